@@ -89,7 +89,8 @@ def main(arguments: list[str] | None = None) -> float:
         preset="sprout",
         steps=a.steps,
         strategy="sprout",
-        init=InitConfig(source="random", random_count=a.start, max_sh_degree=0),
+        init=InitConfig(source="random", random_count=a.start),
+        sh_degree=0,
     )
     configs = [dataclasses.replace(base, strategy_config=SproutConfig(growth=growth)) for growth in (0.0, 0.1)]
     with tempfile.TemporaryDirectory() as folder:

@@ -39,7 +39,7 @@ def gsplat(monkeypatch):
     def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, sh_degree, packed):
         told.degrees.append(sh_degree)
         g = Gaussians(means, quats, scales.log(), opacities.logit(), colors)
-        rgb = rasterize(g, Camera(viewmats, Ks, width, height), RasterizeOptions(rule="gsplat", sh_degree=sh_degree)).rgb
+        rgb = rasterize(g, Camera(viewmats, Ks, width, height), RasterizeOptions(rule="gsplat-1.5", sh_degree=sh_degree)).rgb
         return rgb, None, {"seen": len(told.lrs)}
 
     module = SimpleNamespace(MCMCStrategy=MCMCStrategy, rasterization=rasterization)

@@ -1,5 +1,6 @@
 """Whatever the documents name is there: files, tests and flags. Links and formulas are checked by `make docs`."""
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -56,10 +57,23 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
         train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6))] * views
         config, _ = settings_by_views(PRESETS["default"], train, "cuda")
         chosen = (
-            config.steps, config.init.max_sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
+            config.steps, config.sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
             config.half_resolution,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
+
+
+def test_the_way_of_one_photograph_names_functions_that_exist():
+    """Each row of its table names a file of the package and a function in it; no function comes twice."""
+    text = (ROOT / "docs/architecture.md").read_text("utf-8")
+    hops = re.findall(r"^\| `([\w/]+\.py)` \| `([\w.]+)` \|", text[text.index("## The way of one photograph") :], re.M)
+    assert len(hops) == len(set(hops)) > 25
+    for file, function in hops:
+        found = ast.parse((ROOT / "warpgs" / file).read_text("utf-8")).body
+        for name in function.split("."):
+            found = [n for n in found if getattr(n, "name", None) == name]
+            assert found, f"{file}: there is no {function}"
+            found = found[0].body
 
 
 def test_every_line_of_the_security_page_names_a_test_that_is_there():

@@ -1,11 +1,15 @@
 """The examples run as printed, on small defaults, and show what they promise."""
 
+import importlib.util
 import re
 import runpy
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from warpgs.app.commands.fit import request_of
@@ -40,6 +44,44 @@ def test_examples_show_what_they_promise(name, tmp_path, monkeypatch, capsys):
     assert promised(figure), printed
     assert re.search(r"\d\.\d", printed)
     assert np.asarray(Image.open(tmp_path / image)).std() > 5
+
+
+class StandIn:
+    """gsplat's protocol of a strategy where gsplat is not installed: it reads the same values, and duplicates once."""
+
+    def __init__(self, **options):
+        self.options = options
+
+    def check_sanity(self, params, optimizers):
+        assert set(params) == set(optimizers) >= {"means", "scales", "quats", "opacities"}
+
+    def initialize_state(self, scene_scale=1.0):
+        return {}
+
+    def step_pre_backward(self, params, optimizers, state, step, info):
+        info["means2d"].retain_grad()
+
+    def step_post_backward(self, params, optimizers, state, step, info, packed=False, lr=None):
+        means2d, seen = info["means2d"], (info["radii"] > 0).all(-1)
+        assert means2d.shape == means2d.grad.shape == info["radii"].shape == (info["n_cameras"], len(params["means"]), 2)
+        assert {"width", "height", "gaussian_ids"} <= set(info) and bool(means2d.grad[seen].any())
+        values = means2d.absgrad if "absgrad" in self.options else means2d.grad
+        if step == 20:
+            chosen = (values.norm(dim=-1).sum(0) > values.norm(dim=-1).sum(0).median()).nonzero()[:, 0]
+            for name, old in params.items():
+                params[name] = torch.nn.Parameter(torch.cat([old, old[chosen]]).detach())
+                optimizers[name].param_groups[0]["params"] = [params[name]]
+
+
+@pytest.mark.parametrize("strategy", ["DefaultStrategy", "MCMCStrategy"])
+def test_strategies_of_gsplat_are_driven(strategy, tmp_path, monkeypatch, capsys):
+    """Gaussians are added where gradients are large. The real classes are used where they are installed, and run."""
+    if importlib.util.find_spec("gsplat") is None or (strategy == "MCMCStrategy" and not torch.cuda.is_available()):
+        monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(**{strategy: StandIn}))
+    flags = ["--strategy", strategy, "--steps", "40", "--size", "40", "--out", str(tmp_path / "fitted.png")]
+    assert run("09_gsplat_strategy", flags) > 3
+    before, after = re.match(r"(\d+) -> (\d+) Gaussians", capsys.readouterr().out).groups()
+    assert int(after) > int(before)
 
 
 @pytest.mark.parametrize("name", ["02_fit_scene", "04_own_loss"])

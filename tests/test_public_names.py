@@ -1,7 +1,10 @@
 """The package as `import warpgs` shows it."""
 
 import ast
+import dataclasses
 import importlib
+import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +30,14 @@ def test_every_public_name_is_there_and_documented(name):
     value = getattr(warpgs, name)
     assert value is getattr(importlib.import_module(warpgs._HOMES[name]), name)
     assert name.isupper() or value.__doc__
+
+
+@pytest.mark.parametrize("kind", [warpgs.RasterizeOptions, warpgs.Rule])
+def test_help_describes_every_option(kind):
+    """The class documentation has the field's name and at least 20 letters about it."""
+    text = inspect.getdoc(kind)
+    assert len(dataclasses.fields(kind)) >= 8
+    assert all(re.search(rf"^    {f.name}: \w.{{20}}", text, re.MULTILINE) for f in dataclasses.fields(kind))
 
 
 def test_type_checkers_see_the_same_names():

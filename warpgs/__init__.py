@@ -18,6 +18,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 __all__ = [
     "PRESETS",
+    "ActivatedGaussians",
     "Camera",
     "FitConfig",
     "FitResult",
@@ -30,6 +31,7 @@ __all__ = [
     "RasterizeOptions",
     "Reader",
     "Render",
+    "Rule",
     "Scene",
     "StepReport",
     "StoredRun",
@@ -52,6 +54,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from warpgs.constants import Rule
     from warpgs.export.base import Format
     from warpgs.export.ply import read_ply, write_ply
     from warpgs.io.load import load_scene
@@ -69,8 +72,8 @@ if TYPE_CHECKING:
     from warpgs.pipeline.train.view_modules.base import ViewModule
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
-    from warpgs.render.rule_costs import select_rule
-    from warpgs.scene import Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
+    from warpgs.render.select_rule import select_rule
+    from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
 
 _HOMES = {
     name: module
@@ -92,8 +95,9 @@ _HOMES = {
         "warpgs.pipeline.train.step_report": ("StepReport",),
         "warpgs.render.graphed": ("clear_graph_cache",),
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
-        "warpgs.render.rule_costs": ("select_rule",),
-        "warpgs.scene": ("Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
+        "warpgs.render.select_rule": ("select_rule",),
+        "warpgs.constants": ("Rule",),
+        "warpgs.scene": ("ActivatedGaussians", "Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
     }.items()
     for name in names
 }

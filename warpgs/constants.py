@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from warpgs.field_docs import document_fields
+
 ALPHA_CUT = 1.0 / 255.0
 """Smallest alpha that is blended: half of what an 8-bit channel resolves, doubled (Kerbl et al. 2023, renderer)."""
 
@@ -52,6 +54,7 @@ FRUSTUM_MARGIN = 0.15
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 
+@document_fields
 @dataclass(frozen=True)
 class Rule:
     """A consistent set of cut-offs for projection and blending."""
@@ -82,8 +85,10 @@ RULES = {
     # gradients there wrong by a third.
     "balanced": Rule("balanced", alpha_cut=2.0 / 255.0, transmittance_stop=1e-3),
     "fast": Rule("fast", alpha_cut=4.0 / 255.0, transmittance_stop=1e-3),
-    # gsplat 1.5.3: MAX_ALPHA 0.999, exclusive stop. Its extent of 3.33 sigma never binds: sqrt(2 ln 255) = 3.329.
-    "gsplat": Rule("gsplat", alpha_max=0.999, inclusive_stop=False),
+    # gsplat: exclusive stop. Its extent of 3.33 sigma never binds: sqrt(2 ln 255) = 3.329. The clamp of
+    # alpha was 0.999 up to 1.5.3.
+    "gsplat-1.6": Rule("gsplat-1.6", inclusive_stop=False),
+    "gsplat-1.5": Rule("gsplat-1.5", alpha_max=0.999, inclusive_stop=False),
     # diff-gaussian-rasterization (2023): near plane 0.2, square of 3 sigma.
     "inria": Rule("inria", inclusive_stop=False, near=0.2, square_sigma=3.0),
 }

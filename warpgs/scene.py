@@ -228,6 +228,45 @@ class Gaussians:
 
 
 @dataclass(frozen=True)
+class ActivatedGaussians:
+    """A set of N Gaussians by scales and opacities, for `rasterize` alone; fits and files hold `Gaussians`.
+
+    Opacity 1 and scale 0 render and have finite gradients: alpha is clamped by the rule of the cut-offs, and the pixel filter
+    keeps a flat Gaussian visible edge-on.
+    """
+
+    means: torch.Tensor
+    """World positions [u], shape [N, 3]."""
+    quats: torch.Tensor
+    """Rotations wxyz, any length from 1e-15 to 1e15, shape [N, 4]."""
+    scales: torch.Tensor
+    """Axis lengths [u], at least 0, shape [N, 3]."""
+    opacities: torch.Tensor
+    """Opacities in [0, 1], shape [N]."""
+    sh: torch.Tensor | None = None
+    """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical-harmonics degree given; 0 without."""
+        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` of None as zeros [N, 1, 3]."""
+        sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
+        return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
+
+    def stored(self) -> Gaussians:
+        """Return the same N Gaussians by log scales and logits; scale 0 becomes -inf and opacity 1 inf, which no file takes."""
+        means, quats, scales, opacities, sh = self.tensors().values()
+        return Gaussians(means, quats, scales.log(), opacities.logit(), sh)
+
+
+@dataclass(frozen=True)
 class Render:
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C)."""
 
@@ -251,8 +290,35 @@ class Render:
     median_depth: torch.Tensor | None = None
     """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. No
     gradients flow into it; only where it was requested."""
+    error_bound: torch.Tensor | None = None
+    """Upper bound of the error of ``rgb`` against rule `exact`, over all channels, shape [..., H, W]; see
+    ``RasterizeOptions.error_bound``. No gradients flow into it; only where it was requested."""
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
+
+    absgrad: bool = False
+    """True where ``RasterizeOptions.absgrad`` was set."""
+
+    @cached_property
+    def means2d(self) -> torch.Tensor:
+        """Projected means [px], shape [C, N, 2]; read them before the backward pass.
+
+        After it ``means2d.grad`` holds their gradients, shape [C, N, 2], and ``means2d.absgrad``, with
+        ``RasterizeOptions.absgrad``, the sums over pixels of the gradients' magnitudes. They are a copy for a strategy to hold:
+        no gradient flows through them into the Gaussians.
+        """
+        means2d = self.projected.detach()[..., :2]
+        columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if self.absgrad else {})
+
+        def keep(gradient: torch.Tensor) -> None:
+            for name, part in columns.items():
+                before, found = getattr(means2d, name, None), gradient.detach()[..., part]
+                setattr(means2d, name, found if before is None else before + found)
+
+        if self.projected.requires_grad:
+            means2d.requires_grad_()
+            self.projected.register_hook(keep)
+        return means2d
 
     @property
     def visible(self) -> torch.Tensor:

@@ -10,6 +10,9 @@ from __future__ import annotations
 from bench.lib import result_file, same_bits
 from bench.lib.tables import markdown
 
+RENAMED = {"gsplat": "gsplat-1.5"}
+"""Rules that had another name when results were stored."""
+
 
 def _e(value: float) -> str:
     return f"{value:.1e}" if value else "0"
@@ -48,7 +51,8 @@ def budget_text(results: dict[str, dict]) -> str:
             continue
         lines = []
         for row in result["rows"]:
-            name = row["scene"] + ("" if row["rule"] == "exact" else f", `{row['rule']}`")
+            rule = RENAMED.get(row["rule"], row["rule"])
+            name = row["scene"] + ("" if rule == "exact" else f", `{rule}`")
             both, v = _worst(row), row["gradients"]
             worst = max(v, key=lambda n: v[n]["rel L2"])
             lines.append([

@@ -20,6 +20,8 @@ POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920
 """Sizes of the table of renders and training steps."""
 WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
+FITS = {"fern_cpu2": "fern, 3 photographs of 504 x 378 px", "temple_cpu2": "temple, 12 photographs of 640 x 480 px"}
+"""Results of whole commands, and the captures in words."""
 
 
 def _sources(kind: str, results: dict[str, dict]) -> str:
@@ -93,7 +95,10 @@ def gsplat_table(result: dict) -> str:
 def fits_table(results: dict[str, dict]) -> str:
     """Return medians of whole commands by capture."""
     body = []
-    for name, words in (("fern_cpu2", "fern, 3 photos of 504 x 378 px"), ("temple_cpu2", "temple, 12 photos of 640 x 480 px")):
+    for name, words in (
+        ("fern_cpu2", "fern, 3 photographs of 504 x 378 px"),
+        ("temple_cpu2", "temple, 12 photographs of 640 x 480 px"),
+    ):
         rows = [r for r in results[name]["rows"] if r["side"] == "new"]
         middle = {key: statistics.median(r[key] for r in rows) for key in ("setup", "training", "wall", "psnr")}
         body.append([words, f"{rows[0]['steps']:,}", *(f"{middle[k]:.0f}" for k in ("setup", "training", "wall"))])

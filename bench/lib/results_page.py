@@ -37,9 +37,9 @@ CAPTURES = {
 """Scene and number of training views of each row of the presets' result."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
 POSES = {
-    "given": "given with the photos",
-    "joint": "found, held-out photos included",
-    "aligned": "found from the training photos alone",
+    "given": "given with the photographs",
+    "joint": "found, held-out photographs included",
+    "aligned": "found from the training photographs alone",
 }
 MCMC = {
     "warpgs mcmc": "preset `mcmc`",
@@ -150,7 +150,7 @@ def poses() -> str:
     rows = {(r["poses"], r["train"]): r for r in result["rows"]}
     counts = sorted({r["train"] for r in result["rows"]})
     body = [[words, *(mean_sd(rows[kind, n]["psnr"]) for n in counts)] for kind, words in POSES.items()]
-    return table(["poses", *(f"{n} training photos" for n in counts)], body) + source
+    return table(["poses", *(f"{n} training photographs" for n in counts)], body) + source
 
 
 def same_image() -> str:

@@ -69,7 +69,7 @@ def settings(degree: int, cuda: bool) -> list[Setting]:
     made += [Setting(f"stop {s:g}", "transmittance stop", cut_and_stop(1, s)) for s in STOPS]
     made += [Setting("tile 8", "tile size", tile_size=8)]
     made += [Setting(f"degree {d}", "SH degree", degree=d) for d in range(degree)]
-    made += [Setting(r, "foreign rule", RULES[r]) for r in ("gsplat", "inria")]
+    made += [Setting(r, "foreign rule", RULES[r]) for r in ("gsplat-1.5", "inria")]
     if cuda:
         made += [Setting("atomic", "atomic sums", deterministic=False)]
     made += [Setting(f"cut {c:g}, stop {s:g}", "cut and stop", cut_and_stop(c, s)) for c, s in PAIRS]

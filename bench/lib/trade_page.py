@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from bench.lib import result_file
 from bench.lib.tables import markdown
+from warpgs.constants import RULES
 
-RULES = ("balanced", "fast")
+FASTER = ("balanced", "fast")
 FITS = ("quick", "300 steps", "1200 steps", "rule balanced", "rule fast", "half size 0.3", "half size 0.6", "3000 Gaussians")
 """Fits of the table. Others in the results are of presets that are gone, or pairs."""
 
@@ -17,12 +18,12 @@ def rules() -> str:
     for name in results["cpu2"]["scenes"]:
         rows = {stem: {r["setting"]: r for r in result["rows"] if r["scene"] == name} for stem, result in results.items()}
         cells = [name, f"{rows['cpu2']['exact']['mean']:.1e}"]
-        for rule in RULES:
+        for rule in FASTER:
             cells.append(f"{rows['cpu2'][rule]['mean']:.1e}")
             cells += [f"{rows[stem][rule]['both_ms'] / rows[stem]['exact']['both_ms']:.2f}" for stem in ("cpu2", "h200")]
         body.append(cells)
     head = ["scene", "`exact`: error"]
-    for rule in RULES:
+    for rule in FASTER:
         head += [f"`{rule}`: error", "time, 2 cores", "time, H200"]
     sources = [result_file.source(f"tradeoff_kernel_{stem}") for stem in results]
     return markdown(head, body, head[:1]) + "\n" + "\n".join(sources)
@@ -48,6 +49,20 @@ def fits() -> str:
     return markdown(head, body, head[:1]) + "\n" + "\n".join(sources)
 
 
+def error_bound() -> str:
+    """Return errors of the rules and the tightness of their bound."""
+    result = result_file.stored("error_bound")["cpu2"]
+    body = []
+    for row in result["rows"]:
+        if row["of"] in RULES:
+            cells = [f"`{row['of']}`", f"{row['error_mean']:.1e}", f"{row['error_max']:.1e}"]
+            cells.append(f"{row['violations']} of {row['pixels']:,}")
+            cells += [f"{row[f'tightness_{q}']:.3f}" for q in ("0.5", "0.99", "1")]
+            body.append(cells)
+    head = ["rule", "mean error", "largest error", "bound below error", "ratio: median", "99 %", "largest"]
+    return markdown(head, body, head[:1]) + "\n" + result_file.source("error_bound_cpu2")
+
+
 def parts() -> dict[str, str]:
     """Return the generated parts of docs/trade.md by name."""
-    return {"rules": rules(), "fits": fits()}
+    return {"error bound": error_bound(), "rules": rules(), "fits": fits()}

@@ -38,7 +38,7 @@ WARM_UP = 5
 
 def ours(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor, **choices):
     """Work: our rendering and the gradients of all five tensors."""
-    leaves, options = list(gaussians.tensors().values()), RasterizeOptions(rule="gsplat", **choices)
+    leaves, options = list(gaussians.tensors().values()), RasterizeOptions(rule="gsplat-1.5", **choices)
 
     def work():
         return torch.autograd.grad(rasterize(gaussians, camera, options).rgb, leaves, upstream)
@@ -57,7 +57,7 @@ def count_instances(gaussians: Gaussians, camera: Camera) -> int:
     size = {"width": camera.width, "height": camera.height}
     with torch.no_grad():
         tensors = gaussians.tensors().values()
-        counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES["gsplat"])[1]
+        counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES["gsplat-1.5"])[1]
     return int(counts.sum())
 
 
@@ -189,7 +189,7 @@ def compare(path: Path, name: str, kernels: bool) -> dict:
     del works, work
     target = torch.rand(height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(2))
     steps = {
-        "warpgs graph": Steps(gaussians, camera, target, "gsplat").replay,
+        "warpgs graph": Steps(gaussians, camera, target, "gsplat-1.5").replay,
         "gsplat": peer_step(gaussians, camera, target),
     }
     row["step_wall_ms"] = wall_times(steps)

@@ -1,4 +1,4 @@
-"""Images and gradients of rule `gsplat` against those of gsplat, on the garden cloud, on a CUDA device.
+"""Images and gradients of rule `gsplat-1.5` against those of gsplat, on the garden cloud, on a CUDA device.
 
 Needs gsplat 1.5.3 (`pip install gsplat==1.5.3`, which builds itself on first use).
 """
@@ -24,7 +24,7 @@ def compare(path: Path, degree: int, width: int, height: int) -> dict:
     gaussians, camera = garden_inputs(path, sh_degree=degree, width=width, height=height)
     images, gradients = [], []
     for draw in (
-        lambda: rasterize(gaussians, camera, RasterizeOptions(rule="gsplat")).rgb,
+        lambda: rasterize(gaussians, camera, RasterizeOptions(rule="gsplat-1.5")).rgb,
         lambda: gsplat_rasterize(gaussians, camera),
     ):
         image = draw()
@@ -73,7 +73,7 @@ def main() -> int:
             f"rel-L2 {worst['rel_l2']:.1e}, cosine {worst['cosine']:.8f}, norm off by {worst['norm_ratio']:.1e}; "
             f"{'pass' if passes(row) else 'FAIL'}"
         )
-    what = "images and gradients of rule gsplat against gsplat on the garden cloud"
+    what = "images and gradients of rule gsplat-1.5 against gsplat on the garden cloud"
     result_file.keep(a.out, what, torch.device("cuda"), rows)
     return 0 if all(passes(r) for r in rows) else 1
 

@@ -27,7 +27,7 @@ TRIALS = {
     **{f"rule {r}": ("rule", f"quick:rule={r}") for r in ("balanced", "fast")},
     **{f"half size {s:g}": ("resolution schedule", f"quick:half_resolution={s}") for s in (0.3, 0.6)},
     **{f"{n} Gaussians": ("Gaussian budget", f"quick:max_gaussians={n}") for n in (3000, 5000)},
-    "degree 0": ("SH degree", "quick:init.max_sh_degree=0"),
+    "degree 0": ("SH degree", "quick:sh_degree=0"),
     **{
         f"1200 steps, {r}, half {h:g}": ("pairs", f"quick:steps=1200,rule={r},half_resolution={h}")
         for r, h in (("balanced", 0.3), ("fast", 0.6))

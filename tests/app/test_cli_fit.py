@@ -10,7 +10,8 @@ import pytest
 
 from warpgs.app.cli import main
 from warpgs.app.commands.fit import request_of
-from warpgs.app.flags import field_docs, flags_of, settings_of
+from warpgs.app.flags import flags_of, settings_of
+from warpgs.field_docs import field_docs
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
 from warpgs.pipeline.train.presets import PRESETS

@@ -294,10 +294,18 @@ def set_to(*keys, value):
         (set_to("shN", "count", value=3), "beyond its 3 rows"),
         (set_to("shN", "bands", value=7), "7 degrees"),
         (lambda meta, members: members.update({"quats.webp": bytes(10**7)}), "would take"),
+        (lambda meta, members: members.update({f"{i}": b"" for i in range(1500)}), "table of contents"),
     ],
 )
 def test_archives_that_lie(change, match, tmp_path):
     refused(tmp_path / "a.sog", repacked(change), match)
+
+
+def test_archives_whose_table_of_contents_could_lie_elsewhere(tmp_path):
+    """Behind a comment, or where the record of a large archive says: neither is bounded by the last bytes."""
+    archive = repacked(set_to("version", value=2))
+    refused(tmp_path / "a.sog", archive[:-2] + b"\1\0x", "table of contents")
+    refused(tmp_path / "a.sog", archive[:-22] + b"PK\6\7" + bytes(16) + archive[-22:], "table of contents")
 
 
 def with_document(change):
@@ -334,6 +342,7 @@ EXTENSION = ("meshes", 0, "primitives", 0, "extensions", "KHR_gaussian_splatting
         (at(*EXTENSION, "kernel", value="box"), "kernel 'box'"),
         (at(*EXTENSION, "colorSpace", value="lin_rec709_display"), "lin_rec709"),
         (at("nodes", 0, value={"mesh": 0, "scale": [2, 2, 2]}), "moves its mesh"),
+        (at("asset", value=[0] * 300_001), "values"),
         (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "POSITION is missing"),
     ],

@@ -47,6 +47,18 @@ def test_an_image_that_is_a_link(kind, tmp_path):
     asks(scene)
 
 
+@pytest.mark.parametrize("kind", scenes.WRITERS)
+def test_files_of_cameras_and_points_that_are_links(kind, tmp_path):
+    scene = scenes.WRITERS[kind](tmp_path / "scene")
+    files = [p for p in scene.rglob("*") if p.is_file() and p.suffix != ".png"]
+    assert files
+    for path in files:
+        moved_out(scene, path)
+        asks(scene)
+        path.unlink()
+        (tmp_path / "elsewhere" / path.name).rename(path)
+
+
 @pytest.mark.parametrize("kind", ["colmap", "colmap text", "transforms", "llff", "dtu"])
 def test_an_image_folder_that_is_a_link(kind, tmp_path):
     scene = scenes.WRITERS[kind](tmp_path / "scene")

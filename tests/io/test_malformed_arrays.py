@@ -75,6 +75,14 @@ def test_numpy_headers_that_announce_more_than_there_is(tmp_path):
     refused(tmp_path, r"poses_bounds.npy: cannot be read as a numpy array")
 
 
+def test_archives_beyond_any_number_of_cameras(tmp_path):
+    """zipfile makes ten times its size of a table of contents."""
+    scenes.write_dtu(tmp_path)
+    with (tmp_path / "cameras.npz").open("wb") as f:
+        f.truncate(2**24 + 1)
+    refused(tmp_path, r"cameras.npz: cannot be read as an archive of arrays \(OSError: .*is larger than 16 MiB")
+
+
 def dtu_with(tmp_path, **changes):
     scenes.write_dtu(tmp_path)
     matrices = {k: v for k, v in (scenes.dtu_matrices() | changes).items() if v is not None}

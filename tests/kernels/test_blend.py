@@ -51,11 +51,11 @@ def backgrounds(count, dtype, device):
     return torch.rand(count, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64).to(device, dtype)
 
 
-SMALL_TILES = [pytest.param(8, rule, marks=pytest.mark.slow) for rule in ("exact", "gsplat", "smooth")]
+SMALL_TILES = [pytest.param(8, rule, marks=pytest.mark.slow) for rule in ("exact", "gsplat-1.5", "smooth")]
 
 
 @pytest.mark.parametrize(
-    ("tile_size", "rule"), [*((16, r) for r in ("exact", "gsplat", "inria", "smooth")), (8, "inria"), *SMALL_TILES]
+    ("tile_size", "rule"), [*((16, r) for r in ("exact", "gsplat-1.5", "inria", "smooth")), (8, "inria"), *SMALL_TILES]
 )
 def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
     """Colour, alpha, depth, and the gradients of a random mix of them, under every rule."""

@@ -1,9 +1,11 @@
 """CUDA text compiles, also on a machine without a GPU: NVRTC comes with Warp."""
 
+import itertools
+
 import pytest
 import warp as wp
 
-from warpgs.kernels import blend_channels, blend_cuda, median_depth
+from warpgs.kernels import blend_channels, blend_cuda, median_depth, project
 from warpgs.pipeline.runs.precompile import fit_kernels
 
 ARCHITECTURE = 75
@@ -14,9 +16,12 @@ def modules() -> dict[str, wp.Module]:
     """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
     kernels = [k for k, _ in fit_kernels(True)]
     kernels += [median_depth.make_native(size) for size in (8, 16)]
+    kernels += [make(wp.float32, True, "pinhole", True) for make in (project.make_forward, project.make_backward)]  # activated
     for channels in blend_channels.WIDTHS:
         kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]
-        kernels += [blend_cuda.make_backward(8, depth, 64, True, channels).backward for depth in (True, False)]
+        for depth, absgrad in itertools.product((True, False), repeat=2):
+            made = blend_cuda.make_backward(8, depth, 64, True, channels, absgrad)
+            kernels += [made.backward, made.gather]
     return {k.module.name: k.module for k in kernels}
 
 

@@ -11,7 +11,7 @@ from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.kernels.tiles import bin_tiles
+from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 
 GUARD = 64
 """Entries before and behind each tensor; a multiple of 16 bytes."""
@@ -53,8 +53,8 @@ def rendering(device, cameras, deterministic=True):
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
     projected, counts = project(*g.tensors().values(), views, Ks, degree=1, **size, **side)
     made = bin_tiles(projected, counts, **size, **side)
-    room = {"capacity": len(made.slots) + 5, "overflow": torch.zeros(1, dtype=torch.int32, device=device)}
-    spare = bin_tiles(projected, counts, **size, **side, **room)
+    memory = InstanceMemory(capacity=len(made.slots) + 5, overflow=torch.zeros(1, dtype=torch.int32, device=device))
+    spare = bin_tiles(projected, counts, **size, **side, memory=memory)
     images = blend(projected, made, torch.ones(cameras, 3, device=device), **size, deterministic=deterministic)
     inputs = [projected, *g.tensors().values(), views, Ks]
     of_all = torch.autograd.grad(sum((t * t).sum() for t in images), inputs, retain_graph=True)

@@ -154,7 +154,8 @@ def test_capacity_to_the_instance(device):
     assert int(counts.min()) > 2
     for capacity in (total, total - 1, total - 2, total // 2):
         mine, overflow = counts.clone(), torch.zeros(1, dtype=torch.int32, device=device)
-        made = tiles.bin_tiles(projected, mine, width=48, height=48, rule=EXACT, capacity=capacity, overflow=overflow)
+        memory = tiles.InstanceMemory(capacity=capacity, overflow=overflow)
+        made = tiles.bin_tiles(projected, mine, width=48, height=48, rule=EXACT, memory=memory)
         assert int(overflow) == (capacity < total)
         assert int(made.counts.sum()) == capacity and len(made.gaussian_ids) == capacity
 
@@ -192,7 +193,7 @@ def test_a_transmittance_equal_to_the_stop(device, dtype, inclusive, weights):
     assert torch.allclose(gradient[0, :, 6].cpu().double(), 256 * torch.tensor(weights, dtype=torch.float64), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize("rule", ["gsplat", "inria"])
+@pytest.mark.parametrize("rule", ["gsplat-1.5", "inria"])
 def test_nothing_is_drawn_behind_a_stop(device, dtype, rule):
     """A layer that would take transmittance below the stop ends the pixel, also for fainter ones behind it."""
     opacities = [0.98, 0.98, 0.9, 0.01, 0.5, 0.005]
@@ -238,7 +239,7 @@ def needles(count, device):
     return gaussians
 
 
-@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
+@pytest.mark.parametrize("rule", ["exact", "gsplat-1.5", "inria"])
 def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
     """A colour's gradient is its Gaussian's contribution, and colours times contributions add up to the image."""
     gaussians, cam = needles(400, device), camera(70, 50, cameras=1, dtype=dtype, device=device)
@@ -259,7 +260,7 @@ def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
 
 @pytest.mark.cuda
 @pytest.mark.parametrize("tile_size", [8, 16])
-@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
+@pytest.mark.parametrize("rule", ["exact", "gsplat-1.5", "inria"])
 def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
     """CUDA skips blocks of 8 x 4 pixels where the CPU skips strips: except for alphas at the cut the images agree."""
     rule = dataclasses.replace(RULES[rule], transmittance_stop=0.0)
@@ -311,8 +312,9 @@ def test_lists_are_those_of_the_cpu(tile_size):
             projected, counts = run(gaussians, cam, window=(x, y, width, height), tile_size=tile_size)
             how = {"width": width, "height": height, "rule": EXACT, "tile_size": tile_size, "origin": (x, y)}
             made = tiles.bin_tiles(projected, counts, **how)
-            room = {"capacity": len(made.slots) + 50, "overflow": torch.zeros(1, dtype=torch.int32, device=device)}
-            spare = tiles.bin_tiles(projected, counts, **how, **room)
+            overflow = torch.zeros(1, dtype=torch.int32, device=device)
+            memory = tiles.InstanceMemory(capacity=len(made.slots) + 50, overflow=overflow)
+            spare = tiles.bin_tiles(projected, counts, **how, memory=memory)
             assert int(counts.max()) > 100 and {31, 32, 33} & set(counts.view(-1).tolist())
             for m in (made, spare):
                 count = int(m.total)

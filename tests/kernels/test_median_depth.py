@@ -39,7 +39,7 @@ def wanted(gaussians, cam, rule, tile_size):
     return torch.stack(found)
 
 
-@pytest.mark.parametrize(("tile_size", "rule"), [(16, "exact"), (8, "gsplat"), (16, "inria"), (8, "smooth")])
+@pytest.mark.parametrize(("tile_size", "rule"), [(16, "exact"), (8, "gsplat-1.5"), (16, "inria"), (8, "smooth")])
 def test_median_depth_equals_reference(device, dtype, rule, tile_size):
     """Under every kind of rule, in images that are no multiple of a tile; few pixels have no median."""
     rule = SMOOTH if rule == "smooth" else RULES[rule]
@@ -51,7 +51,7 @@ def test_median_depth_equals_reference(device, dtype, rule, tile_size):
     close("image", found, reference)
 
 
-@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria"])
+@pytest.mark.parametrize("rule", ["exact", "gsplat-1.5", "inria"])
 def test_median_depth_is_there_where_alpha_is_a_half(device, dtype, rule):
     """It is above 0 where the alpha of the same render is at least 1/2, to the pixel, and 0 elsewhere."""
     gaussians, cam = cloud(400, dtype, device), camera(75, 53, cameras=2, dtype=dtype, device=device)

@@ -10,7 +10,7 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import bin_tiles
+from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
@@ -119,7 +119,7 @@ def test_budget_is_checked_in_64_bits_before_allocation(device):
     with pytest.raises(ResourceError, match=r"3,000,000,000 \(Gaussian, tile\) instances.*far too large"):
         bin_tiles(projected, torch.full_like(counts, 1_000_000_000), width=40, height=30, rule=EXACT)
     with pytest.raises(ResourceError, match=r"the limit is 0\.00 GiB"):
-        binned(gaussians, cam, budget_bytes=10)
+        binned(gaussians, cam, memory=InstanceMemory(10))
 
 
 def test_bad_input_names_the_argument():

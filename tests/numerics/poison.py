@@ -81,9 +81,10 @@ def make_case(seed: int, number: int, largest: int = 8000) -> Case:
 
 
 def non_finite(gaussians: Gaussians) -> torch.Tensor:
-    """True where any parameter is NaN or infinite, bool, shape [N]."""
-    rows = torch.cat([t.detach().reshape(len(gaussians), -1) for t in gaussians.tensors().values()], 1)
-    return ~torch.isfinite(rows).all(1)
+    """True where any parameter is NaN or infinite, bool, shape [N]; but scale 0 and opacity 1 have infinite logarithms."""
+    meant = {"log_scales": -math.inf, "logit_opacities": math.inf}
+    bad = {n: ~torch.isfinite(t.detach()) & (t.detach() != meant.get(n, 0.0)) for n, t in gaussians.tensors().items()}
+    return torch.cat([b.reshape(len(gaussians), -1) for b in bad.values()], 1).any(1)
 
 
 def _images(case: Case, keep: torch.Tensor, device) -> tuple[dict, torch.Tensor]:

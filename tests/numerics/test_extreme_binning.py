@@ -11,7 +11,7 @@ from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import bin_tiles
+from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
@@ -68,14 +68,14 @@ def test_full_screen_gaussians_at_4k_are_counted(device):
     """3000 Gaussians over the whole picture: 97 million instances, 4.6 GiB by the budget's reckoning, and refused beyond it."""
     gaussians = spots([(1920.0, 1080.0)] * 3000, 4000.0, device)
     with pytest.raises(ResourceError, match=r"3,000 visible .* 97,200,000 .* 32400 of 32400 tiles"):
-        binned(gaussians, plain(3840, 2160, device), budget_bytes=2**30)
+        binned(gaussians, plain(3840, 2160, device), memory=InstanceMemory(2**30))
 
 
 @pytest.mark.slow
 def test_full_screen_gaussians_at_4k_are_listed(device):
     """The same with memory enough (2 GB): every tile lists all 3000, in order."""
     gaussians = spots([(1920.0, 1080.0)] * 3000, 4000.0, device)
-    _, counts, tiles = binned(gaussians, plain(3840, 2160, device), budget_bytes=2**40)
+    _, counts, tiles = binned(gaussians, plain(3840, 2160, device), memory=InstanceMemory(2**40))
     assert int(counts.sum()) == len(tiles.slots) == 97_200_000
     lengths = tiles.ranges[:, 1] - tiles.ranges[:, 0]
     assert bool((lengths == 3000).all())

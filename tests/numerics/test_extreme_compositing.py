@@ -127,12 +127,12 @@ def test_gradient_on_the_clamp(device):
 
 @pytest.mark.parametrize("logit", [20.0, 88.0, 200.0, 1e38, math.inf, -20.0, -88.0, -200.0, -1e38, -math.inf])
 def test_opacity_logits(device, dtype, logit):
-    """C3: any finite one is opaque or not there, gradients finite; an infinite one is not there."""
+    """C3: any one is opaque or not there, gradients finite."""
     gaussians, cam = layers([0.5, 0.5], 4, dtype, device, logits=torch.tensor([logit, 0.3]))
     found = images(gaussians, cam, background=1.0)
     v = gradients(sum(t.sum() for t in found), gaussians)
     assert finite(*found, *v.values())
-    if logit > 0 and math.isfinite(logit):
+    if logit > 0:
         assert float(found[1].detach().min()) >= 0.99
     else:
         alone = Gaussians(**{n: t.detach()[1:] for n, t in gaussians.tensors().items()})
@@ -169,7 +169,7 @@ def test_what_leaks_through_two_layers(device):
         ("exact", 1 - 1e-7, 0.0, 1.0001e-4),
         ("exact", 0.98, 3.9e-4, 4.1e-4),  # not yet stopped
         ("inria", 1 - 1e-7, 9.99e-3, 1.001e-2),
-        ("gsplat", 0.995, 4.99e-3, 5.01e-3),
+        ("gsplat-1.5", 0.995, 4.99e-3, 5.01e-3),
     ):
         gaussians, cam = layers([opacity, opacity], device=device)
         gaussians = dataclasses.replace(gaussians, sh=torch.full_like(gaussians.sh, -2.0))

@@ -38,7 +38,7 @@ from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 
-POINTS = InitConfig(source="points", max_sh_degree=0)
+POINTS = InitConfig(source="points")
 few = settings(derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
@@ -50,7 +50,7 @@ def gray(points) -> PointCloud:
 
 def taken(views, cloud_, device, steps: int = 3, **more) -> Trainer:
     """A fit after some steps, all of whose numbers are finite."""
-    fit = Trainer(views, cloud_, FitConfig(steps=steps, init=POINTS, **more), device)
+    fit = Trainer(views, cloud_, FitConfig(steps=steps, init=POINTS, sh_degree=0, **more), device)
     for _ in range(steps):
         assert math.isfinite(fit.advance()[0].loss)
     assert all(bool(torch.isfinite(t).all()) for t in fit.state()[0].values() if t.is_floating_point())
@@ -65,7 +65,7 @@ def taken(views, cloud_, device, steps: int = 3, **more) -> Trainer:
 def test_few_points_and_identical_ones_get_a_width(device, count, identical):
     """As many neighbours as there are; a floor of 1e-6 and a ceiling of a tenth of the scene's extent."""
     points = np.zeros((count, 3)) if identical else np.eye(4, 3)[:count] * 2.0
-    g = initial_gaussians(gray(points), POINTS, 5.0, device)
+    g = initial_gaussians(gray(points), POINTS, 0, 5.0, device)
     assert g.means.shape == (count, 3) and bool(torch.isfinite(g.log_scales).all())
     widths = g.log_scales.exp()
     if count:
@@ -84,7 +84,7 @@ def test_clusters_closer_than_squares_can_tell(device, dtype):
     found = mean_square_distances(spread.to(device)).cpu()
     wanted = mean_square_distances_reference(spread.double(), 3)
     assert torch.allclose(found.double(), wanted, rtol=1e-4 if dtype is torch.float32 else 1e-12, atol=2e-45)
-    g = initial_gaussians(gray(spread.numpy()), POINTS, 1.0, device)
+    g = initial_gaussians(gray(spread.numpy()), POINTS, 0, 1.0, device)
     assert torch.allclose(g.log_scales.exp(), torch.full((4, 3), 1e-6, device=device), rtol=1e-5)
 
 
@@ -131,8 +131,8 @@ def test_cameras_without_extent(device, kind, source):
     assert 0 < n.scale < math.inf
     views = [normalize_view(v, n) for v in views]
     density = DensityConfig(start=1, every=1, stop_fraction=1.0)
-    init = InitConfig(source=source, random_count=60, max_sh_degree=0)
-    fit = Trainer(views, points, FitConfig(steps=4, init=init, density=density), device)
+    init = InitConfig(source=source, random_count=60)
+    fit = Trainer(views, points, FitConfig(steps=4, init=init, sh_degree=0, density=density), device)
     assert 0 < fit.context.extent < math.inf and fit.lrs(1)["means"] > 0
     # what stands before the near plane would never be drawn, and never be moved
     assert int(rasterize(fit.gaussians, fit.views[0].camera).visible.sum()) >= 20
@@ -216,7 +216,7 @@ def bad_photos(value: float) -> list[View]:
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_one_bad_pixel_stops_the_fit_before_it_harms(device, value):
     """The step that looks at it is not taken, and the Gaussians are finite."""
-    fit = Trainer(bad_photos(value), seeds(), FitConfig(steps=4, init=POINTS, cuda_graph=False), device)
+    fit = Trainer(bad_photos(value), seeds(), FitConfig(steps=4, init=POINTS, sh_degree=0, cuda_graph=False), device)
     with pytest.raises(NotFiniteError, match=r"loss became (nan|inf)"):
         for _ in range(4):
             fit.advance()
@@ -247,7 +247,13 @@ def poison(fit: Trainer, name: str, where: str, value: float) -> None:
 def test_what_is_no_number_is_never_saved(device, tmp_path, name, where, value):
     """The Gaussian is culled, so the loss stays finite; the next checkpoint is refused by name, and the last one is whole."""
     config = FitConfig(
-        steps=6, init=POINTS, density=DensityConfig(start=100), checkpoint_every=2, checkpoint_seconds=0, cuda_graph=False
+        steps=6,
+        init=POINTS,
+        sh_degree=0,
+        density=DensityConfig(start=100),
+        checkpoint_every=2,
+        checkpoint_seconds=0,
+        cuda_graph=False,
     )
     fit, saved = Trainer(photos(2), seeds(), config, device), []
 
@@ -356,7 +362,7 @@ KINDS = [
     InitConfig, StoppingConfig, LimitConfig, FitConfig,
 ]  # fmt: skip
 SHORT = FitConfig(
-    steps=4, init=InitConfig(source="points", max_sh_degree=1), sh_every=2, phases=PhaseConfig(coarse=1, every=1),
+    steps=4, init=InitConfig(source="points"), sh_degree=1, sh_every=2, phases=PhaseConfig(coarse=1, every=1),
     density=DensityConfig(start=1, every=2, stop_fraction=1.0, gradient=1e-6),
     max_gaussians=200, strategy="importance_sampling",
     method=MethodConfig(events=True, hier=True, pm=False, sampler=SamplerConfig(min_alpha=0.01)),
@@ -426,7 +432,7 @@ def test_views_of_which_nothing_counts(device):
     views = photos(2)
     hidden = [dataclasses.replace(v, mask=np.zeros(v.image.shape[:2], bool)) for v in views]
     fit = taken(hidden, seeds(), device, steps=2)
-    first = initial_gaussians(seeds(), POINTS, fit.context.extent, device)
+    first = initial_gaussians(seeds(), POINTS, 0, fit.context.extent, device)
     assert all(torch.equal(a, b) for a, b in zip(fit.gaussians.tensors().values(), first.tensors().values()))
     taken([hidden[0], views[1]], seeds(), device, steps=4)
     with pytest.raises(DataError, match="every pixel of the training views is masked out"):

@@ -31,7 +31,7 @@ def loop(inputs, frame, rule, tile_size):
     return blend_reference(means[0], covs[0], opacities, colors[0], depths[0], *how, tile_size=tile_size)[:3]
 
 
-@pytest.mark.parametrize("rule", ["exact", "gsplat", "inria", "smooth"])
+@pytest.mark.parametrize("rule", ["exact", "gsplat-1.5", "inria", "smooth"])
 @pytest.mark.parametrize("tile_size", [8, 16])
 def test_dense_twin_equals_plain_loop(rule, tile_size):
     """Pictures and all gradients, to float64's rounding, whole and in a window."""

@@ -102,4 +102,4 @@ def test_a_batch_costs_memory_and_on_a_cpu_steps():
         assert eight == one // fewer > 0
     views = photos(4)
     one, eight = (Trainer(views, seeds(), dataclasses.replace(PLAIN, batch=b), CPU).layout for b in (1, 8))
-    assert eight.held(1000) - one.held(1000) == 3 * (one.row + 8) * 1000
+    assert eight.held(1000) - one.held(1000) == 3 * (one.table.row_bytes + 8) * 1000

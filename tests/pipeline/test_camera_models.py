@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import warpgs
 from tests.parallel_camera import NAME
 from tests.scenes import photos, ring, seeds, three_gaussians
 from warpgs.errors import UsageError
@@ -19,7 +20,7 @@ from warpgs.pipeline.train.memory_plan import most_instances
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import half_size
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, View
+from warpgs.scene import Camera, Scene, View
 
 CPU = torch.device("cpu")
 CONFIG = FitConfig(
@@ -143,3 +144,21 @@ def test_what_cannot_be_rendered_is_refused_before_the_first_step():
         wrong = dataclasses.replace(first, camera=dataclasses.replace(first.camera, **change))
         with pytest.raises(UsageError, match=words):
             Trainer([*rest, wrong], seeds(), CONFIG, CPU)
+
+
+def test_a_fit_of_such_views_is_scored_written_and_opened_again(tmp_path):
+    """The whole command, with scores and report; a note names the checks that compare views, which are left out."""
+    scene = Scene("memory", "none", tuple(views()), points=seeds())
+    done = warpgs.fit(scene, CONFIG, steps=3, split="every:4", out=tmp_path / "run", device="cpu", verbose=False)
+    assert "coverage" not in done.metrics and any(NAME in n and "not compared" in n for n in done.notes)
+    assert done.metrics["rule"]["max"] < 2e-6  # the same kernels in float32 and float64: measured 1.3e-7
+    assert (tmp_path / "run" / "report.html").is_file()
+    opened = warpgs.open_run(tmp_path / "run").cameras()["01.png"]
+    assert opened.model == NAME and np.array_equal(opened.distortion, views()[1].camera.distortion)
+
+
+@pytest.mark.parametrize("changes", [{"init_source": "random"}, {"strategy": "importance_sampling", "method_events": True}])
+def test_settings_that_compare_views_are_refused_before_the_first_step(changes):
+    scene = Scene("memory", "none", tuple(views()), points=seeds())
+    with pytest.raises(UsageError, match=r"--preset 3dgs --init\.source points"):
+        warpgs.fit(scene, CONFIG, device="cpu", verbose=False, **changes)

@@ -146,7 +146,7 @@ def test_an_estimated_opacity_is_no_target():
     views = [dataclasses.replace(v, alpha_estimated=True) for v in cutouts()]
     fit = fitted(views, LossConfig(), 1)
     assert [t.name for t in fit.terms] == ["photometric"] and fit.settings(5)[SHIFT] == (0, 0, 0)
-    assert fit.views[0].countable is not None and fit.layout.cutout
+    assert fit.views[0].countable is not None and fit.layout.sizes.cutout
 
 
 def test_a_failed_step_has_the_colour_behind_it():

@@ -18,7 +18,7 @@ from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.files import make_folder
-from warpgs.pipeline.farm import work
+from warpgs.pipeline.farm import record, work
 from warpgs.pipeline.farm.ensure_run import Outcome
 from warpgs.pipeline.farm.farm import run_farm
 from warpgs.pipeline.farm.job import job_of, job_text
@@ -139,6 +139,19 @@ def test_a_rerun_skips_what_is_finished_and_valid(scenes, single, results):
     statuses = run_farm(jobs_of(scenes, results), engine)
     assert engine.begun == ["s1"] and digests(statuses) == single
     assert [s.record.how for s in statuses] == ["fitted", "continued"]
+
+
+def test_links_that_double_a_scene_at_each_level_are_not_listed(tmp_path, monkeypatch):
+    """40 folders with two links each to the next would be a million million folders."""
+    monkeypatch.setattr(record, "MOST_FILES", 100)
+    for level in range(7):
+        (tmp_path / f"{level}").mkdir()
+        for name in "ab":
+            (tmp_path / f"{level}" / name).symlink_to(tmp_path / f"{level + 1}")
+    (tmp_path / "7").mkdir()
+    for level in ("0", "3"):
+        (tmp_path / level / "image.png").touch()
+    assert record.source_stamp(tmp_path / "3") and not record.source_stamp(tmp_path / "0")  # 31 folders, and 255
 
 
 def test_touched_photographs_are_read_again_and_the_run_is_kept(scenes, results, tmp_path):

@@ -48,7 +48,7 @@ def test_images_of_views_with_like_names_are_all_written(tmp_path):
     views, wanted = photos(5), ["a/b.png", "a_b.png", "A_B.jpg", "x" * 250 + ".png", "train.png"]
     for view, name in zip(views, wanted):
         object.__setattr__(view, "name", name)
-    gaussians = initial_gaussians(seeds(), InitConfig(), 1.0, torch.device("cpu"))
+    gaussians = initial_gaussians(seeds(), InitConfig(), 3, 1.0, torch.device("cpu"))
     evaluate_run(tmp_path, gaussians, views[4:], views[:4], "exact", (0.0, 0.0, 0.0))
     for folder in ("renders", "depth"):
         assert len(list((tmp_path / folder).iterdir())) == 4

@@ -20,7 +20,7 @@ from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules.poses import ROTATION, RefinePoses
 
 CPU = torch.device("cpu")
-PLAIN = FitConfig(steps=8, init=InitConfig(source="points", max_sh_degree=0))
+PLAIN = FitConfig(steps=8, init=InitConfig(source="points"), sh_degree=0)
 
 
 @pytest.fixture(autouse=True)
@@ -77,10 +77,10 @@ def test_a_term_reads_the_outputs_that_it_asks_for_alone():
             return inputs.outputs["alpha"].mean()
 
     fit = Trainer(photos(2), seeds(), dataclasses.replace(PLAIN, loss_terms=(Silent(),)), CPU)
-    assert fit.layout.depth_supervised and outputs_of(fit.terms) == ("rgb", "depth")
+    assert fit.layout.sizes.depth and outputs_of(fit.terms) == ("rgb", "depth")
     with pytest.raises(UsageError, match="'silent' reads the output 'alpha' without asking: name it in needs_outputs"):
         fit.advance()
-    assert not Trainer(photos(2), seeds(), PLAIN, CPU).layout.depth_supervised
+    assert not Trainer(photos(2), seeds(), PLAIN, CPU).layout.sizes.depth
     Silent.needs_outputs = ("normals",)
     with pytest.raises(UsageError, match=r"'silent' needs the output 'normals', which .* rgb, alpha, depth"):
         dataclasses.replace(PLAIN, loss_terms=(Silent(),))

@@ -119,7 +119,7 @@ def test_files_that_hold_no_cameras(text, match, tmp_path):
         read_cameras(tmp_path / "cameras.json")
 
 
-@pytest.mark.parametrize("rule", ["inria", "gsplat"])
+@pytest.mark.parametrize("rule", ["inria", "gsplat-1.5"])
 def test_a_file_shows_what_it_held(rule, tmp_path):
     made, cameras = cloud(50), make_cameras()
     write_gaussians(tmp_path / "a.ply", made, units="file")
@@ -148,6 +148,6 @@ def test_render_of_a_file(tmp_path):
         convert(tmp_path / "cameras.json", tmp_path / "poses.json")
     with pytest.raises(UsageError, match="has no cameras"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(None, None))
-    with pytest.raises(UsageError, match="--rule other"):
+    with pytest.raises(UsageError, match="unknown rule 'other'"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "cameras.json", "other"))
     assert json.loads((tmp_path / "cameras.json").read_text())[0]["img_name"] == "0000"

@@ -20,7 +20,7 @@ from warpgs.render.rasterize import rasterize
 CPU = torch.device("cpu")
 unevenness = sys.modules[NormalSmoothness.__module__].unevenness
 SMOOTH = FitConfig(
-    steps=24, init=InitConfig(source="points", max_sh_degree=0, opacity=0.9), density=DensityConfig(start=6, every=6),
+    steps=24, init=InitConfig(source="points", opacity=0.9), sh_degree=0, density=DensityConfig(start=6, every=6),
     half_resolution=0.5, loss_terms=(NormalSmoothness(2.0, growth=10),),
 )  # fmt: skip
 

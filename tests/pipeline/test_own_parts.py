@@ -16,7 +16,7 @@ from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.trainer import Trainer
 
 CPU = torch.device("cpu")
-PLAIN = FitConfig(steps=40, sh_every=15, init=InitConfig(source="points", max_sh_degree=0))
+PLAIN = FitConfig(steps=40, sh_every=15, init=InitConfig(source="points"), sh_degree=0)
 
 
 @pytest.fixture(autouse=True)

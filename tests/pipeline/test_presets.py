@@ -18,7 +18,7 @@ from warpgs.pipeline.runs.fit import fit
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
 from warpgs.pipeline.train.overrides import keyword, setting_names, with_settings
-from warpgs.pipeline.train.presets import MAX_BYTES, PRESETS, preset_settings
+from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.scene import Scene
 
@@ -49,7 +49,7 @@ def test_a_file_starts_from_another(tmp_path):
     first = written(
         tmp_path, 'base = "3dgs"\nsteps = 40\nmemory-limit = "2GiB"\n[init]\nopacity = 1e-1\nmerge-px = 3\n', "a.toml"
     )
-    second = written(tmp_path, 'base = "a.toml"\nabout = "mine"\nsteps = "none"\ninit.max_sh_degree = "none"\n')
+    second = written(tmp_path, 'base = "a.toml"\nabout = "mine"\nsteps = "none"\nsh_degree = "none"\n')
     config, origin = preset_settings(str(first))
     assert config == dataclasses.replace(
         PRESETS["3dgs"], preset="a.toml", steps=40, memory_limit=2 * 2**30,
@@ -57,8 +57,8 @@ def test_a_file_starts_from_another(tmp_path):
     )  # fmt: skip
     assert type(config.init.merge_px) is float and str(first) in origin and "SHA-256" in origin
     config, origin = preset_settings(second)
-    assert (config.preset, config.steps, config.init.max_sh_degree, config.init.opacity) == ("my.toml", None, None, 0.1)
-    assert all(word in origin for word in (str(first), str(second), "preset 3dgs", "init.merge-px", "init.max-sh-degree"))
+    assert (config.preset, config.steps, config.sh_degree, config.init.opacity) == ("my.toml", None, None, 0.1)
+    assert all(word in origin for word in (str(first), str(second), "preset 3dgs", "init.merge-px", "sh-degree"))
     assert preset_settings(written(tmp_path, "steps = 7"))[0].strategy == PRESETS["default"].strategy
 
 
@@ -120,6 +120,7 @@ def test_a_wrong_setting_is_named(tmp_path, text, said):
         (b"x = " + b"[" * 5000 + b"]" * 5000, "in each other"),
         (b"a = " + b"[" * 20 + b"]" * 20, "in each other"),
         (b"#" * (MAX_BYTES + 1), "larger than"),
+        (b"a = 1\n" + b"a." * (MAX_DOTS + 1) + b"a = 1", "more than 100 dots in a line"),
         (None, "cannot be read"),
     ],
 )
@@ -162,15 +163,17 @@ def test_every_setting_has_a_keyword_of_its_own():
         names = setting_names(config)
         assert len({*map(keyword, names)}) == len(names) > 80
         assert not {*map(keyword, names)} & {*inspect.signature(fit).parameters}
-    assert {"steps", "init.max_sh_degree", "depth_model", "method.sampler.fraction"} <= {*setting_names(FitConfig())}
+    assert {"steps", "sh_degree", "init.opacity", "depth_model", "method.sampler.fraction"} <= {*setting_names(FitConfig())}
 
 
 def test_keywords_replace_settings():
     """Flat, or a group as a mapping or its dataclass; numbers of numpy are numbers; classes stand for themselves."""
     made = with_settings(
-        FitConfig(), {"steps": np.int64(30), "init_max_sh_degree": 1, "dropout": np.float32(0.5), "density": {"every": 7}}, "x"
+        FitConfig(),
+        {"steps": np.int64(30), "sh_degree": 1, "init_opacity": 0.3, "dropout": np.float32(0.5), "density": {"every": 7}},
+        "x",
     )
-    assert (made.steps, made.init.max_sh_degree, made.dropout, made.density.every) == (30, 1, 0.5, 7)
+    assert (made.steps, made.sh_degree, made.init.opacity, made.dropout, made.density.every) == (30, 1, 0.3, 0.5, 7)
     assert type(made.steps) is int and type(made.dropout) is float
     made = with_settings(FitConfig(), {"init": InitConfig(opacity=0.3), "loss_terms": (AlphaDifference(0.2),)}, "x")
     assert made.init.opacity == 0.3 and made.loss_terms == (AlphaDifference(0.2),)
@@ -180,7 +183,7 @@ def test_keywords_replace_settings():
     for wrong, said in (
         ({3: 1}, "3 is no name"),
         ({"loss_terms": 3}, "must be names"),
-        ({"sh_degree": 1}, "mean init.max_sh_degree"),
+        ({"opacity": 0.3}, "mean init.opacity"),
     ):
         with pytest.raises(UsageError, match=said):
             with_settings(FitConfig(), wrong, "x")
@@ -204,21 +207,22 @@ def test_a_fit_takes_keywords_and_records_where_settings_come_from(tmp_path):
     scene = Scene("memory", "none", tuple(photos(3)), points=seeds())
     path = written(tmp_path, 'base = "3dgs"\nsteps = 9\ninit.source = "points"\n')
     options = {"device": "cpu", "verbose": False}
-    result = warpgs.fit(scene, path, steps=3, init_max_sh_degree=1, out=tmp_path / "run", **options)
-    whole = dataclasses.replace(PRESETS["3dgs"], steps=3, init=InitConfig(source="points", max_sh_degree=1))
+    result = warpgs.fit(scene, path, steps=3, sh_degree=1, out=tmp_path / "run", **options)
+    whole = dataclasses.replace(PRESETS["3dgs"], steps=3, init=InitConfig(source="points"), sh_degree=1)
     again = warpgs.fit(scene, whole, **options)
     assert result.gaussians().means.equal(again.gaussians().means) and result.config == dataclasses.replace(
         whole, preset="my.toml"
     )
     record = json.loads((tmp_path / "run" / "config.json").read_text())
     (note,) = (n for n in record["notes"] if n.startswith("settings: "))
-    assert str(path) in note and "SHA-256" in note and note.endswith("then given: steps, init.max-sh-degree")
+    assert str(path) in note and "SHA-256" in note and note.endswith("then given: steps, sh-degree")
     assert record["config"]["preset"] == "my.toml" and record["config"]["steps"] == 3
     for wrong, said in (
         ({"step": 3}, r"warpgs.fit: there is no setting 'step'; did you mean steps\?"),
         ({"steps": "3"}, "warpgs.fit: steps must be a whole number of 64 bits, not '3'"),
         ({"init_opacity": float("nan")}, "init_opacity must be a finite number"),
-        ({"sh_degree": 1}, "did you mean init_max_sh_degree"),
+        ({"opacity": 0.3}, "did you mean init_opacity"),
+        ({"sh_degree": 4}, r"sh-degree must lie in \[0, 3\], not 4"),
         ({"downscale": 2}, "downscale says how a scene is read"),
     ):
         with pytest.raises(UsageError, match=said):

@@ -17,7 +17,7 @@ def scene():
     """Gaussians, and more views than there are threads and pictures at a time."""
     import torch
 
-    return initial_gaussians(seeds(), InitConfig(), 1.0, torch.device("cpu")), photos(12)
+    return initial_gaussians(seeds(), InitConfig(), 3, 1.0, torch.device("cpu")), photos(12)
 
 
 def test_scores_are_those_of_their_views(scene, tmp_path):

@@ -35,7 +35,7 @@ METHOD = MethodConfig(
     events=True, hier=True, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05), protect=ProtectConfig(steps=10)
 )
 CONFIG = FitConfig(
-    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points", max_sh_degree=1), strategy="importance_sampling",
+    steps=40, sh_every=10, dropout=0.2, init=InitConfig(source="points"), sh_degree=1, strategy="importance_sampling",
     density=DensityConfig(start=2, every=8, gradient=1e-5), phases=PhaseConfig(8, 12, every=5), method=METHOD,
 )  # fmt: skip
 

@@ -28,7 +28,7 @@ CPU = torch.device("cpu")
 AT_ONCE = StoppingConfig(min_gain_db=50.0, fraction=0.3, measurements=4)
 """Ends growth as soon as it may."""
 GROWING = FitConfig(
-    steps=60, sh_every=15, init=InitConfig(source="points", max_sh_degree=1), stopping=AT_ONCE,
+    steps=60, sh_every=15, init=InitConfig(source="points"), sh_degree=1, stopping=AT_ONCE,
     density=DensityConfig(start=10, every=5, gradient=1e-5),
 )  # fmt: skip
 SAMPLING = MethodConfig(events=True, hier=True, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05))

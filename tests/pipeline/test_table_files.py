@@ -83,6 +83,14 @@ def test_latex_is_balanced_and_escaped():
     assert "\\begin{tabular}{lcccr}" in tex
 
 
+def test_a_scene_s_name_is_no_latex():
+    """TeX reads ^^5c as a backslash, and an empty line as the end of a paragraph."""
+    caption = next(line for line in latex(table(caption="\\a^^5cinput{b}~c\n\nd")).splitlines() if "caption" in line)
+    assert caption == (
+        "  \\caption{\\textbackslash{}a\\textasciicircum{}\\textasciicircum{}5cinput\\{b\\}\\textasciitilde{}c  d}"
+    )
+
+
 def test_one_seed_has_no_deviation():
     """A figure without a spread is printed alone, a difference without an interval likewise."""
     rows = (

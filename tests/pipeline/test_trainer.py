@@ -183,12 +183,12 @@ def test_first_gaussians():
     """Width from the three nearest, colour from the point, coincident points with a floor, a lone one with a ceiling."""
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 2], [50, 50, 50]], float)
     cloud = PointCloud(points, np.full((5, 3), 0.8, np.float32))
-    g = initial_gaussians(cloud, InitConfig(opacity=0.1), extent=100.0, device=CPU)
+    g = initial_gaussians(cloud, InitConfig(opacity=0.1), 3, extent=100.0, device=CPU)
     assert float(g.log_scales[0, 0].exp()) == pytest.approx(math.sqrt((1 + 4 + 4) / 3), rel=1e-5)
     assert float(g.log_scales[4].exp().max()) == pytest.approx(10.0)
     assert torch.allclose(g.sh[:, 0] * 0.28209479177387814 + 0.5, torch.tensor(0.8)) and not bool(g.sh[:, 1:].any())
     assert torch.allclose(g.logit_opacities.sigmoid(), torch.tensor(0.1))
-    same = initial_gaussians(PointCloud(np.zeros((4, 3)), np.zeros((4, 3), np.float32)), InitConfig(), 1.0, CPU)
+    same = initial_gaussians(PointCloud(np.zeros((4, 3)), np.zeros((4, 3), np.float32)), InitConfig(), 3, 1.0, CPU)
     assert torch.allclose(same.log_scales.exp(), torch.tensor(1e-6))
 
 
@@ -312,9 +312,9 @@ def test_resume_after_kill_gives_the_same_ply(tmp_path):
     ]  # fmt: skip
     # stands still after the first checkpoint, says so, and waits for the end
     stand_still = (
-        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.runs import checkpoint, fit\n"
+        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.runs import checkpoint, fit_steps\n"
         "def save(*a, **k):\n    made(*a, **k)\n    print('saved', flush=True)\n    sys.stdin.read()\n"
-        "made = checkpoint.save_checkpoint\nfit.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
+        "made = checkpoint.save_checkpoint\nfit_steps.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
     )
 
     def command(out: str, *more: str) -> list[str]:

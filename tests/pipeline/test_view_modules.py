@@ -23,7 +23,7 @@ from warpgs.pipeline.train.views import current
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
-PLAIN = FitConfig(steps=60, init=InitConfig(source="points", max_sh_degree=0))
+PLAIN = FitConfig(steps=60, init=InitConfig(source="points"), sh_degree=0)
 OWN = '''
 from dataclasses import dataclass, replace
 
@@ -52,8 +52,8 @@ class Vignetting(warpgs.ViewModule):
     def regularisation(self, values):
         return 1e-3 * values["falloff"].square().sum()
 
-    def bytes(self, count, pixels):
-        return {"loss": 4 * 5 * pixels}
+    def bytes(self, sizes):
+        return {"loss": 4 * 5 * sizes.pixels}
 
     def figures(self, fitted):
         found = fitted.params["falloff"][:, 0].tolist()

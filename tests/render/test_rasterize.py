@@ -133,7 +133,7 @@ def test_native_kernels_agree_with_generic_ones(size):
 def test_errors_name_the_cause(device):
     """Unknown rules and tile sizes, and a scene too large for its budget."""
     gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
-    with pytest.raises(UsageError, match="unknown rule 'best': choose one of exact, balanced, fast, gsplat, inria"):
+    with pytest.raises(UsageError, match="unknown rule 'best': choose one of exact, balanced, fast, gsplat-1"):
         rasterize(gaussians, cam, RasterizeOptions(rule="best"))
     with pytest.raises(UsageError, match="tile size 12 is not one of 8, 16"):
         rasterize(gaussians, cam, RasterizeOptions(tile_size=12))
@@ -146,12 +146,26 @@ def test_errors_name_the_cause(device):
 def test_arguments_of_another_type_or_shape_are_named():
     """Before any work, on the CPU and on CUDA alike: nothing of it is read from the device."""
     gaussians, cam = cloud(3), camera(8, 8, dtype=torch.float32)
+    skewed, large = np.array([[9.0, 0.1, 4], [0, 9, 4], [0, 0, 1]]), dataclasses.replace(cam, width=10**6, height=10**6)
+    learned = RasterizeOptions(opacity_factors=torch.ones(3, requires_grad=True))
     wrong = [
-        (TypeError, "gaussians must be of Gaussians, not Camera", (cam, gaussians)),
+        (TypeError, "gaussians must be of Gaussians or ActivatedGaussians, not Camera", (cam, gaussians)),
         (TypeError, "options must be of RasterizeOptions, not str", (gaussians, cam, "fast")),
         (TypeError, "means must be a tensor, not ndarray", (dataclasses.replace(gaussians, means=np.zeros((3, 3))), cam)),
         (ValueError, r"camera.K must have shape \[3, 3\] or", (gaussians, dataclasses.replace(cam, K=torch.eye(4)))),
         (ValueError, r"camera.viewmat .*not \[3, 4\]", (gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[:3]))),
+        (ValueError, r"camera.K must be \[\[fx, 0, cx\]", (gaussians, dataclasses.replace(cam, K=2 * cam.K))),
+        (
+            ValueError,
+            "skew is not rendered",
+            (gaussians, dataclasses.replace(cam, K=skewed)),
+        ),
+        (UsageError, "detach them", (gaussians, cam, learned)),
+        (
+            ResourceError,
+            r"need 28,000,000,000,000 bytes, and [\d,]+ are free on cpu",
+            (gaussians, large),
+        ),
         (TypeError, "camera.width must be a whole number of pixels, not 8.0", (gaussians, dataclasses.replace(cam, width=8.0))),
         (ValueError, r"background .*not \[4\]", (gaussians, cam, RasterizeOptions(background=torch.zeros(4)))),
         (ValueError, r"K is 1, 4, 9 or 16, not \[3, 5, 3\]", (dataclasses.replace(gaussians, sh=torch.zeros(3, 5, 3)), cam)),

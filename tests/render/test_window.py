@@ -24,7 +24,7 @@ def scene(dtype, device):
 
 
 @pytest.mark.parametrize("window", WINDOWS)
-@pytest.mark.parametrize(("rule", "tile_size"), [("exact", 16), ("exact", 8), ("gsplat", 16), ("inria", 16)])
+@pytest.mark.parametrize(("rule", "tile_size"), [("exact", 16), ("exact", 8), ("gsplat-1.5", 16), ("inria", 16)])
 def test_window_is_the_crop(device, dtype, window, rule, tile_size):
     """Colour, alpha, depth and contributions, every bit of them; float32 and the generic float64 path."""
     gaussians, cam, background = scene(dtype, device)

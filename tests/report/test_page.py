@@ -9,13 +9,13 @@ import pytest
 
 from warpgs.report.curve import curve
 from warpgs.report.images import png, webp
-from warpgs.report.page import SamplingReport, ViewImages, write_page
+from warpgs.report.page import Page, SamplingReport, ViewImages, write_page
 from warpgs.runtime.terminal import Detail
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 
 
-class Page(HTMLParser):
+class Parsed(HTMLParser):
     """Tags, attributes and text of a page; complains about tags that do not nest."""
 
     def __init__(self, text):
@@ -66,9 +66,9 @@ def write(path, **changes):
         "details": {"config": {"steps": 2000}, "versions": {"torch": "2"}},
     }  # fmt: skip
     values |= changes
-    write_page(path, **values)
+    write_page(path, Page(**values))
     text = path.read_text("utf-8")
-    return values, text, Page(text)
+    return values, text, Parsed(text)
 
 
 def test_nothing_is_loaded_from_anywhere(tmp_path):
@@ -169,9 +169,9 @@ def test_sampling_shows_the_first_image_and_the_others_on_request(tmp_path):
 )
 def test_curves_stay_inside_their_frame(ys):
     svg = curve("loss", [10, 20, 30], ys)
-    box = Page(svg).all("svg")[0]
+    box = Parsed(svg).all("svg")[0]
     _, _, width, height = map(float, box["viewbox"].split())
-    for line in Page(svg).all("polyline"):
+    for line in Parsed(svg).all("polyline"):
         points = np.array([p.split(",") for p in line["points"].split()], float)
         assert np.isfinite(points).all() and (points >= 0).all() and (points <= [width, height]).all()
     assert ("no data" in svg) == (not np.isfinite(ys).any())
@@ -180,8 +180,8 @@ def test_curves_stay_inside_their_frame(ys):
 
 def test_curve_runs_down_where_values_fall_and_long_series_are_thinned():
     steps = list(range(1, 5001))
-    svg = Page(curve("loss", steps, [1 / s for s in steps], "u"))
+    svg = Parsed(curve("loss", steps, [1 / s for s in steps], "u"))
     points = np.array([p.split(",") for p in svg.all("polyline")[0]["points"].split()], float)
     assert 100 < len(points) <= 300 and (np.diff(points[:, 0]) > 0).all() and (np.diff(points[:, 1]) >= 0).all()
     assert "loss [u]" in svg.text("text")
-    assert Page(curve("none", [], [])).text("text") == ["none", "no data"]
+    assert Parsed(curve("none", [], [])).text("text") == ["none", "no data"]

@@ -46,6 +46,13 @@ def test_a_second_holder_is_told_whose_the_folder_is(tmp_path, monkeypatch):
         assert "`warpgs eval`" in refusal(tmp_path)
 
 
+def test_a_signature_that_makes_no_sense_is_of_another_process(tmp_path):
+    with hold_folder(tmp_path):
+        for signature in (b"[" * 100_000, b"[]", b'{"command": ""}', bytes(1)):
+            (tmp_path / LOCK).write_bytes(b"\n" + signature)
+            assert refusal(tmp_path).startswith(f"{tmp_path}: another process is writing there")
+
+
 def test_a_lock_file_alone_holds_nothing(tmp_path):
     """Its process is gone, and the number may be that of another one now, or come from another container."""
     (tmp_path / LOCK).write_text(f'\n{{"process": {os.getpid()}, "host": "", "since": "", "command": ""}}')

@@ -17,7 +17,7 @@ from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.step_buffers import Setting
-from warpgs.kernels.tiles import bin_tiles
+from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 from warpgs.runtime import interop
 
 
@@ -75,7 +75,8 @@ def everything():
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
     projected, counts = project(*g.tensors().values(), views, Ks, **size, degree=1, rule=rule)
     tiles = bin_tiles(projected, counts, **size, rule=rule)
-    capped = bin_tiles(projected, counts, **size, rule=rule, capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
+    memory = InstanceMemory(capacity=2000, overflow=torch.zeros(1, dtype=torch.int32))
+    capped = bin_tiles(projected, counts, **size, rule=rule, memory=memory)
     images = blend(projected, tiles, torch.ones(2, 3), **size, rule=rule)
     target = torch.rand(images[0].shape, generator=torch.Generator().manual_seed(0))
     maps, sums = ssim(images[0], target), differences(images[0], target)

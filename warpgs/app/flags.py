@@ -1,39 +1,18 @@
 """Flags from settings: a dataclass of settings as a command line that takes its names, defaults and help texts from it."""
 
-import ast
 import contextlib
 import dataclasses
-import inspect
 import io
-import itertools
 import re
-import textwrap
 import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
 from warpgs.errors import UsageError
+from warpgs.field_docs import field_docs
 from warpgs.runtime.terminal import say
 
 Settings = TypeVar("Settings")
-
-
-def field_docs(kind: type) -> dict[str, str]:
-    """Return the docstrings of the fields of a dataclass by name, each on one line; those of its bases included."""
-    docs: dict[str, str] = {}
-    for cls in reversed(kind.__mro__):
-        if not dataclasses.is_dataclass(cls):
-            continue
-        try:
-            source = inspect.getsource(cls)
-        except OSError:  # a class typed into an interpreter has no source: its flags go without help
-            continue
-        (tree,) = ast.parse(textwrap.dedent(source)).body
-        for statement, after in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
-            match statement, after:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as text)):
-                    docs[name] = " ".join(text.split())
-    return docs
 
 
 def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | None = None) -> tuple[type, Any]:

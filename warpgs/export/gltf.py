@@ -35,6 +35,8 @@ COLOR_SPACE = "srgb_rec709_display"
 GLB, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 MAX_PARTS = 100_000
 """Most lists and objects in a document, each of which takes some thirty times as much memory as text."""
+MAX_VALUES = 300_000
+"""Most commas in a document: each parts two values, which take up to a hundred bytes."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TINY = 1e-37
@@ -203,6 +205,8 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
         text = data
     if text.count(b"[") + text.count(b"{") > MAX_PARTS:
         raise malformed(path, f"its JSON has more than {MAX_PARTS:,} lists and objects")
+    if text.count(b",") > MAX_VALUES:
+        raise malformed(path, f"its JSON has more than {MAX_VALUES:,} values")
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as e:

@@ -43,6 +43,8 @@ COLUMNS = 64
 ROUNDS = 12
 """Rounds of Lloyd's algorithm for a codebook."""
 MAX_META_BYTES = 2**20
+MAX_CONTENTS_BYTES = 2**16
+"""Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
 MAX_PIXEL_BYTES = 8
 """Most bytes of a pixel in a lossless WebP image; one that cannot be compressed takes little more than 4."""
@@ -158,6 +160,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         DataError: The file is malformed, cut short, or announces more than its size can hold.
     """
     size = file.seek(0, os.SEEK_END)
+    _check_contents(path, file, size)
     with zipfile.ZipFile(file) as archive:
         meta = json.loads(_member(path, archive, "meta.json", MAX_META_BYTES))
         n = meta.get("count") if isinstance(meta, dict) else None
@@ -226,6 +229,18 @@ def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
     return by_rows(
         n, (4,), lambda p: from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * SQRT2)
     )
+
+
+def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
+    """Raise a DataError where the end of an archive announces a large table of contents, or leaves its size to other records.
+
+    These are a comment behind the end, and the locator of zip64 before it, which archives beyond 4 GiB need.
+    """
+    file.seek(max(0, size - 42))
+    locator, end = (last := file.read())[:-22], last[-22:]
+    plain = end[:4] == b"PK\5\6" and end[-2:] == b"\0\0" and locator[:4] != b"PK\6\7"
+    if not plain or int.from_bytes(end[12:16], "little") > MAX_CONTENTS_BYTES:
+        raise malformed(path, f"its table of contents is not at its end, or has more than {MAX_CONTENTS_BYTES:,} bytes")
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:

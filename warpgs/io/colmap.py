@@ -341,14 +341,14 @@ class ColmapReader(Reader):
         if model is None or kind is None:
             lacks = "cameras and images" if model is None else " and ".join(missing_parts(model))
             raise DataError(f"{model or folder}: the COLMAP reconstruction lacks {lacks}; copy the whole folder")
-        poses = read_poses(model / f"images.{kind}")
         scene = SceneFolder(folder, options)
+        poses = read_poses(scene.inside(model / f"images.{kind}"))
         views, notes = _read_views(scene, model, kind, poses)
         points_path, points = model / f"points3D.{kind}", None
         if not points_path.is_file():
             notes.append(f"{points_path.name} is missing, so there are no points to start from")
         else:
-            points = read_points(points_path, {n: view_name(p.name) for n, p in poses.items()})
+            points = read_points(scene.inside(points_path), {n: view_name(p.name) for n, p in poses.items()})
             if len(points) == 0:
                 notes.append(f"{points_path.name} holds no points")
         return self.scene(folder, views, notes, points=points, pixels=scene.pixel_source(by_folder=True))
@@ -356,7 +356,7 @@ class ColmapReader(Reader):
 
 def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pose]) -> tuple[list[View], list[str]]:
     """Return the views of a reconstruction in file coordinates, sorted by the names in the file, and notes."""
-    lenses = read_cameras(model / f"cameras.{kind}")
+    lenses = read_cameras(scene.inside(model / f"cameras.{kind}"))
     file = model / f"images.{kind}"
     images, factor, note = scene.images()
     notes = [note] if note else []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.geometry import matmul
-from warpgs.input_files import open_input
+from warpgs.input_files import read_input
 from warpgs.io.folders import SceneFolder, ViewList, has_folder, resampling_note
 from warpgs.io.images import Lens, list_images
 from warpgs.io.pose_matrices import rigid
@@ -18,6 +19,8 @@ from warpgs.scene import Scene
 
 FILES = ("cameras.npz", "cameras_sphere.npz")
 FOLDERS = ("image", "images")
+MAX_ARCHIVE_BYTES = 2**24
+"""Size of the largest archive that is read [bytes]; one of 64 cameras has a hundred thousand."""
 MAX_MATRIX_BYTES = 4096
 """Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is refused."""
 
@@ -54,7 +57,7 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
     """Return the world and scale matrices of the archive by name, float64, shape [4, 4] each."""
     matrices = {}
     try:
-        with open_input(path) as file, np.load(file, allow_pickle=False) as archive:
+        with np.load(io.BytesIO(read_input(path, MAX_ARCHIVE_BYTES)), allow_pickle=False) as archive:
             for key in archive.files:
                 if key.startswith(("world_mat_", "scale_mat_")) and "inv" not in key:
                     if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:
@@ -104,7 +107,8 @@ class DTUReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         path = next((folder / f for f in FILES if (folder / f).is_file()), folder / FILES[0])
-        matrices = _read_matrices(path)
+        scene = SceneFolder(folder, options)
+        matrices = _read_matrices(scene.inside(path))
         images = next((folder / f for f in FOLDERS if (folder / f).is_dir()), folder / FOLDERS[0])
         files = list_images(images)
         cameras = sum(key.startswith("world_mat_") for key in matrices)
@@ -113,7 +117,7 @@ class DTUReader(Reader):
                 f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
                 "the counts must agree: restore the set"
             )
-        scene, masks, views = SceneFolder(folder, options), _masks(folder, files), ViewList()
+        masks, views = _masks(folder, files), ViewList()
         for i, file in enumerate(files):
             name = file.relative_to(images).as_posix()
             where = f"{path}, image {name!r}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -202,6 +202,39 @@ def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
     return orientation
 
 
+def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
+    """Return an image with its mask applied, as opacity with ``cutout``, and its colours multiplied by the opacity."""
+    image, mask, alpha, done, kept = loaded.image, loaded.mask, loaded.alpha, list(loaded.done), None
+    if mask is not None:
+        kept = float(mask.mean(dtype=np.float64))
+        done.append("cut out by a mask file" if cutout else "masked by a mask file")
+    if cutout and mask is not None:
+        alpha, mask = mask.astype(np.float32) if alpha is None else alpha * mask, None
+    if alpha is not None and alpha.min() < 1:
+        image *= alpha[..., None]  # until it is resampled
+        if not alpha.any():
+            done.append("wholly transparent: it shows nothing")
+        elif kept is None or not cutout:
+            done.append("transparent in part, by the alpha channel")
+    else:
+        alpha = None
+    if mask is not None and not mask.any():
+        raise DataError(
+            f"{path}: its mask leaves no pixel; --mask-keeps says which of its colours, white or black, keeps a pixel"
+        )
+    return LoadedImage(image, mask, loaded.K, tuple(done), alpha, kept)
+
+
+def _over_background(loaded: LoadedImage, background: tuple[float, float, float]) -> LoadedImage:
+    """Return an image whose colours, multiplied by their opacity until now, lie over a background."""
+    image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha
+    if alpha is not None:
+        alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more
+        for channel, value in enumerate(background):
+            image[..., channel] += np.float32(value) * (1 - alpha)
+    return replace(loaded, image=image, alpha=alpha)
+
+
 def load_image(
     path: Path,
     lens: Lens | Callable[[int, int], Lens],
@@ -236,42 +269,21 @@ def load_image(
         UsageError: ``downscale`` or ``max_side`` leaves next to nothing.
     """
     image, alpha = decode(path, max_pixels)
-    stored, done = image.shape[:2], []
+    stored = image.shape[:2]
     if not isinstance(lens, Lens):
         lens = lens(stored[1], stored[0])
     orientation = _upright(path, lens, image)
     if orientation != 1:
         image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
-        done.append("turned by the EXIF tag, as the camera asks")
     height, width = image.shape[:2]
-    K, kept = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K, None
+    K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
+    done = () if orientation == 1 else ("turned by the EXIF tag, as the camera asks",)
     if mask is not None:
         mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
-        kept = float(mask.mean(dtype=np.float64))
-        done.append("cut out by a mask file" if cutout else "masked by a mask file")
-    if cutout and mask is not None:
-        alpha, mask = mask.astype(np.float32) if alpha is None else alpha * mask, None
-    if alpha is not None and alpha.min() < 1:
-        image *= alpha[..., None]  # until it is resampled
-        if not alpha.any():
-            done.append("wholly transparent: it shows nothing")
-        elif kept is None or not cutout:
-            done.append("transparent in part, by the alpha channel")
-    else:
-        alpha = None
-    if mask is not None and not mask.any():
-        raise DataError(
-            f"{path}: its mask leaves no pixel; --mask-keeps says which of its colours, white or black, keeps a pixel"
-        )
-    loaded = LoadedImage(image, mask, K, tuple(done), alpha, kept)
+    loaded = _with_mask(path, LoadedImage(image, mask, K, done, alpha), cutout)
     if any(lens.distortion):
         loaded = _undistort(loaded, lens)
     loaded = _shrink(path, loaded, downscale, max_side)
     if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
-    image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha
-    if alpha is not None:
-        alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more
-        for channel, value in enumerate(background):
-            image[..., channel] += np.float32(value) * (1 - alpha)
-    return LoadedImage(image, loaded.mask, loaded.K, loaded.done, alpha, kept)
+    return _over_background(loaded, background)

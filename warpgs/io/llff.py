@@ -57,8 +57,8 @@ class LLFFReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         path = folder / FILE
-        rows = read_rows(path)
         scene = SceneFolder(folder, options)
+        rows = read_rows(scene.inside(path))
         images, factor, note = scene.images()
         files = list_images(images)
         if len(files) != len(rows):

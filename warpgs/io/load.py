@@ -52,7 +52,7 @@ def load_scene(
         max_side: Longest side that an image keeps [px], 0 for no limit; larger ones are reduced to it, and the intrinsics with
             them. None for 1600 where ``downscale`` is None too, else for no limit.
         strict: A frame without an image file is an error instead of a note.
-        allow_outside: Let names and links of the scene lead to images and masks outside its folder.
+        allow_outside: Let names and links of the scene lead to files outside its folder.
         masks: Fate of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
             (they are transparent, gray ones in part: `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
@@ -72,16 +72,11 @@ def load_scene(
         UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``masks`` or ``mask_keeps`` is another
             word, or there is no such reader.
     """
-    root, numbers = Path(path), itertools.count(1)
-
-    def on_image(file: Path) -> None:
-        if progress is not None:
-            progress(f"reading {root}: image {next(numbers)}")
-
-    factor, side = image_scale(downscale, max_side)
+    root, (factor, side) = Path(path), image_scale(downscale, max_side)
     options = ReadOptions(
-        factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side, on_image=on_image
-    )
+        factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side,
+        on_image=_counted(root, progress),
+    )  # fmt: skip
     try:
         _check_folder(root)
         chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
@@ -89,6 +84,17 @@ def load_scene(
     except OSError as e:
         # folders without permission, names too long for the file system, disks that fail
         raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
+
+
+def _counted(root: Path, progress: Callable[[str], object] | None) -> Callable[[Path], None]:
+    """Return a function that shows the number of the image that is read."""
+    numbers = itertools.count(1)
+
+    def on_image(file: Path) -> None:
+        if progress is not None:
+            progress(f"reading {root}: image {next(numbers)}")
+
+    return on_image
 
 
 def detect(root: Path) -> tuple[Reader, list[str]]:

@@ -86,7 +86,7 @@ class MiddleburyReader(Reader):
         path, *others = files_of(folder)
         notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} passed over"] if others else []
         scene, views = SceneFolder(folder, options), ViewList()
-        for number, name, values in read_rows(path):
+        for number, name, values in read_rows(scene.inside(path)):
             where = f"{path}, line {number}, image {name!r}"
             K, viewmat = _intrinsics(values[:9].reshape(3, 3).copy(), where), np.eye(4)
             viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]

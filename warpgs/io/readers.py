@@ -37,7 +37,7 @@ class ReadOptions:
     strict: bool = False
     """A frame without an image file is an error instead of a note."""
     allow_outside: bool = False
-    """Names and links of the scene may lead to images and masks outside its folder."""
+    """Names and links of the scene may lead to files outside its folder."""
     masks: str = "ignore"
     """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
     mask_keeps: str = "white"

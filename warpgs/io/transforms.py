@@ -213,7 +213,7 @@ class TransformsReader(Reader):
         reading = _Reading(folder, SceneFolder(folder, options), background)
         notes = []
         for file in files_of(folder):
-            shared = read_json(file)
+            shared = read_json(reading.scene.inside(file))
             for number, frame in enumerate(shared["frames"]):
                 reading.frame(file, shared, number, frame)
             if shared.get("ply_file_path"):

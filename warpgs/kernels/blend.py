@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
@@ -15,6 +14,22 @@ from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
+
+
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of images, of what blending leaves for its gradient, and of gradient slots at each moment of a step."""
+    slots, states = blend_cuda.instance_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0)
+    images = (COLORS + 2) * FLOAT * sizes.pixels  # colour, alpha, depth
+    kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
+    lean = sizes.cuda and not (sizes.depth or sizes.cutout)  # there only colour has a gradient
+    upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
+    whole = images + upstream if sizes.chunked else 0  # images of the frame stand beside those of a chunk
+    return {
+        BINNING: whole, LOSS: images + (0 if sizes.chunked else kept), BLENDING: kept + slots + images + (whole or upstream),
+        PROJECTION: images + upstream, SAMPLING: 3 * images,
+    }  # fmt: skip
 
 
 @functools.cache
@@ -121,7 +136,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     _, depth, transmittances, weights, ends, _ = saved
     v_rgb, v_alpha, v_depth = v_images
     real, device, channels = interop.real_of(projected), projected.device, backgrounds.shape[1]
-    values = VALUES + channels - COLORS
+    values = VALUES + channels - COLORS + 2 * settings.absgrad
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     upstream = [interop.view(v_rgb.contiguous().view(-1, channels), real)]
@@ -133,7 +148,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
         *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
         *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
-    _launch(blend_cpu.make_kernels(real, tiles.size, channels).backward, len(tiles.ranges), inputs, device)
+    _launch(blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad).backward, len(tiles.ranges), inputs, device)
     inputs = [
         interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
         interop.view(v_projected.view(-1, v_projected.shape[-1]), real),
@@ -192,7 +207,7 @@ class _Blend(torch.autograd.Function):
         return rgb, alpha, depth
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, *v_images):
         projected, backgrounds, *tensors = ctx.saved_tensors
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
@@ -202,7 +217,7 @@ class _Blend(torch.autograd.Function):
 
 
 def check_slots(tiles: Tiles) -> None:
-    """Check that instances have slots.
+    """Check that the instances have slots.
 
     Raises:
         ValueError: They have none.
@@ -237,6 +252,7 @@ def blend(
     rule: Rule,
     deterministic: bool = True,
     origin: tuple[int, int] = (0, 0),
+    absgrad: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
 
@@ -253,6 +269,8 @@ def blend(
         deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which takes less memory
             and gives other bits each time; elsewhere it changes nothing.
         origin: Left and top [px] of the window that the tiles were made for.
+        absgrad: Sum magnitudes of the mean's gradient over pixels, too. They are the gradient of the last two values of
+            ``projected``, the half sides of the box.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
@@ -263,7 +281,7 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(projected, backgrounds, tiles, BlendSettings(origin, width, height, rule, deterministic))
+    return _Blend.apply(projected, backgrounds, tiles, BlendSettings(origin, width, height, rule, deterministic, absgrad))
 
 
 def contributions(

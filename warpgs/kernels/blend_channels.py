@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from warpgs.constants import Rule
 from warpgs.kernels.blend import background_gradient, check_slots, check_tiles, composite, composite_gradients, is_native
 from warpgs.kernels.blend_records import COLORS, WIDTHS
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles
+from warpgs.runtime.derivatives import first_order
 
 GEOMETRY = 6
 """Values of a projected Gaussian before its colour; its depth and its box follow that."""
@@ -77,7 +77,7 @@ class _BlendChannels(torch.autograd.Function):
         return image, alpha, depth
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, v_image, v_alpha, v_depth):
         projected, colors, backgrounds, image, *tensors = ctx.saved_tensors
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
@@ -114,6 +114,7 @@ def blend_channels(
     rule: Rule,
     deterministic: bool = True,
     origin: tuple[int, int] = (0, 0),
+    absgrad: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
 
@@ -130,6 +131,7 @@ def blend_channels(
         rule: Cut-offs.
         deterministic: Sum gradients in a fixed order, see `blend`.
         origin: Left and top [px] of the window that the tiles were made for.
+        absgrad: Sum magnitudes, see `blend`; of several passes (more than 11 channels) those of each.
 
     Returns:
         The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
@@ -142,5 +144,5 @@ def blend_channels(
     check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))
     if colors.shape[-1] == 0:
         raise ValueError(f"colors must have at least one channel, not shape {list(colors.shape)}")
-    settings = BlendSettings(origin, width, height, rule, deterministic)
+    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
     return _BlendChannels.apply(projected, colors, backgrounds, tiles, settings)

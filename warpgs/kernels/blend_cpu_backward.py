@@ -17,10 +17,10 @@ from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 
 @functools.cache
-def make_walk(real, tile_size: int, channels: int):
+def make_walk(real, tile_size: int, channels: int, absgrad: bool):
     """Make the functions that load the pixels of a tile and walk past a Gaussian."""
     f = make_functions(real)
-    r = make_records(real, tile_size, channels)
+    r = make_records(real, tile_size, channels, absgrad)
     stride = wp.constant(tile_size * (tile_size + 1))
     side = wp.constant(tile_size)
     strip = wp.constant(STRIP)
@@ -175,12 +175,12 @@ def make_walk(real, tile_size: int, channels: int):
 
 
 @functools.cache
-def make_gradient(real, tile_size: int, channels: int):
+def make_gradient(real, tile_size: int, channels: int, absgrad: bool):
     """Make the functions that sum the gradient of one instance."""
-    r = make_records(real, tile_size, channels)
-    count = VALUES + channels - COLORS
+    r = make_records(real, tile_size, channels, absgrad)
+    count = VALUES + channels - COLORS + 2 * absgrad
     values = wp.constant(count)
-    channels_of_strip = wp.constant(channels * STRIP)
+    channels_of_strip = wp.constant((channels + 2 * absgrad) * STRIP)
     stride = wp.constant(tile_size * (tile_size + 1))
     at = r.at
     at_int = r.at_int
@@ -196,6 +196,15 @@ def make_gradient(real, tile_size: int, channels: int):
         """Add what a pixel gives to the gradient of the channels."""
         for c in range(wp.static(channels)):
             s.color[c * strip + lane] = at(s.color[c * strip + lane]) + w * at(pixels.g[c * stride + p])
+
+    @wp.func(inline=True)
+    def add_magnitudes(g: r.Projected, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[r.Gradient]):
+        """Add the magnitudes of what a pixel gives to the gradient of the mean, where they are asked for."""
+        if wp.static(absgrad):
+            x = wp.static(channels * STRIP) + lane
+            y = wp.static((channels + 1) * STRIP) + lane
+            s.color[x] = at(s.color[x]) + wp.abs(v_e1)
+            s.color[y] = at(s.color[y]) + wp.abs(g.u12 * v_e1 + g.u22 * g.u22 * v_y)
 
     @wp.func(inline=True)
     def sum_up(
@@ -224,6 +233,7 @@ def make_gradient(real, tile_size: int, channels: int):
                 s.yy[lane] = at(s.yy[lane]) + v_y * dy
                 s.opacity[lane] = at(s.opacity[lane]) + v
                 add_channels(w, p, lane, pixels, s)
+                add_magnitudes(g, v_e1, v_y, lane, s)
                 s.z[lane] = at(s.z[lane]) + w * at(pixels.v_z[p])
         return s
 
@@ -264,17 +274,21 @@ def make_gradient(real, tile_size: int, channels: int):
         v_slots[slot, 4] = -g.opacity * g.u22 * totals[4]
         for k in range(5, values):
             v_slots[slot, k] = totals[k]
+        if wp.static(absgrad):  # behind the depth, which is the last total
+            v_slots[slot, values - 3] = totals[values - 1]
+            v_slots[slot, values - 2] = g.opacity * wp.abs(g.u11) * totals[values - 3]
+            v_slots[slot, values - 1] = g.opacity * totals[values - 2]
 
     return SimpleNamespace(sum_up=sum_up, totals_of=totals_of, store=store)
 
 
 @functools.cache
-def make_backward(real, tile_size: int, channels: int):
-    """Make the kernel for one scalar type, tile size and number of channels."""
+def make_backward(real, tile_size: int, channels: int, absgrad: bool = False):
+    """Make the kernel for one scalar type, tile size and number of channels; ``absgrad`` as in `BlendSettings`."""
     f = make_functions(real)
-    r = make_records(real, tile_size, channels)
-    m = make_walk(real, tile_size, channels)
-    n = make_gradient(real, tile_size, channels)
+    r = make_records(real, tile_size, channels, absgrad)
+    m = make_walk(real, tile_size, channels, absgrad)
+    n = make_gradient(real, tile_size, channels, absgrad)
     side = wp.constant(tile_size)
     place_z = wp.constant(6 + channels)
 

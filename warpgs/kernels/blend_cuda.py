@@ -11,13 +11,14 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.constants import SMALLEST_WEIGHT
+from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
 from warpgs.kernels.blend_records import COLORS
 from warpgs.kernels.blend_settings import BlendSettings, make_struct
-from warpgs.kernels.tiles import Tiles
+from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.cuda_source import source
+from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128)
 """Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
@@ -36,7 +37,8 @@ THREADS = 1024
 """Threads of the one block that puts tiles in order."""
 STRIDE = 12
 """Floats from one instance's sums to the next with three channels: as many as a projected Gaussian has, so that rows are
-16-byte aligned. There are at most ten sums: two along the rows of the factor, three for the factor, opacity, colour, depth.
+16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
+and two of magnitudes.
 Each further channel has one more."""
 
 # 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
@@ -140,7 +142,9 @@ def make_kernels(tile_size: int):
 
 
 @functools.cache
-def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS):
+def make_backward(
+    tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS, absgrad: bool = False
+):  # fmt: skip
     """Make the backward kernels: sums per instance, then per Gaussian.
 
     Args:
@@ -149,9 +153,11 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool, ch
         chunk: Instances per warp.
         atomic: True to add each sum to its Gaussian's at once, in no fixed order, instead of by slots.
         channels: Number of channels, out of `WIDTHS`.
+        absgrad: True to sum magnitudes of the mean's gradient, too (`BlendSettings.absgrad`).
     """
     Blending = make_struct(wp.float32)
-    numbers = {"CHUNK": chunk, "WITH_DEPTH": str(with_depth).lower(), "ATOMIC": str(atomic).lower()}
+    flags = {"WITH_DEPTH": with_depth, "ATOMIC": atomic, "ABSGRAD": absgrad}
+    numbers = {"CHUNK": chunk, **{name: str(flag).lower() for name, flag in flags.items()}}
 
     @wp.func_native(_source("backward", tile_size, channels, **numbers))
     def backward_body(
@@ -171,9 +177,10 @@ def make_backward(tile_size: int, with_depth: bool, chunk: int, atomic: bool, ch
     ): ...  # fmt: skip
 
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
+    name += ".absgrad" * absgrad
     options = {"enable_backward": False, "grid_stride": False, "module": name}
     # many chunks want many warps at a time more than they want registers, unless channels fill these
-    small = chunk == CHUNKS[1] and not with_depth and channels == COLORS
+    small = chunk == CHUNKS[1] and not (with_depth or absgrad) and channels == COLORS
     registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 
     @wp.kernel(**registers, **options)
@@ -212,9 +219,16 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
     return [interop.view(t.view(-1), wp.int32) for t in tensors]
 
 
-def chunk_of(tiles: Tiles, deterministic: bool) -> int:
+def chunk_of(tiles: int, deterministic: bool) -> int:
     """Return the instances per chunk: the larger number, which takes less memory, also where order is given up for memory."""
-    return CHUNKS[int(tiles.ranges.shape[0] > MAX_SMALL_TILES or not deterministic)]
+    return CHUNKS[int(tiles > MAX_SMALL_TILES or not deterministic)]
+
+
+def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
+    """Return the bytes of a step's gradient slots, and of the states that blending leaves for its backward pass."""
+    columns, rows = (0, 0) if sizes.chunked else grid(sizes.width, sizes.height, TILE_SIZE)
+    state = FLOAT * STATE * TILE_SIZE * TILE_SIZE // chunk_of(columns * rows, True)
+    return FLOAT * STRIDE * sizes.instances, state * sizes.instances
 
 
 def forward(
@@ -238,7 +252,7 @@ def forward(
     transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
     ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
-    chunk = chunk_of(tiles, settings.deterministic)
+    chunk = chunk_of(tiles.ranges.shape[0], settings.deterministic)
     rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
     states = allocator.saved((rows, state * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
@@ -278,8 +292,8 @@ def backward(
     v_rgb, v_alpha, v_depth = v_images
     device, count, deterministic = projected.device, tiles.slots.shape[0], settings.deterministic
     with_depth = v_alpha is not None or v_depth is not None
-    chunk = chunk_of(tiles, deterministic)
-    k = make_backward(tiles.size, with_depth, chunk, not deterministic, backgrounds.shape[1])
+    chunk = chunk_of(tiles.ranges.shape[0], deterministic)
+    k = make_backward(tiles.size, with_depth, chunk, not deterministic, backgrounds.shape[1], settings.absgrad)
     if with_depth:
         v_alpha, v_depth = (torch.zeros_like(depth) if v is None else v.contiguous() for v in (v_alpha, v_depth))
     else:

@@ -16,11 +16,12 @@ WIDTHS = (COLORS, 7, 11)
 
 
 @functools.cache
-def make_records(real, tile_size: int, channels: int):
+def make_records(real, tile_size: int, channels: int, absgrad: bool):
     """Make the records, and the functions that read an entry of their vectors, for one scalar type, tile size and channels.
 
     A tile lies in columns as wide as a strip, one beside the other; entries of its pixels follow in that order. Vectors are
-    one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other.
+    one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other, in a gradient with the
+    two magnitudes behind them where ``absgrad`` asks for these.
     """
     count = tile_size * (tile_size // STRIP)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
@@ -29,7 +30,7 @@ def make_records(real, tile_size: int, channels: int):
     list_ints = wp.types.vector(count, wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
-    strip_channels = wp.types.vector(channels * STRIP, real)
+    strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
     channel_reals = wp.types.vector(channels, real)
 
     @wp.struct

@@ -46,6 +46,8 @@ class BlendSettings:
     """Cut-offs."""
     deterministic: bool = True
     """True to sum gradients in a fixed order on every device."""
+    absgrad: bool = False
+    """True to sum magnitudes of the mean's gradient over pixels, too, as the gradient of the box."""
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - to make it takes 20 us, and steps ask for the same ones again
     def struct(self, tile_size: int, real):

@@ -74,12 +74,13 @@ def make_types(real):
 
 
 @functools.cache
-def make_projection(real, camera_model: str):
+def make_projection(real, camera_model: str, activated: bool = False):
     """Make the steps of the projection that forward and backward share (derivation: docs/project.md).
 
     Args:
         real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
+        activated: True for scales and opacities themselves; False for their logarithms and logits.
     """
     r = make_rotations(real)
     camera = CAMERA_MODELS.find(camera_model).make_functions(real)
@@ -115,6 +116,25 @@ def make_projection(real, camera_model: str):
         return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
 
     @wp.func
+    def sigmoid(x: real) -> real:
+        if x >= real(0.0):
+            return real(1.0) / (real(1.0) + wp.exp(-x))
+        t = wp.exp(x)
+        return t / (real(1.0) + t)
+
+    @wp.func
+    def scales_of(stored: vec3) -> vec3:
+        if wp.static(activated):
+            return stored
+        return vec3(wp.exp(stored[0]), wp.exp(stored[1]), wp.exp(stored[2]))
+
+    @wp.func
+    def opacity_of(stored: real) -> real:
+        if wp.static(activated):
+            return stored
+        return sigmoid(stored)
+
+    @wp.func
     def ellipse(
         mean: vec3, q: vec4, log_scale: vec3, view: mat44, K: mat33, lens: wp.array(dtype=real),
         width: real, height: real, near: real, low_pass: real,
@@ -134,10 +154,10 @@ def make_projection(real, camera_model: str):
         e.quat_length = r.quat_length(q)
         if not (e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)):
             return e
-        if not finite3(log_scale):  # -inf would be an axis of length 0, which log 0 is not meant to say
-            return e
         e.quat = q / e.quat_length
-        e.scales = vec3(wp.exp(log_scale[0]), wp.exp(log_scale[1]), wp.exp(log_scale[2]))
+        e.scales = scales_of(log_scale)
+        if not finite3(e.scales):  # the logarithm of 0 is -inf, and no error
+            return e
         e.pixel = pixel
         e.expansion_point = camera.expansion_point(pixel, width, height)
         e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
@@ -171,13 +191,6 @@ def make_projection(real, camera_model: str):
         return e
 
     @wp.func
-    def sigmoid(x: real) -> real:
-        if x >= real(0.0):
-            return real(1.0) / (real(1.0) + wp.exp(-x))
-        t = wp.exp(x)
-        return t / (real(1.0) + t)
-
-    @wp.func
     def direction(mean: vec3, view: mat44) -> vec4:
         """Return the unit vector from the camera centre to the mean, and the distance; zeros where the two coincide."""
         centered = mean + vec3(
@@ -194,7 +207,7 @@ def make_projection(real, camera_model: str):
         return vec4(d[0], d[1], d[2], length * largest)
 
     return SimpleNamespace(
-        Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, direction=direction, finite3=finite3,
+        Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, opacity_of=opacity_of, direction=direction, finite3=finite3,
         rotation=r.rotation, rotation_backward=r.rotation_backward,
         axes_backward=camera.axes_backward, position_backward=camera.position_backward,
         vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.constants import LARGEST_COEFFICIENT, Rule
 from warpgs.errors import UsageError
@@ -19,6 +18,8 @@ from warpgs.kernels.project_backward import make_backward
 from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 
 PROJECTED_SIZE = 12
 """Numbers of a projected Gaussian, 16-byte aligned in float32:
@@ -26,16 +27,29 @@ PROJECTED_SIZE = 12
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
 
 
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of projected Gaussians with their tile counts, and of gradients, at each moment of a step."""
+    one = FLOAT * PROJECTED_SIZE * sizes.count
+    projected = one + FLOAT * sizes.count
+    # of chunks, the gradient of one and of all; the last copy is what statistics are computed from
+    sums = 2 * one if sizes.chunked else 0
+    return {
+        BINNING: projected + sums, LOSS: projected, BLENDING: projected + max(one, sums),
+        PROJECTION: projected + 2 * one + sizes.row * sizes.count, SAMPLING: projected,
+    }  # fmt: skip
+
+
 @functools.cache
-def make_forward(real, native: bool, camera_model: str):
+def make_forward(real, native: bool, camera_model: str, activated: bool = False):
     """Make the forward kernel.
 
     Args:
         real: wp.float32 or wp.float64.
         native: True for CUDA and float32.
         camera_model: Name of the camera model, whose functions are compiled in.
+        activated: True for scales and opacities themselves; False for their logarithms and logits.
     """
-    m = make_projection(real, camera_model)
+    m = make_projection(real, camera_model, activated)
     s = make_spans(real)
     basis = sh.make_functions(real).basis
     vec3 = m.vec3
@@ -48,7 +62,7 @@ def make_forward(real, native: bool, camera_model: str):
             projected[i, k] = values[k]
 
     store = make_native().store_row if native else store_values
-    module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}"
+    module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}{'.activated' * activated}"
 
     @wp.func
     def project_one(
@@ -66,12 +80,10 @@ def make_forward(real, native: bool, camera_model: str):
         )  # fmt: skip
         if e.valid == 0:
             return 0
-        opacity = m.sigmoid(logit_opacities[n])
+        opacity = m.opacity_of(logit_opacities[n])
         if opacity_factors.shape[0] > 0:
             opacity *= opacity_factors[n]
-        if not (wp.isfinite(logit_opacities[n]) and wp.isfinite(opacity)):
-            return 0
-        if not (opacity > real(0.0) and opacity >= alpha_cut):
+        if not (wp.isfinite(opacity) and opacity > real(0.0) and opacity >= alpha_cut):
             return 0
 
         inv_c = real(1.0) / wp.sqrt(e.c)
@@ -198,7 +210,7 @@ def project_tensors(
         settings.tile_size, settings.sh_count, rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    kernel = make_forward(real, _native(means), settings.camera_model)
+    kernel = make_forward(real, _native(means), settings.camera_model, settings.activated)
     interop.launch(kernel, cameras * count, arguments, means.device, cost=5)
     return projected, tile_counts
 
@@ -215,7 +227,7 @@ class _Project(torch.autograd.Function):
         return projected, tile_counts
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, v_projected, _):
         *inputs, projected, tile_counts = ctx.saved_tensors
         wants_camera = ctx.needs_input_grad[6] or ctx.needs_input_grad[7]  # viewmats and Ks, behind the settings
@@ -266,7 +278,7 @@ def project_gradients(
         int(wants_camera), *outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    kernel = make_backward(real, native, settings.camera_model)
+    kernel = make_backward(real, native, settings.camera_model, settings.activated)
     interop.launch(kernel, threads, arguments, device, cost=10 * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]
@@ -332,10 +344,8 @@ def project(
         distortion = viewmats.new_empty(len(viewmats), 0)
     factors = checked_factors(means, opacity_factors)
     inputs = ProjectInputs(means, quats, log_scales, logit_opacities, sh_coefficients, viewmats, Ks, distortion, factors)
-    count = sh.coefficient_count(degree)
-    return project_inputs(
-        inputs, ProjectSettings((width, height), window or (0, 0, width, height), count, rule, tile_size, camera_model)
-    )
+    count, window = sh.coefficient_count(degree), window or (0, 0, width, height)
+    return project_inputs(inputs, ProjectSettings((width, height), window, count, rule, tile_size, camera_model))
 
 
 def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[torch.Tensor, torch.Tensor]:
@@ -354,9 +364,10 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     model = CAMERA_MODELS.find(settings.camera_model)
+    scales, opacities = ("scales", "opacities") if settings.activated else ("log_scales", "logit_opacities")
     sizes = interop.check(
-        means=(inputs.means, "N 3"), quats=(inputs.quats, "N 4"), log_scales=(inputs.log_scales, "N 3"),
-        logit_opacities=(inputs.logit_opacities, "N"), sh=(inputs.sh, "N K 3"),
+        means=(inputs.means, "N 3"), quats=(inputs.quats, "N 4"),
+        **{scales: (inputs.log_scales, "N 3"), opacities: (inputs.logit_opacities, "N")}, sh=(inputs.sh, "N K 3"),
         viewmats=(inputs.viewmats, "C 4 4"), Ks=(inputs.Ks, "C 3 3"),
         distortion=(inputs.distortion, f"C {model.coefficients}"),
     )  # fmt: skip

@@ -11,9 +11,9 @@ from warpgs.kernels.native import make_functions as make_native
 
 
 @functools.cache
-def make_functions(real, camera_model: str):
+def make_functions(real, camera_model: str, activated: bool = False):
     """Make the functions that take the gradients of one projected Gaussian to those of its parameters."""
-    m = make_projection(real, camera_model)
+    m = make_projection(real, camera_model, activated)
     vec2 = m.vec2
     vec3 = m.vec3
     vec4 = m.vec4
@@ -71,6 +71,11 @@ def make_functions(real, camera_model: str):
         g0 = vec3(v_axes[0, 0], v_axes[0, 1], v_axes[0, 2])
         g1 = vec3(v_axes[1, 0], v_axes[1, 1], v_axes[1, 2])
         g2 = vec3(v_axes[2, 0], v_axes[2, 1], v_axes[2, 2])
+        if wp.static(activated):  # the axes divided by the scales, which may be 0
+            turned = rotation * m.rotation(e.quat)
+            axes0 = vec3(turned[0, 0], turned[0, 1], turned[0, 2])
+            axes1 = vec3(turned[1, 0], turned[1, 1], turned[1, 2])
+            axes2 = vec3(turned[2, 0], turned[2, 1], turned[2, 2])
         g.log_scale = wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
         v_turned = v_axes * wp.diag(e.scales)  # gradient of camera rotation times Gaussian rotation
         v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
@@ -109,14 +114,16 @@ def make_functions(real, camera_model: str):
 
     @wp.func
     def logit(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
-        """Return the gradient of the opacity's logit (section 6)."""
+        """Return the gradient of the opacity's logit, or of the opacity itself (section 6)."""
+        if wp.static(activated):
+            return v_projected[i, 5] * (projected[i, 5] / logit_opacity)  # the factor of the opacity, or 1
         return v_projected[i, 5] * projected[i, 5] * m.sigmoid(-logit_opacity)
 
     return SimpleNamespace(shape=shape, color=color, centered=centered, logit=logit)
 
 
 @functools.cache
-def make_backward(real, native: bool, camera_model: str):
+def make_backward(real, native: bool, camera_model: str, activated: bool = False):
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
     Args:
@@ -124,9 +131,10 @@ def make_backward(real, native: bool, camera_model: str):
         native: True for CUDA and float32. The Gaussians that some camera sees are then dealt to the first threads of each
             block.
         camera_model: Name of the camera model, whose functions are compiled in.
+        activated: True for scales and opacities themselves; False for their logarithms and logits.
     """
-    m = make_projection(real, camera_model)
-    f = make_functions(real, camera_model)
+    m = make_projection(real, camera_model, activated)
+    f = make_functions(real, camera_model, activated)
     functions = sh.make_functions(real)
     vec3 = m.vec3
     vec4 = m.vec4
@@ -138,7 +146,7 @@ def make_backward(real, native: bool, camera_model: str):
 
     # four blocks to a multiprocessor
     registers = {"cuda_max_registers": 128} if native else {}
-    module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}"
+    module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}{'.activated' * activated}"
 
     @wp.kernel(enable_backward=False, module=module, **registers)
     def backward(

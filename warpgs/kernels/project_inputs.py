@@ -8,6 +8,7 @@ from typing import NamedTuple, Self
 import torch
 
 from warpgs.constants import Rule
+from warpgs.errors import UsageError
 from warpgs.runtime import interop
 
 
@@ -27,6 +28,8 @@ class ProjectSettings:
     """Side of a tile [px]."""
     camera_model: str
     """Name of the camera model."""
+    activated: bool = False
+    """True where ``log_scales`` and ``logit_opacities`` of `ProjectInputs` hold scales and opacities themselves."""
 
 
 class ProjectInputs(NamedTuple):
@@ -37,9 +40,9 @@ class ProjectInputs(NamedTuple):
     quats: torch.Tensor
     """Rotations wxyz, shape [N, 4]."""
     log_scales: torch.Tensor
-    """Logarithm of the axis lengths [u], shape [N, 3]."""
+    """Logarithm of the axis lengths [u], or the lengths (`ProjectSettings.activated`), shape [N, 3]."""
     logit_opacities: torch.Tensor
-    """Inverse sigmoid of the opacity, shape [N]."""
+    """Inverse sigmoid of the opacity, or the opacity, shape [N]."""
     sh: torch.Tensor
     """Spherical-harmonics coefficients of the colour, shape [N, K, 3]."""
     viewmats: torch.Tensor
@@ -65,9 +68,12 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
 
     Raises:
         TypeError: The scalar types differ.
+        UsageError: A gradient of the factors would be recorded.
         ValueError: The shape or the device differs.
     """
     if factors is None:
         return means.new_empty(0)
     interop.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
+    if factors.requires_grad and torch.is_grad_enabled():
+        raise UsageError("opacity_factors have no gradient: detach them, or multiply the opacities themselves")
     return factors.detach()

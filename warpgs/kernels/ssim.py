@@ -8,11 +8,18 @@ from types import SimpleNamespace
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.kernels import ssim_cpu, ssim_cuda
 from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
 from warpgs.runtime import interop
+from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.step_sizes import FLOAT, StepSizes
+
+
+def difference_bytes(sizes: StepSizes) -> int:
+    """Return the bytes of `differences` and its gradient: three partials, the gradient, and on a CPU five sums a block."""
+    images = 4 * CHANNELS * FLOAT * sizes.pixels
+    return images + (0 if sizes.cuda else 5 * FLOAT * (CHANNELS * sizes.width + 2 * PADDING) * -(-sizes.height // BLOCK))
 
 
 @functools.cache
@@ -151,7 +158,7 @@ class _Ssim(torch.autograd.Function):
         return result
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, v_result):
         image, target, *partials = ctx.saved_tensors
         if _native(image):
@@ -188,7 +195,7 @@ class _Differences(torch.autograd.Function):
         return sums.sum(0)
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, v_sums):
         image, target, *partials = ctx.saved_tensors
         if _native(image):

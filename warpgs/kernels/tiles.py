@@ -14,6 +14,7 @@ from warpgs.kernels.tiles_emit import make_emit, make_find_ranges
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
+from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
 
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
@@ -60,9 +61,59 @@ class Tiles:
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
+@dataclass(frozen=True)
+class InstanceMemory:
+    """Memory that the (Gaussian, tile) instances of a render may take."""
+
+    budget: int | None = None
+    """Bytes; None for four fifths of what is free."""
+    capacity: int | None = None
+    """Number of instances to allocate for, without asking the device how many there are, so that the work can be captured as a
+    CUDA graph; None for as many as there are. Unused entries are marked as no tile's."""
+    overflow: torch.Tensor | None = None
+    """Set to 1 where there are more instances than the capacity: the lists are then cut short and must not be used. Int32,
+    shape [1]; needed with a capacity."""
+    allocator: Allocator = TORCH
+    """Provider of the lists' memory."""
+
+
+AS_NEEDED = InstanceMemory()
+"""Memory for as many instances as there are."""
+
+
 def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
     """Return the columns and rows of tiles that cover an image."""
     return -(-width // tile_size), -(-height // tile_size)
+
+
+def _checked_counts(projected: torch.Tensor, tile_counts: torch.Tensor) -> torch.Tensor:
+    """Return the tile counts by flat Gaussian number, int32, shape [C * N]; ValueError where a shape or type is wrong."""
+    sizes = interop.check(projected=(projected, "C N 12"))
+    if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
+        raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
+    return tile_counts.contiguous().view(-1)
+
+
+def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int:
+    """Return the number of tiles of all images; ResourceError where there are more than can be numbered."""
+    columns, rows = grid(width, height, tile_size)
+    tiles = cameras * columns * rows
+    if tiles > interop.MAX_SIZE:
+        raise ResourceError(
+            f"{cameras:,} images of {width} x {height} px have {tiles:,} tiles of {tile_size} px, beyond the "
+            f"{interop.MAX_SIZE:,} that can be numbered; render fewer cameras at once, or a window of each"
+        )
+    return tiles
+
+
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of the lists at each moment of a step; the owners of instances are given up once these are sorted."""
+    columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
+    ranges = 2 * FLOAT * columns * rows + (FLOAT + 8) * sizes.count  # of each tile; first slots and ends of each Gaussian
+    sorting = (2 * 2 * FLOAT + 2 * 8) * sizes.count  # depths and order twice, two running sums of int64
+    lists, kept = LIST_BYTES * sizes.instances, (LIST_BYTES - FLOAT) * sizes.instances
+    waiting = 0 if sizes.chunked else ranges + kept  # nothing of a chunk waits for the loss
+    return {BINNING: ranges + sorting + lists, LOSS: waiting, BLENDING: ranges + kept, SAMPLING: ranges + lists}
 
 
 @functools.cache
@@ -150,9 +201,8 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
 
 
 def _depth_order(
-    projected: torch.Tensor, counts: torch.Tensor, tiles: int, *,
-    budget_bytes: int | None, capacity: int | None, allocator: Allocator,
-) -> tuple[torch.Tensor, int, int]:  # fmt: skip
+    projected: torch.Tensor, counts: torch.Tensor, tiles: int, memory: InstanceMemory
+) -> tuple[torch.Tensor, int, int]:
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
 
     With a capacity nothing is read from the device: all Gaussians count as visible, those that are not come last, and the
@@ -161,22 +211,22 @@ def _depth_order(
     device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
     projected_view, counts_view = interop.view(projected, real), interop.view(counts, wp.int32)
-    if capacity is not None:
-        visible, total = count, capacity
+    if memory.capacity is not None:
+        visible, total = count, memory.capacity
     else:
         if count * tiles >= VISIBLE or count > MAX_VISIBLE:
             many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
-            _check_total(*reversed(many.tolist()), device, tiles, budget_bytes)
+            _check_total(*reversed(many.tolist()), device, tiles, memory.budget)
         # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
         sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-        packed = allocator.workspace((sums,), torch.int64, device)
+        packed = memory.allocator.workspace((sums,), torch.int64, device)
         interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
         torch.cumsum(packed, 0, out=packed)
         visible, total = divmod(int(packed[-1]), VISIBLE)
-        _check_total(total, visible, device, tiles, budget_bytes)
-    depths, order = (allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
+        _check_total(total, visible, device, tiles, memory.budget)
+    depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
     depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
-    if capacity is not None:
+    if memory.capacity is not None:
         interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
     else:
         inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
@@ -185,21 +235,33 @@ def _depth_order(
     return order, visible, total
 
 
+def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, allocator: Allocator) -> torch.Tensor:
+    """Return one past the last slot of each visible Gaussian from front to back, int64, shape [max(visible, 1)]."""
+    ends = allocator.saved((max(visible, 1),), torch.int64, counts.device)
+    inputs = [interop.view(order, wp.int32), interop.view(counts, wp.int32), interop.view(ends, wp.int64)]
+    interop.launch(kernel, visible, inputs, counts.device)
+    return torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
+
+
+def _sort_by_tile(
+    keys: torch.Tensor, slots: torch.Tensor, owners: torch.Tensor, ranges: torch.Tensor, total: int, slotted: bool
+) -> torch.Tensor:
+    """Sort the instances stably by tile, fill in the range of each, and return their Gaussian numbers, int32, shape [M].
+
+    ``keys`` and ``slots`` are sort buffers [2 M], ``owners`` [M], or [0] without ``slotted``; ``ranges`` [C * tiles, 2].
+    """
+    no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
+    keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
+    wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
+    inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
+    interop.launch(make_find_ranges(slotted), total, inputs, keys.device)
+    return ids
+
+
 def bin_tiles(
-    projected: torch.Tensor,
-    tile_counts: torch.Tensor,
-    *,
-    width: int,
-    height: int,
-    tile_size: int = TILE_SIZE,
-    rule: Rule,
-    budget_bytes: int | None = None,
-    capacity: int | None = None,
-    overflow: torch.Tensor | None = None,
-    origin: tuple[int, int] = (0, 0),
-    allocator: Allocator = TORCH,
-    slotted: bool = True,
-) -> Tiles:
+    projected: torch.Tensor, tile_counts: torch.Tensor, *, width: int, height: int, rule: Rule, tile_size: int = TILE_SIZE,
+    origin: tuple[int, int] = (0, 0), memory: InstanceMemory = AS_NEEDED, slotted: bool = True,
+) -> Tiles:  # fmt: skip
     """Return for every tile the Gaussians that touch it, front to back. Not differentiable.
 
     Args:
@@ -207,19 +269,11 @@ def bin_tiles(
         tile_counts: Tiles that each touches, int32, shape [C, N].
         width: Image width [px].
         height: Image height [px].
-        tile_size: Side of a tile [px].
         rule: Cut-offs, the same as given to `project`.
-        budget_bytes: Memory that the instances may take; None for four fifths of the free memory.
-        capacity: Number of instances to allocate memory for, instead of asking the device how many there are, so that the work
-            can be captured as a CUDA graph. Unused entries are marked as no tile's.
-        overflow: Set to 1 where there are more instances than ``capacity``: the lists are then cut short and must not be
-            used. Int32, shape [1]; needed with ``capacity``.
+        tile_size: Side of a tile [px].
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
-        allocator: Provider of the lists' memory.
+        memory: Memory of the instances; M is its capacity where it has one.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
-
-    Returns:
-        Sorted instances; M is ``capacity`` where one is given.
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
@@ -227,50 +281,31 @@ def bin_tiles(
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
-    sizes = interop.check(projected=(projected, "C N 12"))
-    if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
-        raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
-    device, real, native = projected.device, interop.real_of(projected), projected.is_cuda
-    k = make_kernels(real, native)
-    (columns, rows), count = grid(width, height, tile_size), sizes["C"] * sizes["N"]
-    tiles, no_tile = columns * rows, sizes["C"] * columns * rows
-    if no_tile > interop.MAX_SIZE:
-        raise ResourceError(
-            f"{sizes['C']:,} images of {width} x {height} px have {no_tile:,} tiles of {tile_size} px, beyond the "
-            f"{interop.MAX_SIZE:,} that can be numbered; render fewer cameras at once, or a window of each"
-        )
-    counts = tile_counts.contiguous().view(-1)
+    counts, (columns, rows) = _checked_counts(projected, tile_counts), grid(width, height, tile_size)
+    cameras, per_camera = tile_counts.shape
+    no_tile = _checked_tiles(cameras, width, height, tile_size)
+    device, real, native, allocator = projected.device, interop.real_of(projected), projected.is_cuda, memory.allocator
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()
-    if count == 0:
+    if len(counts) == 0:
         return Tiles(tile_size, ranges, counts, counts, counts, counts, counts, counts.new_zeros(1, dtype=torch.int64))
 
-    projected = projected.detach().contiguous().view(count, -1)
-    projected_view, counts_view, fixed = interop.view(projected, real), interop.view(counts, wp.int32), capacity is not None
+    projected = projected.detach().contiguous().view(len(counts), -1)
     with interop.stream_of(device):
-        limits = {"budget_bytes": budget_bytes, "capacity": capacity, "allocator": allocator}
-        order, visible, total = _depth_order(projected, counts, tiles, **limits)
-        order_view = interop.view(order, wp.int32)
-        ends = allocator.saved((max(visible, 1),), torch.int64, device)
-        ends_view = interop.view(ends, wp.int64)
-        interop.launch(k.ordered_counts, visible, [order_view, counts_view, ends_view], device)
-        ends = torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
-        starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (count, 2 * total, 2 * total))
+        order, visible, total = _depth_order(projected, counts, columns * rows, memory)
+        ends = _slot_ends(order, counts, visible, make_kernels(real, native).ordered_counts, allocator)
+        starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
         owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
-        if fixed:
+        if memory.capacity is not None:
             keys[:total].fill_(no_tile)
-        keys_view, slots_view, owners_view = (interop.view(t, wp.int32) for t in (keys, slots, owners))
+        overflow = starts if memory.capacity is None else memory.overflow
         inputs = [
-            projected_view, order_view, counts_view, ends_view, visible, sizes["N"],
-            *origin, width, height, tile_size, rule.alpha_cut, rule.square_sigma, columns, tiles, no_tile, total,
-            interop.view(starts, wp.int32), keys_view, slots_view, owners_view,
-            interop.view(overflow if fixed else starts, wp.int32),
+            interop.view(projected, real), interop.view(order, wp.int32), interop.view(counts, wp.int32),
+            interop.view(ends, wp.int64), visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
+            rule.square_sigma, columns, columns * rows, no_tile, total,
+            *(interop.view(t, wp.int32) for t in (starts, keys, slots, owners, overflow)),
         ]  # fmt: skip
         threads = -(-visible // 256) * 256 if native else visible
         interop.launch(make_emit(real, native, slotted), threads, inputs, device, cost=10)
-        wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
-        ids = slots[total:] if slotted else slots[:total]  # the second half of the sorted buffers is free again
-        outputs = [interop.view(ids, wp.int32), interop.view(ranges, wp.int32)]
-        inputs = [keys_view, slots_view, owners_view, total, no_tile, *outputs]
-        interop.launch(make_find_ranges(slotted), total, inputs, device)
+        ids = _sort_by_tile(keys, slots, owners, ranges, total, slotted)
     own_slots = slots[: total if slotted else 0]
     return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible)

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render.compose import Images, bin_and_blend, bin_projected, median_depth_of, weights_of
 from warpgs.render.settings import RenderSettings, Window
+from warpgs.runtime.derivatives import first_order
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class _BlendChunked(torch.autograd.Function):
         return tuple(images)
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx, *upstream):
         *blended, colors = ctx.saved_tensors[:3]
         inputs, frame = ProjectInputs(*ctx.saved_tensors[3:]).detached(), ctx.frame

@@ -1,7 +1,7 @@
 """Project, bin, blend: the one way from Gaussians to images.
 
-`rasterize`, chunked and graphed rendering and the training step all come here, each with its own memory: what a render
-depends on (camera model, channels, cut-offs, window) stands in `RenderSettings` and `ProjectInputs`, and nowhere else.
+`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. Camera
+model, channels, cut-offs and window of a render are in `RenderSettings` and `ProjectInputs`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -18,32 +18,17 @@ from warpgs.kernels.blend_channels import blend_channels
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
-from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
-from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
 
 
 @dataclass(frozen=True)
-class InstanceMemory:
-    """Memory that the (Gaussian, tile) instances of a render may take."""
-
-    budget: int | None = None
-    """Bytes; None for four fifths of what is free."""
-    capacity: int | None = None
-    """Number of instances to allocate for, without asking the device how many there are; None for as many as there are."""
-    overflow: torch.Tensor | None = None
-    """Set to 1 where there are more instances than the capacity; int32, shape [1]."""
-    allocator: Allocator = TORCH
-    """Provider of the lists' memory."""
-
-
-@dataclass(frozen=True)
 class Composed:
-    """A render with what it was made of."""
+    """A render, with its projected Gaussians and their tiles."""
 
     images: Images
     """Colour, alpha and depth."""
@@ -56,14 +41,16 @@ class Composed:
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return an array of one camera or of a batch, of ``axes`` axes each, as a tensor [C, ...] of the type of ``like``."""
+    """Return an array as a tensor [C, ...] of the type of ``like``; that of a single camera has ``axes`` axes."""
     tensor: torch.Tensor = array
     if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
         tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
     return tensor[None] if tensor.ndim == axes else tensor
 
 
-def inputs_of(gaussians: Gaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
+def inputs_of(
+    gaussians: Gaussians | ActivatedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None
+) -> ProjectInputs:
     """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
 
     Args:
@@ -92,7 +79,7 @@ def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> Render
 
 
 def bin_projected(
-    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory(),
+    projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     slotted: bool = True,
 ) -> Tiles:  # fmt: skip
     """Return the instances of each tile of the window.
@@ -108,13 +95,12 @@ def bin_projected(
         ResourceError: There are more than memory allows.
     """
     return bin_tiles(
-        projected, tile_counts, tile_size=settings.tile_size, budget_bytes=memory.budget, capacity=memory.capacity,
-        overflow=memory.overflow, allocator=memory.allocator, slotted=slotted, **settings.of_window(),
-    )  # fmt: skip
+        projected, tile_counts, tile_size=settings.tile_size, memory=memory, slotted=slotted, **settings.of_window()
+    )
 
 
 def compose(
-    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = InstanceMemory(),
+    inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     deterministic: bool = True,
 ) -> Composed:  # fmt: skip
     """Render the window of a batch of cameras. Differentiable as `project` and `blend` are.
@@ -139,15 +125,15 @@ def compose(
 
 def bin_and_blend(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
-    memory: InstanceMemory = InstanceMemory(), deterministic: bool = True, colors: torch.Tensor | None = None,
+    memory: InstanceMemory = AS_NEEDED, deterministic: bool = True, colors: torch.Tensor | None = None,
 ) -> tuple[Tiles, Images]:  # fmt: skip
-    """Return the instances and the images of projected Gaussians [C, N, 12], see `compose` and `images_of`."""
+    """Bin and blend projected Gaussians [C, N, 12]; arguments are those of `compose` and `images_of`."""
     tiles = bin_projected(projected, tile_counts, settings, memory, needs_slots((projected, backgrounds, colors)))
     return tiles, images_of(projected, tiles, backgrounds, settings, deterministic, colors)
 
 
 def needs_slots(tensors: Iterable[torch.Tensor | None]) -> bool:
-    """Return whether gradients of a render may be asked for: those of tensors of any shape [...]."""
+    """Return whether autograd is on and one of the tensors, of any shape [...], requires gradients."""
     return torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
 
 
@@ -165,7 +151,7 @@ def images_of(
         deterministic: True to sum gradients in a fixed order.
         colors: Channels of each Gaussian, shape [1, N, D] or [C, N, D]; None for their own colours.
     """
-    named = {"deterministic": deterministic, **settings.of_window()}
+    named = {"deterministic": deterministic, "absgrad": settings.absgrad, **settings.of_window()}
     if colors is None:
         return blend(projected, tiles, backgrounds, **named)
     return blend_channels(projected, tiles, colors, backgrounds, **named)
@@ -191,14 +177,14 @@ def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Return instances, and images with what their gradients take; none is recorded, and all memory is the allocator's.
+    """Bin and blend without autograd, in memory of the allocator; returns what the backward pass needs, too.
 
     Args:
         projected: Projected Gaussians, contiguous, shape [C, N, 12].
         tile_counts: Number of tiles that each touches, int32, shape [C, N].
         backgrounds: Colour behind everything, contiguous, shape [C, 3].
         settings: Settings of the render.
-        memory: Memory of the instances, and of all else.
+        memory: Memory of the instances; its allocator provides all other tensors.
 
     Returns:
         The instances, and the tensors [...] that `blending.composite` returns.

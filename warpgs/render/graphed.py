@@ -15,17 +15,17 @@ import weakref
 
 import torch
 import warp as wp
-from torch.autograd.function import once_differentiable
 
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, Tiles
-from warpgs.render.compose import InstanceMemory, composite_into, count_instances
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles
+from warpgs.render.compose import composite_into, count_instances
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
 from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphedFunction, GraphPool
+from warpgs.runtime.derivatives import first_order
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
@@ -97,7 +97,7 @@ class GraphedRasterizer:
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
         images, block = self._forward_blend(*projection, backgrounds.detach())
-        projected = _projected(*inputs[:7], self, cameras, projection)
+        projected = _projected(self, cameras, projection, *inputs[:7])
         images = _blended(projected, backgrounds, self, projection[1], images, block)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
@@ -179,32 +179,21 @@ class GraphedRasterizer:
         return *found, None, None
 
 
-def _once(backward):
-    """Wrap a backward function as torch's `once_differentiable` does, but only where a gradient of it is possible."""
-    checked = once_differentiable(backward)
-
-    @functools.wraps(backward)
-    def once(ctx, *gradients):
-        return (checked if torch.is_grad_enabled() else backward)(ctx, *gradients)
-
-    return once
-
-
 class _Projected(torch.autograd.Function):
     """The projected Gaussians as an autograd result of the seven tensors."""
 
     @staticmethod
-    def forward(ctx, means, quats, log_scales, logit_opacities, coefficients, viewmats, Ks, rasterizer, cameras, projection):
-        ctx.save_for_backward(means, quats, log_scales, logit_opacities, coefficients, cameras, *projection)
+    def forward(ctx, rasterizer, cameras, projection, *inputs):
+        ctx.save_for_backward(*inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
         ctx.rasterizer = rasterizer
         ctx.set_materialize_grads(False)
         return projection[0]
 
     @staticmethod
-    @_once
+    @first_order
     def backward(ctx, v_projected):
-        wants_camera = ctx.needs_input_grad[5] or ctx.needs_input_grad[6]
-        return *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera), None, None, None
+        wants_camera = ctx.needs_input_grad[8] or ctx.needs_input_grad[9]  # viewmats and Ks
+        return None, None, None, *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera)
 
 
 class _Blended(torch.autograd.Function):
@@ -219,7 +208,7 @@ class _Blended(torch.autograd.Function):
         return tuple(images)
 
     @staticmethod
-    @_once
+    @first_order
     def backward(ctx, *v_images):
         return *ctx.rasterizer.blend_gradients(ctx.saved_tensors, v_images, ctx.needs_input_grad[1]), None, None, None, None
 

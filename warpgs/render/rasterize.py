@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from warpgs.constants import RULES, Rule
-from warpgs.errors import UsageError
+from warpgs.constants import Rule
+from warpgs.errors import ResourceError, UsageError
+from warpgs.field_docs import document_fields
+from warpgs.kernels.blend_records import WIDTHS
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
+from warpgs.kernels.tiles import InstanceMemory
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
 from warpgs.render.compose import (
-    InstanceMemory,
     bin_projected,
     images_of,
     inputs_of,
@@ -26,19 +28,28 @@ from warpgs.render.compose import (
     weights_of,
 )  # fmt: skip
 from warpgs.render.settings import RenderSettings, Window
+from warpgs.rules import rule_named
 from warpgs.runtime import interop
-from warpgs.scene import Camera, Gaussians, Render
+from warpgs.runtime.derivatives import refuse_transforms
+from warpgs.runtime.device_memory import available_bytes, installed_bytes
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Render
 
 TILE_SIZES = (8, 16)
 """Sides of a tile that the kernels can be made for [px]."""
 
+BOUND_ROUNDING = 2.0**-29
+"""Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
+colour is off by at most 2 e: an alpha moves its weight between its own colour and those behind, and the weights sum to 1. The
+unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
 
+
+@document_fields
 @dataclass(frozen=True)
 class RasterizeOptions:
     """Options of `rasterize`; the defaults are exact."""
 
     rule: str | Rule = "exact"
-    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat, inria, or a `Rule` of your own."""
+    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     sh_degree: int | None = None
     """Spherical-harmonics degree used; None for all that is stored."""
     background: torch.Tensor | None = None
@@ -58,10 +69,17 @@ class RasterizeOptions:
     """True to report sum and maximum of each Gaussian's blending weight, too."""
     median_depth: bool = False
     """True to render the depth at which transmittance falls to one half, too."""
+    error_bound: bool = False
+    """True to bound the error of ``rgb`` against rule `exact`, too: for each pixel the distance of this render from one under
+    `exact` in float64, plus the rounding of float64. So it covers cut-offs and float32 together. It costs a render in float64,
+    several times the time of one in float32 (docs/trade.md). Not with ``capacity``."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
     """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
+    absgrad: bool = False
+    """True to sum magnitudes of the gradients of projected means over pixels, too: ``Render.means2d.absgrad``. At most 11
+    channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
@@ -75,18 +93,20 @@ class RasterizeOptions:
     gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
     """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
-    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth and limits
-    (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
+    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth, error bound and
+    limits (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
     torch.cuda.synchronize does."""
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
         others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
-        plain = self.record and self.deterministic and not self.contributions and not self.median_depth
-        return plain and all(o is None for o in others)
+        extra = self.contributions or self.median_depth or self.absgrad or self.error_bound
+        return self.record and self.deterministic and not extra and all(o is None for o in others)
 
 
-ARGUMENTS = (Gaussians, Camera, RasterizeOptions)
+K_TOLERANCE = 1e-5
+"""Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""
+ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
@@ -96,31 +116,38 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     Raises:
         UsageError: The rule, the tile size or the camera model is unknown, or options exclude each other.
     """
-    rule = options.rule if isinstance(options.rule, Rule) else RULES.get(options.rule)
-    if rule is None:
-        raise UsageError(f"unknown rule {options.rule!r}: choose one of {', '.join(RULES)}, or give a Rule")
+    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
+    channels = 0 if options.colors is None else options.colors.shape[-1]
+    if options.absgrad and (options.features is not None or channels > WIDTHS[-1]):
+        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
+    if options.error_bound and options.capacity is not None:
+        raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
     return rule
 
 
-def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> None:
+def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
-    Nothing is read from the device: values are not checked, and a Gaussian that is not finite is culled.
+    Nothing is read from a GPU: a K there is taken as it is, other values are not checked, and a Gaussian that is not finite is
+    culled.
 
     Raises:
         TypeError: An argument, or the size of the image, is of another type.
-        UsageError: A background has nothing before it.
-        ValueError: A shape is another.
+        UsageError: A background has nothing before it, or Gaussians have no colours.
+        ValueError: A shape is another, or K has a skew or another last row than 0, 0, 1.
     """
-    for name, given, kind in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
-        if not isinstance(given, kind):
+    for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
+        if not isinstance(given, kinds):
             order = "the order is rasterize(gaussians, camera, options)"
-            raise TypeError(f"{name} must be of {kind.__name__}, not {type(given).__name__}; {order}")
+            wanted = " or ".join(kind.__name__ for kind in kinds)
+            raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
+    if gaussians.sh is None and options.colors is None:
+        raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
     for name, tensor in gaussians.tensors().items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}; torch.as_tensor makes one")
@@ -128,13 +155,21 @@ def _check_arguments(gaussians: Gaussians, camera: Camera, options: RasterizeOpt
         shape = tuple(np.shape(getattr(camera, name)))
         if len(shape) not in (2, 3) or shape[-2:] != (rows, rows):
             raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
+    K = camera.K
+    if not (isinstance(K, torch.Tensor) and K.is_cuda):
+        fixed = torch.as_tensor(K)[..., (0, 1, 2, 2, 2), (1, 0, 0, 1, 2)] - torch.tensor([0, 0, 0, 0, 1])
+        if not bool((fixed.abs() <= K_TOLERANCE).all()):
+            raise ValueError(
+                "camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
+                "undistort images with skew"
+            )
     for name in ("width", "height"):
         size = getattr(camera, name)
         if not isinstance(size, (int, np.integer)):
             raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
     if options.feature_background is not None and options.features is None:
         raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
-    sh = gaussians.sh
+    sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
 
@@ -170,6 +205,20 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
+def _check_memory(window: Window, layers: list[_Layer], like: torch.Tensor) -> None:
+    """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
+    channels = sum(layer.backgrounds.shape[1] + 4 for layer in layers)  # and alpha, depth, transmittance, sum of weights
+    needed = len(layers[0].backgrounds) * window[2] * window[3] * channels * like.element_size()
+    if needed < installed_bytes(like.device) // 20:  # asking for what is free takes 0.1 ms
+        return
+    free = available_bytes(like.device)
+    if needed > free:
+        raise ResourceError(
+            f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
+            "smaller images, fewer cameras at once, or parts of an image by RasterizeOptions(window=...)"
+        )
+
+
 class _Layer(NamedTuple):
     """Values that are blended into one image."""
 
@@ -192,36 +241,46 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
-def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
+def rasterize(
+    gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()
+) -> Render:
     """Render Gaussians as one camera, or each camera of a batch, sees them.
 
     Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
     tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
-    backgrounds are moved to the type and device of ``gaussians.means``.
+    backgrounds are moved to the type and device of ``gaussians.means``. There are no second derivatives, torch.func is refused,
+    and torch.compile breaks its graph here.
 
     Args:
-        gaussians: The scene, N Gaussians.
+        gaussians: N Gaussians: by log scales and logits (`Gaussians`), or by scales and opacities (`ActivatedGaussians`).
         camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera. To get gradients of the projected means, call
-        ``render.projected.retain_grad()`` before the backward pass: they are ``render.projected.grad[..., :2]``.
+        The images, without a leading axis for a single camera. ``render.means2d``, read before the backward
+        pass, holds the gradients of the projected means after it.
 
     Raises:
-        ResourceError: The Gaussians touch more tiles than memory allows.
+        ResourceError: The images, or the tiles that the Gaussians touch, need more memory than there is.
         TypeError: An argument is of another type; a scalar type is neither float32 nor float64, or they differ.
-        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, or options exclude each
-            other.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
+            other, a transform of torch.func is active, or a second derivative is asked for.
+        ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
+            a GPU, has a skew or another last row than 0, 0, 1.
     """
+    if torch.compiler.is_dynamo_compiling():
+        torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
+        eager: Render = torch.compiler.disable(rasterize)(gaussians, camera, options)
+        return eager
+    refuse_transforms()
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
-    settings = settings_of(camera, degree, rule, window=_checked_window(camera, options), tile_size=options.tile_size)
+    named = {"window": _checked_window(camera, options), "tile_size": options.tile_size, "absgrad": options.absgrad}
+    settings = settings_of(camera, degree, rule, activated=isinstance(gaussians, ActivatedGaussians), **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if inputs.means.is_cuda and options.repeatable():
@@ -232,8 +291,31 @@ def rasterize(gaussians: Gaussians, camera: Camera, options: RasterizeOptions = 
     layers = [_layer("background", options.background, colors, inputs)]
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
+    _check_memory(settings.window, layers, inputs.means)
     *found, features_found, median = _rasterize(inputs, layers, settings, options)
-    return _as_render(camera, *found, features=features_found, median_depth=median)
+    render = _as_render(camera, *found, features=features_found, median_depth=median)
+    bound = _error_bound(render.rgb.detach(), gaussians, camera, options) if options.error_bound else None
+    return replace(render, absgrad=options.absgrad, error_bound=bound)
+
+
+@torch.no_grad()
+def _error_bound(
+    rgb: torch.Tensor, gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions
+) -> torch.Tensor:
+    """Return the bound of the error of colours [..., H, W, D], shape [..., H, W]; see `RasterizeOptions.error_bound`."""
+
+    def doubled(holder: Any) -> dict[str, Any]:
+        values = {f.name: getattr(holder, f.name) for f in fields(holder)}
+        return {n: v.double() if isinstance(v, torch.Tensor) else v for n, v in values.items()}
+
+    only_rgb = {"features": None, "feature_background": None, "contributions": False, "median_depth": False, "absgrad": False}
+    reference = RasterizeOptions(**doubled(options) | only_rgb | {"rule": "exact", "error_bound": False, "record": False})
+    found = rasterize(type(gaussians)(**doubled(gaussians)), Camera(**doubled(camera)), reference)
+    colors = found.projected[..., 6:9] if reference.colors is None else reference.colors
+    background = found.rgb.new_zeros(1) if reference.background is None else torch.as_tensor(reference.background).to(found.rgb)
+    largest = torch.cat([colors.reshape(-1), background.reshape(-1)]).abs().amax()
+    bound = (rgb - found.rgb).abs().amax(-1) + BOUND_ROUNDING * largest
+    return torch.nextafter(bound.to(rgb.dtype), torch.full_like(bound, torch.inf, dtype=rgb.dtype))
 
 
 def _rasterize(
@@ -270,4 +352,6 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
     def own(image: torch.Tensor) -> torch.Tensor:
         return image.squeeze(0) if single else image  # not image[0], whose gradient would be a copy among zeros
 
-    return Render(*map(own, images), *rest, **{name: own(image) for name, image in maps.items() if image is not None})
+    shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
+    rgb, alpha, depth = map(own, images)
+    return Render(rgb, alpha, depth, *rest, **shaped)

@@ -32,11 +32,15 @@ class RenderSettings:
     """Side of a tile [px]."""
     camera_model: str = "pinhole"
     """Name of the camera model."""
+    activated: bool = False
+    """True where scales and opacities are given themselves (`ProjectSettings.activated`)."""
+    absgrad: bool = False
+    """True to sum magnitudes of the gradients of projected means, too (`BlendSettings.absgrad`)."""
 
     def projection(self) -> ProjectSettings:
         """Return what the projection takes."""
         size, count = (self.width, self.height), sh.coefficient_count(self.degree)
-        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, self.camera_model)
+        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, self.camera_model, self.activated)
 
     def of_window(self) -> dict[str, Any]:
         """Return size, place and cut-offs of the window, as binning and blending take them by name."""
@@ -46,4 +50,4 @@ class RenderSettings:
     def blending(self, deterministic: bool = True) -> BlendSettings:
         """Return what blending takes; ``deterministic`` sums gradients in a fixed order."""
         x, y, width, height = self.window
-        return BlendSettings((x, y), width, height, self.rule, deterministic)
+        return BlendSettings((x, y), width, height, self.rule, deterministic, self.absgrad)

@@ -161,71 +161,87 @@ def _without_folders(value: object) -> object:
     return PureWindowsPath(value).name if absolute else value  # its separators are / and \\
 
 
-def write_page(
-    path: Path,
-    *,
-    title: str,
-    subtitle: str,
-    figures: list[tuple[str, str]],
-    notes: list[str],
-    table: list[list[str]],
-    views: list[ViewImages],
-    curves: list[str],
-    sampling: SamplingReport | None,
-    overview: bytes | None,
-    protocol: dict[str, str],
-    details: dict,
-    coverage: CoverageReport | None = None,
-    held_out: bool = True,
-) -> None:
-    """Write the report page: one file that refers to nothing outside it.
+@dataclass(frozen=True)
+class Page:
+    """Contents of a report page."""
 
-    Args:
-        path: The HTML file.
-        title: Headline.
-        subtitle: A line under it.
-        figures: Label and value of each key figure.
-        notes: Choices made for the user; a `Detail` stands in the last section.
-        table: Header row, then a row per held-out view.
-        views: Images of views.
-        curves: SVG charts.
-        sampling: The fit's sampling events, or None where it had none.
-        overview: Image of cameras and points, or None.
-        protocol: Settings in which two scores must agree to be compared, and the definition of each figure, by name.
-        details: Configuration, versions and data, shown as JSON on request; of paths the last name alone.
-        coverage: Scores of held-out views by what training views saw, or None.
-        held_out: Whether the views are held out; else the fit was trained on them.
+    title: str
+    """Headline."""
+    subtitle: str
+    """Line under it."""
+    figures: list[tuple[str, str]]
+    """Label and value of each key figure."""
+    notes: list[str]
+    """Choices made for the user; a `Detail` stands in the last section."""
+    table: list[list[str]]
+    """Header row, then a row per held-out view."""
+    views: list[ViewImages]
+    """Images of views."""
+    curves: list[str]
+    """SVG charts."""
+    sampling: SamplingReport | None
+    """The fit's sampling events, or None where it had none."""
+    overview: bytes | None
+    """Image of cameras and points, or None."""
+    protocol: dict[str, str]
+    """Settings in which two scores must agree to be compared, and the definition of each figure, by name."""
+    details: dict
+    """Configuration, versions and data, shown as JSON on request; of paths the last name alone."""
+    coverage: CoverageReport | None = None
+    """Scores of held-out views by what training views saw, or None."""
+    held_out: bool = True
+    """True where the views are held out; False where the fit was trained on them."""
+
+
+def write_page(path: Path, page: Page) -> None:
+    """Write the report page: one HTML file that refers to nothing outside it.
 
     Raises:
         ResourceError: The file cannot be written.
     """
-    cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)
-    sections = [
-        f'<h1>{html.escape(title)}</h1><p class="sub">{html.escape(subtitle)}</p>',
-    ]
-    if overview:
-        sections.append(f'<div class="first">{_figure(overview, OVERVIEW + (HELD_OUT if held_out else ""))}</div>')
-    sections.append(f'<div class="figures">{cells}</div>')
-    choices = [n for n in notes if not isinstance(n, Detail)]
-    if choices:
-        sections.append(f"<h2>Choices made for you</h2>{_list(choices)}")
-    if views:
-        heading = "Views the fit has not seen" if held_out else "Views the fit was trained on"
-        sections.append(f"<h2>{heading}</h2>{''.join(map(_view, views))}")
-    if len(table) > 1:
-        sections.append("<h2>Scores</h2>" + _table(table))
-    if coverage:
-        sections.append(_coverage(coverage))
-    if protocol:
-        items = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in protocol.items())
+    write_text(path, _document(page.title, "".join([*_head(page), *_scores(page), *_fit(page)])))
+
+
+def _head(page: Page) -> list[str]:
+    """Return the sections above the scores: title, overview, key figures, choices made for the user."""
+    cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in page.figures)
+    overview = []
+    if page.overview:
+        caption = OVERVIEW + (HELD_OUT if page.held_out else "")
+        overview = [f'<div class="first">{_figure(page.overview, caption)}</div>']
+    choices = [n for n in page.notes if not isinstance(n, Detail)]
+    return [
+        f'<h1>{html.escape(page.title)}</h1><p class="sub">{html.escape(page.subtitle)}</p>', *overview,
+        f'<div class="figures">{cells}</div>', *([f"<h2>Choices made for you</h2>{_list(choices)}"] if choices else []),
+    ]  # fmt: skip
+
+
+def _scores(page: Page) -> list[str]:
+    """Return the sections on views, their scores and how these were made."""
+    sections = []
+    if page.views:
+        heading = "Views the fit has not seen" if page.held_out else "Views the fit was trained on"
+        sections.append(f"<h2>{heading}</h2>{''.join(map(_view, page.views))}")
+    if len(page.table) > 1:
+        sections.append("<h2>Scores</h2>" + _table(page.table))
+    if page.coverage:
+        sections.append(_coverage(page.coverage))
+    if page.protocol:
+        items = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in page.protocol.items())
         sections.append(f"<h2>How it was scored</h2><dl>{items}</dl>")
-    if curves:
-        sections.append(f'<h2>The fit</h2><div class="curves">{"".join(curves)}</div>')
-    if sampling:
-        sections.append(_sampling(sampling))
-    settings = html.escape(json.dumps(_without_folders(details), indent=1))
-    sections.append(
-        f"<h2>Details</h2>{_list([n for n in notes if isinstance(n, Detail)])}"
-        f"<details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>"
-    )
-    write_text(path, _document(title, "".join(sections)))
+    return sections
+
+
+def _fit(page: Page) -> list[str]:
+    """Return the sections on the fit: charts, sampling events, details."""
+    sections = []
+    if page.curves:
+        sections.append(f'<h2>The fit</h2><div class="curves">{"".join(page.curves)}</div>')
+    if page.sampling:
+        sections.append(_sampling(page.sampling))
+    settings = html.escape(json.dumps(_without_folders(page.details), indent=1))
+    details = _list([n for n in page.notes if isinstance(n, Detail)])
+    return [
+        *sections,
+        f"<h2>Details</h2>{details}<details><summary>configuration, versions, data</summary><pre>{settings}</pre></details>",
+    ]

@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 from filelock import lock_descriptor
 
+from warpgs import schema
 from warpgs.errors import FolderHeldError, ResourceError
 from warpgs.files import LOCK, remove_leftovers, writing_into
 from warpgs.output_folders import Folder, RefusedError, open_folder
@@ -148,7 +149,7 @@ def _signed(file: BinaryIO) -> str | None:
     """Return who signed a lock file; None where nobody did, or not to the end."""
     try:
         file.seek(1)
-        found = json.loads(file.read())
+        found = schema.parse(file.read(schema.MAX_BYTES))
         command = found["command"] if len(found["command"]) <= MOST_LETTERS else f"{found['command'][:MOST_LETTERS]}..."
         return f"process {found['process']} on {found['host']}, since {found['since']}, `{command}`,"
     except (OSError, ValueError, KeyError, TypeError):

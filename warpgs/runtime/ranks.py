@@ -21,6 +21,7 @@ from warpgs.runtime.terminal import say
 
 if TYPE_CHECKING:
     import torch
+    import torch.distributed as dist
 
 JOIN_SECONDS = 300.0
 """Time in which all processes must have come [s]."""
@@ -163,28 +164,10 @@ def join(device: str) -> Ranks:
     address, port = os.environ.get("MASTER_ADDR", "127.0.0.1"), _number("MASTER_PORT", 1, 65535)
     agent = os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"  # torchrun itself holds the store then
     cuda = device != "cpu" and (device.startswith("cuda") or torch.cuda.is_available())
-
     home = _stay_home(address)
-
-    def connected(hosts: bool) -> dist.Store:
-        own = {}
-        if hosts and home and sys.platform != "win32":  # torch takes it over, and would listen on every interface
-            own["master_listen_fd"] = loopback_socket(port, "set another MASTER_PORT for all ranks", home).detach()
-        store = dist.TCPStore(
-            home or address,
-            port,
-            count,
-            is_master=hosts,
-            timeout=timedelta(seconds=JOIN_SECONDS),
-            wait_for_workers=False,
-            **own,
-        )
-        run = [os.environ.get(f"TORCHELASTIC_{name}", "0") for name in ("RUN_ID", "RESTART_COUNT")]
-        return dist.PrefixStore("/".join(["warpgs", *run]), store)
-
     try:
-        store = connected(rank == 0 and not agent)
-        watch = RankWatch(rank, count, store, connected(False))
+        store = _store(address, port, count, home, hosts=rank == 0 and not agent)
+        watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
     except RuntimeError as e:
         raise ResourceError(
             f"rank {rank} of {count} does not reach the others at {address}:{port} ({str(e).splitlines()[0][:200]})"
@@ -192,12 +175,7 @@ def join(device: str) -> Ranks:
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
     if cuda:
-        if torch.cuda.device_count() <= local:
-            raise ResourceError(
-                f"rank {rank} needs GPU {local} of this machine, and torch sees {torch.cuda.device_count()}: NCCL takes one "
-                "GPU a process, so start as many as there are, or give --device cpu"
-            )
-        torch.cuda.set_device(local)
+        _take_gpu(rank, local)
     watch.meet(JOIN_SECONDS)
     try:
         dist.init_process_group(
@@ -209,6 +187,31 @@ def join(device: str) -> Ranks:
         torchrun = [("torchrun", *at) for at in listening_at(os.getppid()) if agent and at[1] == port]
         say_what_is_open([*(("rank 0", *at) for at in listening_at()), *torchrun])
     return _joined
+
+
+def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool) -> dist.Store:
+    """Return a connection to the store of all ranks, which this process ``hosts`` or not; ``home`` is that of `_stay_home`."""
+    import torch.distributed as dist
+
+    own = {}
+    if hosts and home and sys.platform != "win32":  # torch takes it over, and would listen on every interface
+        own["master_listen_fd"] = loopback_socket(port, "set another MASTER_PORT for all ranks", home).detach()
+    wait = timedelta(seconds=JOIN_SECONDS)
+    store = dist.TCPStore(home or address, port, count, is_master=hosts, timeout=wait, wait_for_workers=False, **own)
+    run = [os.environ.get(f"TORCHELASTIC_{name}", "0") for name in ("RUN_ID", "RESTART_COUNT")]
+    return dist.PrefixStore("/".join(["warpgs", *run]), store)
+
+
+def _take_gpu(rank: int, local: int) -> None:
+    """Take the GPU of a local rank; ResourceError where there is none."""
+    import torch
+
+    if torch.cuda.device_count() <= local:
+        raise ResourceError(
+            f"rank {rank} needs GPU {local} of this machine, and torch sees {torch.cuda.device_count()}: NCCL takes one "
+            "GPU a process, so start as many as there are, or give --device cpu"
+        )
+    torch.cuda.set_device(local)
 
 
 def _stay_home(address: str) -> str | None:

@@ -24,7 +24,6 @@ from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.time_budget import check_budget
 from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
 from warpgs.plugins import Registry, flag_group
-from warpgs.render.rule_costs import select_rule
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.runtime.imports import fast_imports
 from warpgs.runtime.interop import set_threads
@@ -51,10 +50,8 @@ def _request_type() -> type:
         --lpips-weights from the run."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
-        max_error: float | None = None
-        """Choose the fastest rule whose images are off exact by at most this on average, in [0, 1]; not with --rule."""
         time_budget: float | None = None
-        """Choose the number of steps so that the fit is done in this time [s]; not with --steps or --max-error."""
+        """Choose the number of steps so that the fit is done in this time [s]; not with --steps."""
         view: bool = False
         """Show the model in a browser while it trains, at the printed address; the result is the same to the byte."""
         view_port: int = 8080
@@ -186,23 +183,16 @@ def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
     return dataclasses.replace(config, loss_terms=found, view_modules=learned)
 
 
-def _chosen(a: Any, arguments: list[str], config: FitConfig) -> tuple[FitConfig, tuple[str, ...]]:
-    """Let measured costs choose settings where the user asked for it; returns the settings and notes on the choice."""
-    if a.max_error is not None and a.time_budget is not None:
-        raise UsageError("--max-error and --time-budget choose settings by different costs: give one of them")
-    if a.time_budget is not None:
-        if a.resume or word_after(arguments, "--steps"):
-            raise UsageError(
-                "--time-budget chooses the number of steps: leave out --steps, and to continue such a run give --resume with "
-                "the --steps that it chose instead of --time-budget"
-            )
-        check_budget(a.time_budget)
-    if a.max_error is None:
-        return config, ()
-    if word_after(arguments, "--rule"):
-        raise UsageError("--max-error chooses the rule: leave out --rule")
-    rule, note = select_rule(max_error=a.max_error)
-    return dataclasses.replace(config, rule=rule), (note,)
+def _check_time_budget(a: Any, arguments: list[str]) -> None:
+    """Raise UsageError where a time budget is given that cannot be kept, or with the steps that it chooses."""
+    if a.time_budget is None:
+        return
+    if a.resume or word_after(arguments, "--steps"):
+        raise UsageError(
+            "--time-budget chooses the number of steps: leave out --steps, and to continue such a run give --resume with "
+            "the --steps that it chose instead of --time-budget"
+        )
+    check_budget(a.time_budget)
 
 
 def _names_a_run_alone(arguments: list[str]) -> bool:
@@ -265,8 +255,8 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     if a.threads:
         set_threads(a.threads)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
-    config, chosen = _chosen(a, arguments, config)
-    notes = (origin_note(origin, base, config), *chosen)
+    _check_time_budget(a, arguments)
+    notes = (origin_note(origin, base, config),)
     if word_after(arguments, "--preset") is None:
         say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
     view_port = a.view_port if a.view else None

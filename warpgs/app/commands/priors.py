@@ -43,7 +43,7 @@ def _show(arguments: list[str], about: str) -> int:
         max_side: int | None = None
         """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
         allow_outside: bool = False
-        """Let names and links of the scene lead to images and masks outside its folder."""
+        """Let names and links of the scene lead to files outside its folder."""
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image or a mask may have as stored."""
         threads: int = 0

@@ -23,7 +23,7 @@ def run(arguments: list[str], about: str) -> int:
         cameras: Path | None = None
         """Cameras that a file of Gaussians is seen through: cameras.json, transforms.json, COLMAP's folder, or a scene."""
         rule: str | None = None
-        """Cut-offs that a file of Gaussians was trained with: inria, gsplat or exact. inria where not given."""
+        """Cut-offs that a file of Gaussians was trained with: inria, gsplat-1.6, gsplat-1.5 or exact. inria where not given."""
         path: str = "auto"
         """auto (what suits how the photographs were taken), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""

@@ -4,10 +4,10 @@
 // instance go to its slot; if ATOMIC, they are added to its Gaussian's at once, in whatever order warps get there.
 __shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_rest[WARPS][REST][32];
 const int warp = threadIdx.x / 32;
-constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
+constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC, absgrad = ABSGRAD;
 const int total = (int)min(totals.data[0], (long long)capacity);  // of a cut list, what there is
 const int floor = item * CHUNK;
-constexpr int values = 6 + CHANNELS + with_depth;
+constexpr int values = 6 + CHANNELS + (absgrad ? 3 : with_depth);  // magnitudes stand behind the place of the depth
 // number of the sum that this lane holds after the reduction below
 int held = 0;
 {
@@ -195,6 +195,10 @@ while (top_instance > floor) {
                             v[6 + c] += w * G[k][c];
                         if (with_depth)
                             v[6 + CHANNELS] += w * vz[k];
+                        if (absgrad) {
+                            v[7 + CHANNELS] += fabsf(v_e1);
+                            v[8 + CHANNELS] += fabsf(a.w * v_e1 + b.x * v_e2);
+                        }
                     }
                 }
             }

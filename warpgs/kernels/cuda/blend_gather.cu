@@ -2,8 +2,8 @@
 // Gradient of one projected Gaussian from the sums of its instances. Their slots are neighbours: a thread sums a short list, the warp
 // shares a long one. The factors common to all pixels are applied here, once.
 constexpr int SHORT = 32;
-constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC;
-constexpr int values = 6 + CHANNELS + with_depth;
+constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC, absgrad = ABSGRAD;
+constexpr int values = 6 + CHANNELS + (absgrad ? 3 : with_depth);
 const bool valid = i < counts.shape[0];
 const bool seen = valid && counts.data[i] > 0;
 const int count = atomic ? (int)seen : seen ? counts.data[i] : 0;
@@ -21,6 +21,10 @@ if (count <= SHORT)
         v[5 + CHANNELS] += last[0];
         if (with_depth)
             v[6 + CHANNELS] += last[1];
+        if (absgrad) {
+            v[7 + CHANNELS] += last[2];
+            v[8 + CHANNELS] += last[3];
+        }
     }
 unsigned heavy = __ballot_sync(ALL, count > SHORT);
 while (heavy) {
@@ -48,6 +52,10 @@ if (valid) {
         const float4 a = values_of[0], b = values_of[1];
         constexpr float back = 1.0f / SCALE;
         const float s1 = back * v[0], s2 = back * v[1];
+        if (absgrad) {  // sums of |e1 ...| and of |U^T e ...|, both in the units of the scaled factor
+            v[7 + CHANNELS] *= back * fabsf(a.z);
+            v[8 + CHANNELS] *= back * back;
+        }
         row[0] = make_float4(-a.z * s1, -(a.w * s1 + b.x * s2), back * v[2], back * v[3]);
         row[1] = make_float4(back * v[4], v[5], v[6], v[7]);
         #pragma unroll

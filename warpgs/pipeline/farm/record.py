@@ -25,7 +25,7 @@ CHECKED = (PLY, "metrics.json", CONFIG)
 """Files of a run whose checksums the record holds."""
 FORMAT = 1
 MOST_FILES = 100_000
-"""Files of a scene that are listed; one with more is read by the fit to know whether it is the same."""
+"""Files, and folders, of a scene that are listed; one with more is read by the fit to know whether it is the same."""
 
 _DIGEST = schema.text
 _SCHEMA = schema.fields(
@@ -112,7 +112,9 @@ def source_stamp(scene: Path) -> str:
         if scene.is_file():
             found = scene.stat()
             rows.append((scene.name, found.st_size, found.st_mtime_ns))
-        for folder, _, names in os.walk(scene, followlinks=True):
+        for count, (folder, _, names) in enumerate(os.walk(scene, followlinks=True)):
+            if count > MOST_FILES:  # links may show a folder in many places
+                return ""
             for name in names:
                 path = Path(folder, name)
                 found = path.stat()

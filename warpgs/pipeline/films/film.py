@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -158,8 +159,7 @@ def render_film(
         if one_size:
             write_film(film, images(), settings.fps)
         else:
-            for _ in images():
-                pass
+            collections.deque(images(), maxlen=0)
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
     return RenderedPath([*files, film] if one_size else files, [*notes, *plan.notes, *check.notes(plan.remedy), *left])

@@ -14,7 +14,7 @@ from warpgs import geometry
 from warpgs.colors import base_coefficients
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
-from warpgs.kernels.sh import MAX_DEGREE, coefficient_count
+from warpgs.kernels.sh import coefficient_count
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
@@ -56,8 +56,6 @@ class InitConfig:
     """First opacity, in (0, 1)."""
     scale_factor: float = 1.0
     """First width of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
-    max_sh_degree: int | None = 3
-    """Spherical-harmonics degree stored, 0 to 3. None: by the number of views."""
     near_views: int = 4
     """sweep, flow: nearest other views that each view is matched with."""
     merge_px: float = 4.0
@@ -86,8 +84,6 @@ class InitConfig:
             raise UsageError(f"init scale-factor {self.scale_factor} must lie between 0.001 and 10")
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
-        if self.max_sh_degree is not None and not 0 <= self.max_sh_degree <= MAX_DEGREE:
-            raise UsageError(f"init max sh degree {self.max_sh_degree} must lie between 0 and {MAX_DEGREE}")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 
@@ -361,12 +357,13 @@ def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
 
 
-def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, device: torch.device) -> Gaussians:
+def initial_gaussians(cloud: PointCloud, config: InitConfig, sh_degree: int, extent: float, device: torch.device) -> Gaussians:
     """Return one isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
 
     Args:
         cloud: At least one point.
-        config: Opacity and degree.
+        config: Opacity, and the factor of the widths.
+        sh_degree: Degree of the spherical harmonics, 0 to 3.
         extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
         device: Device of the tensors, float32.
 
@@ -379,8 +376,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, extent: float, devi
     # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
     distances = mean_square_distances(points).double().sqrt()
     scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
-    assert config.max_sh_degree is not None  # `settings_by_views` has chosen
-    sh = points.new_zeros(count, coefficient_count(config.max_sh_degree), 3)
+    sh = points.new_zeros(count, coefficient_count(sh_degree), 3)
     sh[:, 0] = base_coefficients(colors)
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1

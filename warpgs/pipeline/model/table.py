@@ -91,6 +91,21 @@ class Table:
         return Table(gaussians.tensors(), columns, gaussians.means.device, len(gaussians))
 
     @property
+    def row_bytes(self) -> int:
+        """Bytes of the parameters of a row."""
+        return sum(t.element_size() * t[0].numel() for t in self.params.values())
+
+    def lasting_bytes(self) -> int:
+        """Return the bytes of a row that last from step to step: parameters, two moments and columns."""
+        return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
+
+    def growth_bytes(self, before: int, after: int) -> int:
+        """Return the bytes while rows are added: the new ones, one tensor before and after, and numbers of rows and parents."""
+        added = min(2 * (after - before), after)  # a split replaces one row by two
+        largest = max(t.element_size() * t[0].numel() for t in self.params.values())
+        return self.row_bytes * added + largest * (before + after) + 8 * after
+
+    @property
     def gaussians(self) -> Gaussians:
         """The current parameters as Gaussians; they require gradients."""
         return Gaussians(**self.params)

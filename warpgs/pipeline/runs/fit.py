@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import torch
 
-from warpgs.errors import DataError, NotFiniteError, UsageError
+from warpgs.errors import DataError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split, check_spec
@@ -23,13 +23,11 @@ from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
 from warpgs.pipeline.runs.batched import batched_notes, check_batched
-from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
-from warpgs.pipeline.runs.failed_step import FILE as FAILED
-from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
+from warpgs.pipeline.runs.fit_steps import model_fields, take_steps, tell
 from warpgs.pipeline.runs.folder import (
     CONFIG,
-    camera_values,
     check_checkpoint,
     check_same,
     read_record,
@@ -47,7 +45,6 @@ from warpgs.pipeline.train.background import choose_background, over_background
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.presets import chosen_settings
 from warpgs.pipeline.train.slots import check_renders
 from warpgs.pipeline.train.step_report import StepReport
@@ -55,16 +52,13 @@ from warpgs.pipeline.train.time_budget import within_budget
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import background_warmup
 from warpgs.priors.photo_checks import check_photos, photo_notes
-from warpgs.report.events import EventLog
 from warpgs.report.image_names import image_names, renaming_notes
-from warpgs.report.progress import Progress, Stages
+from warpgs.report.progress import Stages
 from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.ranks import ALONE, Ranks
-from warpgs.runtime.stop_signals import noted_signals
 from warpgs.runtime.terminal import Detail, counted
-from warpgs.scene import Camera, Gaussians, Normalization, Scene
+from warpgs.scene import Camera, Scene
 
-Names = tuple[str, ...]
 COMPILING = "compiling kernels, once on this machine, a minute or two in all"
 """Line on a wait for kernels."""
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
@@ -123,7 +117,7 @@ def fit(
         ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
             prints, writes and scores; the others return a result without metrics.
         **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
-            ``steps=300`` or ``init_max_sh_degree=1``; or a group as a mapping, ``init={"max_sh_degree": 1}``. `FitConfig` lists
+            ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` lists
             them, and `warpgs fit --help-all`.
 
     Raises:
@@ -142,10 +136,7 @@ def fit(
         check_spec(spec)
     check_batched(scene, config, ranks, time_budget, resume)
     verbose, own = ranks.first and verbose, out if ranks.first else None
-    stages = Stages() if verbose else Stages(lambda line: None)
-    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
-    folder = nothing if own is None else run_folder(own, resume)
-    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
+    with _opened(own, resume, verbose) as (held, progress, compiled):
         resume = resume and out is not None and (out / CONFIG).is_file()  # else it holds found poses alone
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
@@ -159,24 +150,35 @@ def fit(
             read, request, parts, config, *where, own, lpips, own_notes, verbose, on_step, began, progress, on_model, ranks,
             compiled,
         )  # fmt: skip
-        if time_budget is not None:
-            job.config, note = within_budget(job.config, time_budget, job.train, job.device)
-            job.notes.append(note)
-        _set_background(job)
-        job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
-        job.notes += chosen
-        check_renders(job.config.batch, job.config.steps or 0)
+        _settle(job, time_budget)
         trainer, state, record = _prepare(job, out if resume else None)
         result = _finish(job, trainer, state, record, resume)
     ranks.leave()
     return result
 
 
-def _set_background(job: FitJob) -> None:
-    """Put the scene over the background that the settings ask for."""
-    color, note = choose_background(job.config.background, job.scene, job.train)
+@contextlib.contextmanager
+def _opened(
+    out: Path | None, resume: bool, verbose: bool | Literal["progress"]
+) -> Iterator[tuple[list[str], Callable[[str], object], list[float]]]:
+    """Hold the run folder; yields notes on it, the function that shows what is being done, and seconds spent on compiling."""
+    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    folder = nothing if out is None else run_folder(out, resume)
+    stages = Stages() if verbose else Stages(lambda line: None)
+    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
+        yield held, progress, compiled
+
+
+def _settle(job: FitJob, time_budget: float | None) -> None:
+    """Put the scene over its background, and choose the settings that are left open."""
+    if time_budget is not None:
+        job.config, note = within_budget(job.config, time_budget, job.train, job.device)
+        job.notes.append(note)
+    color, background = choose_background(job.config.background, job.scene, job.train)
     job.scene = over_background(job.scene, color)
-    job.notes += [note] if note else []
+    job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
+    job.notes += [*([background] if background else []), *chosen]
+    check_renders(job.config.batch, job.config.steps or 0)
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
@@ -228,7 +230,11 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
             check_checkpoint(state[1], stored, resumed)
     c = job.config
     with background_warmup(c, job.device) as ready:
-        job.photographs = check_photos([*job.train, *job.test], job.progress)
+        if job.other_models:
+            models = " and ".join(job.other_models)
+            job.notes.append(f"camera model {models}: photographs are not compared with each other; coverage is not measured")
+        else:
+            job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background
         trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
@@ -251,12 +257,12 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
     setup = time.perf_counter() - job.began
     nothing = contextlib.nullcontext(lambda: None)
     with nothing if job.out is None else images_kept(trainer, list(job.split.train), job.out) as images_written:
-        _train(job, trainer, images_written)
-    _tell(job, trainer)  # of images that were written last
+        take_steps(job, trainer, images_written)
+    tell(job, trainer)  # of images that were written last
     training = time.perf_counter() - job.began - setup
     job.ranks.part()
     if not job.ranks.first:
-        return FitResult(*_model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
+        return FitResult(*model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
     given = cameras_of(job.scene)
     job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned.views))
     if job.out is not None:
@@ -276,18 +282,9 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
     for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
         job.say(line)
     return FitResult(
-        *_model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
+        *model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
         transparent=job.scene.transparent,
     )  # fmt: skip
-
-
-def _model_fields(
-    job: FitJob, trainer: Trainer
-) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
-    """Return the fields of the `FittedModel` that a fit has by now."""
-    cameras = cameras_of(job.scene)
-    names, rule = (job.split.train, job.split.test), job.config.rule
-    return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
 
 
 def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera]) -> dict[str, Any]:
@@ -298,7 +295,7 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     names = image_names(v.name for v in scene.views)
     scored, tell = (job.out, gaussians, train, test, c.rule, scene.background), job.progress
     metrics = evaluate_run(*scored, job.lpips, trainer.context.max_instances, names=names, tell=tell)
-    if test:
+    if test and not job.other_models:
         metrics["coverage"] = coverage_of_run(*scored, trainer.context.max_instances, names=names, tell=tell)
     tell("comparing renders with float64")
     rule = rule_report_of(
@@ -307,9 +304,11 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     )  # fmt: skip
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
     options = options_for(c.rule, scene.background, gaussians, trainer.context.max_instances)
-    shown = counted(train, job.progress, "looking for what moved", "views")
-    fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
-    moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
+    moved = {}
+    if not job.other_models:
+        shown = counted(train, job.progress, "looking for what moved", "views")
+        fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
+        moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity = complexity_figures(trainer)
     learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
     details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
@@ -326,73 +325,3 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
         **event_figures(trainer), **complexity, "view_modules": learned,
         "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip
-
-
-def _train(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
-    """Take all remaining steps, with a log and checkpoints where there is a run folder; images come before a checkpoint."""
-    out = job.out
-    log = None if out is None else EventLog(out / "metrics.jsonl", trainer.step)
-
-    def save(current: Trainer) -> None:
-        if out is not None and log is not None:
-            log.flush()
-            images_written()
-            tensors, state = current.state()
-            if current.config.view_modules:  # by which a run is opened without their code
-                cameras = learned_cameras(job.scene, job.split, current.learned.views)
-                state["cameras"] = {n: camera_values(c) for n, c in cameras.items()}
-            save_checkpoint(out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
-
-    def restore(current: Trainer) -> bool:
-        if out is None or log is None or not (out / TENSORS).is_file():
-            return False
-        current.load(*load_checkpoint(out))
-        log.rewind(current.step)
-        return True
-
-    slow, compiled = -1, -1  # the last step of those that took longer than steps to come will; kernels compiled by then
-
-    with Progress(trainer.steps, trainer.step) if job.verbose else contextlib.nullcontext() as progress:
-
-        def on_step(r: StepReport) -> None:
-            nonlocal slow, compiled
-            if len(job.compiled) > compiled:
-                slow, compiled = trainer.step, len(job.compiled)
-            if progress is not None:
-                progress.total = trainer.steps  # fewer, once the fit is known to end earlier
-                seconds = None if r.step <= slow else r.seconds
-                progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=seconds)
-            if log is not None:
-                log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
-            _tell(job, trainer)
-            if job.on_step is not None:
-                job.on_step(r)
-            if job.on_model is not None:
-                job.on_model(FittedModel(*_model_fields(job, trainer), transparent=job.scene.transparent))
-
-        try:
-            with noted_signals() as stopped:
-                run(trainer, on_step, save, stopped, restore)
-        except NotFiniteError as e:
-            if out is None or e.view is None:
-                if e.view is not None:
-                    job.ranks.leave()  # all have this loss, and the first says so
-                raise
-            name = job.split.train[e.view]
-            save_failed_step(out / FAILED, failed_step(trainer, e.view, name, e.slot))
-            save(trainer)
-            raise NotFiniteError(
-                f"{e}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "
-                f"{out / FAILED}` says what is not finite. A fit repeats exactly: continued with --resume, it comes to the "
-                "same place; other settings, lower learning rates above all, lead elsewhere"
-            ) from e
-        finally:
-            if log is not None:
-                log.close()
-
-
-def _tell(job: FitJob, trainer: Trainer) -> None:
-    """Print what the fit has to say, and keep it for the report."""
-    while trainer.messages:
-        trainer.notes.append(trainer.messages.pop(0))  # a continued run has them in its report, too
-        job.note(trainer.notes[-1])

@@ -54,6 +54,11 @@ class FitJob:
         """Views held out."""
         return train_views(self.scene, self.split.test)
 
+    @property
+    def other_models(self) -> list[str]:
+        """Camera models of the views other than pinhole, which only the kernels know."""
+        return sorted({v.camera.model for v in self.scene.views} - {"pinhole"})
+
     def say(self, line: str) -> None:
         """Print a line for the user, unless the fit is to be silent, or to tell of its progress alone."""
         if self.verbose is True:

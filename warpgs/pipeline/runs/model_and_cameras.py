@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from warpgs.constants import RULES
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
 from warpgs.export.formats import format_of, read_gaussians
@@ -15,6 +14,7 @@ from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
+from warpgs.rules import rule_named
 from warpgs.scene import Camera, Gaussians, Normalization
 
 RULE = "inria"
@@ -32,7 +32,7 @@ def open_file(
     Args:
         path: The file, in any format of `warpgs.export.formats`.
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
-        rule: Name of the cut-offs that it was trained with: inria, gsplat or another of `RULES`; None for inria, which is said.
+        rule: Name of the cut-offs that it was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
 
     Raises:
@@ -44,8 +44,7 @@ def open_file(
         raise UsageError(
             f"{path}: a file of Gaussians has no cameras; give --cameras cameras.json, transforms.json, or a scene"
         )
-    if rule is not None and rule not in RULES:
-        raise UsageError(f"--rule {rule}: choose one of {', '.join(RULES)}")
+    rule_named(rule or RULE)
     where, _ = choose_device(device)
     found, notes = _cameras_of(cameras)
     for name, c in found.items():
@@ -59,7 +58,7 @@ def open_file(
     gaussians = Gaussians(**{name: t.to(where) for name, t in gaussians.tensors().items()})
     notes += [note] if (note := format_of(path).note) else []
     if rule is None:
-        notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat suits models of gsplat and nerfstudio")
+        notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat-1.6 or gsplat-1.5 suits models of gsplat")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
     model = FittedModel(gaussians, normalization, in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
     return model, [*notes, f"{len(gaussians):,} Gaussians, {len(found)} cameras"]

@@ -34,7 +34,7 @@ from warpgs.report.events import read_events
 from warpgs.report.image_names import image_names
 from warpgs.report.images import depth_map, error_map, png, side_by_side, webp
 from warpgs.report.overview import render_overview
-from warpgs.report.page import SamplingReport, ViewImages, write_page
+from warpgs.report.page import Page, SamplingReport, ViewImages, write_page
 from warpgs.report.progress import duration
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.terminal import counted
@@ -93,7 +93,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
         lines = [
             f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views",
             *([f"  for comparison, without a fit: {best}"] if best else []),
-            f"  {metrics['coverage']['summary']}",
+            *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),
         ]
     else:
         lines = [NO_SCORES, f"training PSNR {metrics['train']['psnr']:.2f} dB"]
@@ -156,17 +156,13 @@ def evaluate_run(
         Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
     """
     options = options_for(rule, background, gaussians, max_instances)
-    if out is not None:
-        make_folder(out / "renders")
-        make_folder(out / "depth")
+    for folder in () if out is None else ("renders", "depth"):
+        make_folder(out / folder)
     files = names or image_names(v.name for v in [*train, *test])
 
     def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
         if out is not None:
-            name = f"{files[view.name]}.png"
-            row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
-            write_bytes(out / "renders" / name, png(row))
-            write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
+            _write_images(out, f"{files[view.name]}.png", view, image, depth, alpha)
         return score(view, image, lpips if test else None, alpha)
 
     def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
@@ -186,6 +182,13 @@ def evaluate_run(
         "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
         "baselines": baselines(train, test) if test else {},
     }  # fmt: skip
+
+
+def _write_images(out: Path, name: str, view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
+    """Write the render [H, W, 3] of a view beside its photograph and the error, and the depth map [H, W]."""
+    row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+    write_bytes(out / "renders" / name, png(row))
+    write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
 
 
 def _images(
@@ -287,8 +290,7 @@ def write_report(
         names = image_names(v.name for v in scene.views)
         covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
     camera = train[0].camera
-    write_page(
-        out / "report.html",
+    page = Page(
         title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
         subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
         f"{camera.width} x {camera.height} px, {metrics['device']}",
@@ -297,3 +299,4 @@ def write_report(
         details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
         coverage=covered,
     )  # fmt: skip
+    write_page(out / "report.html", page)

@@ -64,7 +64,8 @@ def rule_report_of(
     """Measure error and gain of a rule on a scene; takes some tenths of a second.
 
     Three random views are rendered with the rule, as in the fit, and 64 x 64 px of each are compared with the image that
-    rule `exact` defines, computed in float64 by other means than the kernels (`warpgs.render.reference`).
+    rule `exact` defines, computed in float64 by other means than the kernels (`warpgs.render.reference`); by the kernels where
+    the camera is no pinhole.
 
     Args:
         gaussians: Of the finished fit, float32.
@@ -93,8 +94,7 @@ def rule_report_of(
         # what reaches the part under `exact`; tiles are listed with a margin
         near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
         part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
-        with _one_thread():
-            wanted = reference_image(part, view.camera, window, behind, gaussians.sh_degree)
+        wanted = _wanted(part, view.camera, window, behind)
         errors.append((found.double() - wanted).abs().flatten())
     error = torch.cat(errors)
     whole = chosen[0].camera
@@ -106,6 +106,15 @@ def rule_report_of(
     if rule != "exact":
         result["exact_ms"] = 1000 * _seconds(lambda: rasterize(gaussians, whole, exact), device)
     return result | {"summary": _summary(result)}
+
+
+def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor) -> torch.Tensor:
+    """Return the image of a window under `exact` in float64: by other means than the kernels, which alone know other models."""
+    if camera.model == "pinhole":
+        with _one_thread():
+            return reference_image(part, camera, window, background, part.sh_degree)
+    doubled = Gaussians(**{n: t.double() for n, t in part.tensors().items()})
+    return rasterize(doubled, camera, RasterizeOptions(rule="exact", background=background.double(), window=window)).rgb
 
 
 def _summary(r: dict[str, Any]) -> str:

@@ -166,11 +166,16 @@ def csv_text(table: Table) -> str:
     return out.getvalue()
 
 
+_LATEX = str.maketrans(
+    {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    | {"\\": "\\textbackslash{}", "^": "\\textasciicircum{}", "~": "\\textasciitilde{}", "\n": " ", "\r": " "}
+)
+"""LaTeX of each sign."""
+
+
 def _escape(text: str) -> str:
-    """Escape the signs that mean something to LaTeX."""
-    for sign in "\\&%$#_{}":
-        text = text.replace(sign, "\\textbackslash " if sign == "\\" else f"\\{sign}")
-    return text
+    """Escape the signs that mean something to LaTeX: names of scenes may be anybody's."""
+    return text.translate(_LATEX)
 
 
 def latex(table: Table) -> str:

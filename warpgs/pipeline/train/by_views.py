@@ -55,15 +55,16 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         device: Kind of device, cpu or cuda: on a CPU the steps are limited to a time, unless ``cpu_limit`` is off.
     """
     views, notes = len(train), []
-    optimizer, init = config.optimizer, config.init
+    optimizer = config.optimizer
     if optimizer.scales_lr is None:
         lr = SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER
         optimizer = dataclasses.replace(optimizer, scales_lr=float(f"{lr:.3g}"))
     if optimizer.opacities_lr is None:
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
-    if init.max_sh_degree is None:
-        init = dataclasses.replace(init, max_sh_degree=sum(views >= n for n in DEGREES))
+    degree = config.sh_degree
+    if degree is None:
+        degree = sum(views >= n for n in DEGREES)
     half = config.half_resolution
     if half is None:
         half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
@@ -72,7 +73,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         steps = min(steps_by_views(views), config.max_steps)
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
-        f"at most {steps:,} steps{each}": config.steps, f"colours of degree {init.max_sh_degree}": config.init.max_sh_degree,
+        f"at most {steps:,} steps{each}": config.steps, f"colours of degree {degree}": config.sh_degree,
         f"a learning rate of scales of {optimizer.scales_lr:g}": config.optimizer.scales_lr,
         f"of opacities of {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
         f"half size in the first {half:.0%} of the steps": config.half_resolution,
@@ -90,4 +91,4 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
                 f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
                 f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
             )
-    return dataclasses.replace(config, steps=steps, half_resolution=half, optimizer=optimizer, init=init), notes
+    return dataclasses.replace(config, steps=steps, sh_degree=degree, half_resolution=half, optimizer=optimizer), notes

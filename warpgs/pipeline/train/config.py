@@ -9,8 +9,8 @@ import typing
 from dataclasses import dataclass, field
 from typing import Any
 
-from warpgs.constants import RULES
 from warpgs.errors import UsageError
+from warpgs.kernels.sh import MAX_DEGREE
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import LimitConfig
 from warpgs.pipeline.train.background import color_of
@@ -25,6 +25,7 @@ from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.pipeline.train.view_modules.base import VIEW_MODULES, ViewModule, check_modules
 from warpgs.plugins import Registry
 from warpgs.priors.view_prior import PriorConfig
+from warpgs.rules import rule_named
 from warpgs.schema import SchemaError, anything, mapping, of_type
 
 
@@ -51,6 +52,8 @@ class FitConfig:
     half_resolution: float | None = 0.0
     """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md). None: by the number
     of views."""
+    sh_degree: int | None = 3
+    """Highest spherical-harmonics degree of the colours, 0 to 3. None: by the number of views."""
     sh_every: int = 1000
     """Number of steps after which the spherical-harmonics degree in use rises by one."""
     dropout: float = 0.0
@@ -114,10 +117,11 @@ class FitConfig:
             raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
         if self.half_resolution is not None and not 0 <= self.half_resolution <= 1:
             raise UsageError(f"half-resolution must lie in [0, 1], not {self.half_resolution}")
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_DEGREE:
+            raise UsageError(f"sh-degree must lie in [0, {MAX_DEGREE}], not {self.sh_degree}")
         if not 0 <= self.dropout < 1:
             raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
-        if self.rule not in RULES:
-            raise UsageError(f"rule {self.rule!r} is not one of {', '.join(RULES)}")
+        rule_named(self.rule)
         color_of(self.background)
         check_terms(self.loss_terms)
         check_modules(self.view_modules)

@@ -11,6 +11,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
+from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, Prior
 
 OUTPUTS = ("rgb", "alpha", "depth")
@@ -88,6 +89,14 @@ class LossTerm:
     def active(self, step: int, steps: int) -> bool:
         """Return whether a step, from 1 to ``steps``, has the term."""
         return True
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes that the term takes at the moments of a step.
+
+        By default four maps at the loss for a term that reads depth, enough for a correlation of two maps with its gradient,
+        and none for others: override it in a term that takes more.
+        """
+        return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
         """Compute the term, a differentiable value of shape []; it must not read back from the device.

@@ -1,151 +1,75 @@
-"""Memory that a fit needs, predicted from the tensors that the kernels allocate, and the means to keep to a limit.
+"""Memory that a fit needs, added up from what its parts declare, and the means to keep to a limit.
 
-A step holds parameters with their moments throughout, and on top of them what its heaviest moment needs. Counted are the
-tensors of the fit while it takes steps; what the CUDA driver, Python and the compiled kernels occupy comes on top. Not counted,
-since they are small: parameters of single views, and the buffers of learning rates and losses (`StepBuffers`).
+A step holds parameters with their moments throughout, and on top of them what its heaviest moment needs. Each part declares its
+bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. What
+the CUDA driver, Python and the compiled kernels occupy comes on top. Not counted, since they are small: parameters of single
+views, and the buffers of learning rates and losses (`StepBuffers`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
 
-from warpgs.constants import RULES, TILE_SIZE
+from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.kernels import blend, blend_cuda
-from warpgs.kernels.project import PROJECTED_SIZE
-from warpgs.kernels.tiles import LIST_BYTES, MAX_INSTANCES, grid
+from warpgs.kernels import blend, project, tiles
+from warpgs.kernels.tiles import MAX_INSTANCES
 from warpgs.pipeline.model.table import Table
+from warpgs.pipeline.train import views as training_views
+from warpgs.pipeline.train.loss import LossTerm, outputs_of
+from warpgs.pipeline.train.slots import SUMMED
+from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.view_modules.base import ViewModule
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.compose import count_instances, inputs_of, settings_of
 from warpgs.runtime.byte_units import format_bytes
+from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes, add_needs
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
-FLOAT = 4
-"""Bytes of a float32 or int32."""
-SAMPLED = 8
-"""Largest number of views that a sampling event samples in (`importance_sampling.MAX_VIEWS`)."""
-SUMMED = 2
-"""Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
-
-
-def instance_bytes(cuda: bool, tiles: int) -> tuple[int, int]:
-    """Return the bytes of a (Gaussian, tile) instance in an image of so many tiles: in binning, and in the backward pass.
-
-    The backward pass has the lists without the owners, the gradient slots and, on CUDA, the states that blending left.
-    """
-    kept = LIST_BYTES - FLOAT
-    if not cuda:
-        return LIST_BYTES, kept + FLOAT * blend.VALUES
-    chunk = blend_cuda.CHUNKS[int(tiles > blend_cuda.MAX_SMALL_TILES)]
-    return LIST_BYTES, kept + FLOAT * blend_cuda.STRIDE + FLOAT * blend_cuda.STATE * TILE_SIZE * TILE_SIZE // chunk
+RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views.step_bytes)
+"""Parts of every step: their bytes by moment."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Sizes that, with the numbers of Gaussians and instances, decide what a step needs."""
+    """Parts of a fit, which with the numbers of Gaussians and instances decide what a step needs."""
 
-    coefficients: int
-    """Spherical-harmonics coefficients a channel, K."""
-    width: int
-    """Width of the largest view [px]."""
-    height: int
-    """Height of the largest view [px]."""
+    sizes: StepSizes
+    """Sizes of every step, without Gaussians and instances."""
+    parts: tuple[Callable[[StepSizes], Needs], ...]
+    """Parts of a step: their bytes by moment."""
+    table: Table
+    """The Gaussians with their columns."""
     view_bytes: int
-    """Bytes of all views, those included that are kept beside them (`view_bytes`)."""
-    column_bytes: int = 0
-    """Bytes of the strategy's columns for each Gaussian."""
-    views: int = 1
-    """Number of views."""
-    masked: bool = False
-    """True where a view has a mask."""
-    scored: bool = False
-    """True where views have scores, by which fine Gaussians are sampled."""
-    depth_supervised: bool = False
-    """True where a loss term reads depth."""
-    cuda: bool = False
-    """True on a CUDA device."""
+    """Bytes of all views, those included that are kept beside them."""
     graphs: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
-    cutout: bool = False
-    """True where views know their opacity."""
     sums: int = 0
     """Sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
-    modules: tuple[ViewModule, ...] = ()
-    """View modules, which count what steps take for them."""
-
-    @property
-    def row(self) -> int:
-        """Bytes of the parameters of a Gaussian."""
-        return FLOAT * (3 + 4 + 3 + 1 + 3 * self.coefficients)
 
     def held(self, count: int) -> int:
         """Return the bytes that last from step to step: parameters, two Adam moments, columns, sums over slots, and views."""
-        sums = self.sums * (self.row + SUMMED * FLOAT)
-        return (3 * self.row + self.column_bytes + sums) * count + self.view_bytes
+        sums = self.sums * (self.table.row_bytes + SUMMED * FLOAT)
+        return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
         """Return the bytes on top of `held` at each moment of a step that may be its heaviest.
 
         ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
         """
-        pixels = self.width * self.height
-        columns, rows = grid(self.width, self.height, TILE_SIZE)
-        listing, backward = (b * instances for b in instance_bytes(self.cuda, 0 if chunked else columns * rows))
-        waiting = backward - FLOAT * (blend_cuda.STRIDE if self.cuda else blend.VALUES) * instances
-        one = FLOAT * PROJECTED_SIZE * count  # projected Gaussians, or their gradient
-        projected = one + FLOAT * count  # with the tile counts
-        ranges = 8 * columns * rows + 2 * FLOAT * count
-        sorting = count * (FLOAT * 4 + 2 * 8)  # depths and order twice, two running sums
-        images = 5 * FLOAT * pixels  # colour, alpha, depth
-        kept = 3 * FLOAT * pixels  # transmittance, weight, end: what blending leaves for its gradient
-        upstream = FLOAT * pixels * (3 if self.cuda and not (self.depth_supervised or self.cutout) else 5)
-        # three partials for each colour and the gradient; masked copies; the two maps that are correlated, with gradients
-        # the difference of opacities and its gradient
-        loss = FLOAT * pixels * ((19 if self.masked else 12) + 4 * self.depth_supervised + 3 * self.cutout)
-        loss += self._of_modules("loss", count)
-        if not self.cuda:
-            loss += 5 * FLOAT * (3 * self.width + 30) * -(-self.height // 8)
-        # an event keeps image, scores and gate of each view until its end
-        seen = 7 * FLOAT * pixels * min(self.views, SAMPLED) if self.scored else 0
-        sampling = {"sampling": projected + ranges + listing + seen + 3 * images} if self.scored else {}
-        # on CUDA a step copies image, mask, opacity and disparity of its view from the stacks
-        own = FLOAT * pixels * (3 + self.masked + self.cutout + self.depth_supervised) if self.cuda else 0
-        own += FLOAT * pixels * 6 * self.cutout  # the image over the step's background, and what was added to it
-        if chunked:  # nothing of a chunk waits for the loss; in the backward pass its images stand beside the whole ones
-            apart = own + projected + 2 * one + images + upstream
-            return {
-                "binning": apart + ranges + sorting + listing,
-                "loss": own + projected + images + loss,
-                "blending": apart + ranges + images + kept + backward,
-                "projection": own + self._projection(count) + images + upstream,
-                **sampling,
-            }
-        return {
-            "binning": own + projected + ranges + sorting + listing,
-            "loss": own + projected + ranges + images + kept + waiting + loss,
-            "blending": own + projected + one + ranges + images + kept + upstream + backward,
-            "projection": own + self._projection(count) + images + upstream,
-            **sampling,
-        }
-
-    def _projection(self, count: int) -> int:
-        """Return the bytes of projected Gaussians, of their gradient and its copy for statistics, and of other gradients."""
-        return (FLOAT * (3 * PROJECTED_SIZE + 1) + self.row) * count + self._of_modules("projection", count)
-
-    def _of_modules(self, moment: str, count: int) -> int:
-        """Return the bytes that view modules take at a moment of a step."""
-        return sum(m.bytes(count, self.width * self.height).get(moment, 0) for m in self.modules)
+        sizes = replace(self.sizes, count=count, instances=instances, chunked=chunked)
+        needs, own = add_needs((*RENDER, *self.parts), sizes), add_needs(self.parts, sizes)
+        if SAMPLING not in own:  # no part samples
+            del needs[SAMPLING]
+        return needs
 
     def event(self, before: int, after: int) -> int:
-        """Return the bytes on top of ``held(after)`` while Gaussians are added: new rows, and one tensor before and after."""
-        added = min(2 * (after - before), after)  # a split replaces one Gaussian by two
-        numbers = 2 * FLOAT * after  # of the rows that stay, and of parents, int64
-        return self.row * added + FLOAT * 3 * self.coefficients * (before + after) + numbers
+        """Return the bytes on top of ``held(after)`` while Gaussians are added."""
+        return self.table.growth_bytes(before, after)
 
     def step(self, count: int, instances: int, chunked: bool = False) -> int:
         """Return the bytes at the heaviest moment of a step; each CUDA graph keeps memory of its own."""
@@ -237,47 +161,30 @@ class MemoryPlan:
 
 
 def layout_of(
-    table: Table,
-    views: Sequence[TrainingView],
-    *,
-    kept: Sequence[TrainingView] = (),
-    scored: bool = False,
-    captured: bool = False,
-    depth_supervised: bool = False,
-    modules: tuple[ViewModule, ...] = (),
-    sums: int = 0,
-) -> Layout:
+    table: Table, views: Sequence[TrainingView], terms: Sequence[LossTerm] = (), strategy: Strategy | None = None,
+    modules: Sequence[ViewModule] = (), *, kept: Sequence[TrainingView] = (), captured: bool = False, sums: int = 0,
+) -> Layout:  # fmt: skip
     """Return the layout of steps of a fit.
 
     Args:
         table: The Gaussians with their columns.
         views: Training views, those at half their size included.
+        terms: Loss terms.
+        strategy: Density strategy.
+        modules: View modules.
         kept: Views that are kept beside them.
-        scored: True where fine Gaussians are sampled by scores.
         captured: True to capture steps as CUDA graphs where the device can.
-        depth_supervised: True where a loss term reads depth.
-        modules: View modules of the fit.
         sums: Sums of gradients that a step of several views keeps.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
-    return Layout(
-        table.gaussians.sh.shape[1], largest.width, largest.height, view_bytes([*views, *kept]),
-        sum(c.element_size() for c in table.columns.values()), len(views), any(v.mask is not None for v in views),
-        scored, depth_supervised, cuda, len({v.kind for v in views}) if cuda and captured else 0,
-        any(v.alpha is not None for v in views), sums, modules,
+    sizes = StepSizes(
+        largest.width, largest.height, table.row_bytes, len(views), masked=any(v.mask is not None for v in views),
+        cutout=any(v.alpha is not None for v in views), depth="depth" in outputs_of(terms), cuda=cuda,
     )  # fmt: skip
-
-
-def view_bytes(views: Iterable[TrainingView]) -> int:
-    """Return the bytes of views: images, masks, opacities, maps and scores, memory that several share counted once.
-
-    Stacks are not counted: on CUDA images, masks, opacities and maps of the views are parts of them (`stack_views`), elsewhere
-    there are none.
-    """
-    tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.semantic, v.geometry, v.consistent, *v.maps.values()))
-    storages = (t.untyped_storage() for t in tensors if t is not None)
-    return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
+    parts = (*(t.bytes for t in terms), *(m.bytes for m in modules), *(() if strategy is None else (strategy.bytes,)))
+    graphs = len({v.kind for v in views}) if cuda and captured else 0
+    return Layout(sizes, parts, table, training_views.view_bytes([*views, *kept]), graphs, sums)
 
 
 @torch.no_grad()
@@ -312,8 +219,8 @@ def plan(
         if not single.smallest(count) <= limit:
             raise UsageError(
                 f"--memory-limit {format_bytes(limit)} is less than the {format_bytes(single.smallest(count))} that the "
-                f"smallest step needs with {count:,} Gaussians and {layout.width} x {layout.height} px; raise the limit, start "
-                "with fewer points (--max-gaussians N), or --downscale the views"
+                f"smallest step needs with {count:,} Gaussians and {layout.sizes.width} x {layout.sizes.height} px; raise "
+                "the limit, start with fewer points (--max-gaussians N), or --downscale the views"
             )
         cap = single.largest_count(limit, count, cap)
         graphs = layout.step(cap, int(capacity_factor * instances / count * cap))

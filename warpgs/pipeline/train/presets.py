@@ -28,6 +28,8 @@ MAX_BYTES = 2**16
 """Size of the largest file that is read [bytes]."""
 MAX_DEPTH = 8
 """Number of tables and lists that may lie in each other."""
+MAX_DOTS = 100
+"""Number of dots in a line: Python's reader of TOML takes the square of the parts of a key as time."""
 MAX_BASES = 8
 """Number of presets that may start from each other."""
 DEFAULT_PRESET = "default"
@@ -170,6 +172,8 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
     remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
     try:
         data = read_input(path, MAX_BYTES)
+        if any(line.count(b".") > MAX_DOTS for line in data.split(b"\n")):
+            raise ValueError(f"more than {MAX_DOTS} dots in a line")
         values = tomllib.loads(data.decode("utf-8"))
         check_depth(values, MAX_DEPTH)
     except OSError as e:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
@@ -55,11 +56,13 @@ def prepare(
 
     Raises:
         DataError: There is nothing to start from.
-        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients.
+        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. Or the start or
+            the strategy compares views, and a camera is no pinhole.
     """
     for view in train:
         check_camera(view.camera)
-    check_points(train, points, config.init)  # before anything takes time
+    _check_models(train, config)  # before anything takes time
+    check_points(train, points, config.init)
     where = device if config.memory_limit is None else torch.device("cpu")
 
     def usable() -> torch.device:
@@ -84,6 +87,16 @@ def prepare(
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
     return Preparation(found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
+
+
+def _check_models(train: list[View], config: FitConfig) -> None:
+    """Refuse settings that compare views with each other where a camera is no pinhole; only the kernels know other models."""
+    others = sorted({v.camera.model for v in train} - {"pinhole"})
+    if others and (config.init.source != "points" or samples(config)):
+        raise UsageError(
+            f"camera model {others[0]}: this start or strategy compares views, which needs pinhole cameras; fit with --preset "
+            "3dgs --init.source points, or undistort the images"
+        )
 
 
 def samples(config: FitConfig) -> bool:

@@ -15,6 +15,8 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.runtime.ranks import Ranks
 
+SUMMED = 2
+"""Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
 Node = tuple[int, int]
 """Slots of a subtree: the first, and the one behind the last."""
 ALIGNMENT = 16

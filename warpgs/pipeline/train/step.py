@@ -17,7 +17,7 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
 from warpgs.pipeline.model.table import Table
@@ -26,7 +26,7 @@ from warpgs.pipeline.train.learned_views import LearnedViews, seen
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
-from warpgs.render.compose import InstanceMemory, compose, count_instances, inputs_of, settings_of
+from warpgs.render.compose import compose, count_instances, inputs_of, settings_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
@@ -37,12 +37,12 @@ MAX_STEPS = 100
 CAPACITY_FACTOR = 1.3
 """Capacity of a captured step for instances, as a multiple of the most that any view has when it is captured."""
 DEAD_BYTES = 2**30
-"""Bytes of graphs no longer used that may pile up. To give them back takes milliseconds, in which the device waits."""
+"""Bytes of unused graphs that are kept. Freeing them takes milliseconds, in which the device waits."""
 
 
 @dataclass(frozen=True)
 class StepPlan:
-    """Choices that a step is made of; steps of equal plans share a CUDA graph."""
+    """Choices that are fixed when a step is captured; steps of equal plans share a CUDA graph."""
 
     degree: int
     """Spherical-harmonics degree in use."""
@@ -93,10 +93,7 @@ class StepBuffers:
         return done, stop, self.history[: done + 1].tolist()
 
     def begin(self, views: ViewStack) -> tuple[torch.Tensor, ...]:
-        """Return learning rates, settings [7], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step.
-
-        The coefficients of its camera are `of_view` of the stack's.
-        """
+        """Return learning rates, settings [7], viewmat [1, 4, 4], K [1, 3, 3] and image [H, W, 3] of the current step."""
         if self.device.type == "cpu":  # no copies
             step, row = int(self.counter), int(self.view_rows[int(self.counter)])
             view = views.viewmats[row : row + 1], views.Ks[row : row + 1], views.images[row]
@@ -105,7 +102,7 @@ class StepBuffers:
         return begin_step(self.counter, *rows)
 
     def of_view(self, maps: Rows) -> torch.Tensor:
-        """Return the entry of the step's view in maps [V, ...]; before the step is counted."""
+        """Return the entry of the step's view in maps [V, ...]. Call it before `end_step` counts the step."""
         if self.device.type == "cpu":
             return maps[int(self.view_rows[int(self.counter)])]
         assert isinstance(maps, torch.Tensor)  # on CUDA stacks are tensors
@@ -113,12 +110,11 @@ class StepBuffers:
 
 
 Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tensor | None"], Render]
-"""Function that renders Gaussians for a batch of one camera, a degree, factors of the opacities, and a colour [3] that is added
-to the background."""
+"""Renderer of a batch of one camera. Further arguments: the degree, opacity factors, and a shift of the background [3]."""
 
 
 def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
-    """Return a renderer whose capacity follows the instances, in chunks of at most ``max_instances``; background [3]."""
+    """Return a renderer that allocates what each render needs, in chunks of at most ``max_instances``; background [3]."""
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
@@ -135,13 +131,13 @@ def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | Non
 
 def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overflow: torch.Tensor) -> Renderer:
     """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit; background [3]."""
-    cut, backgrounds, memory = RULES[rule], background[None], InstanceMemory(capacity=capacity, overflow=overflow)
+    cut_offs, backgrounds, memory = RULES[rule], background[None], InstanceMemory(capacity=capacity, overflow=overflow)
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
     ) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
-        found = compose(inputs_of(gaussians, camera, factors), behind, settings_of(camera, degree, cut), memory)
+        found = compose(inputs_of(gaussians, camera, factors), behind, settings_of(camera, degree, cut_offs), memory)
         return _single(Render(*found.images, found.projected, found.tile_counts))
 
     return render
@@ -162,7 +158,7 @@ class Learned:
     views: LearnedViews
     """View modules with their parameters; often none."""
     strategy: Strategy
-    """Density strategy, which gathers gradients and follows updates."""
+    """Density strategy."""
     dropout_seed: int | None
     """Seed of the opacity dropout; None for none."""
     centers: torch.Tensor
@@ -187,10 +183,10 @@ class ViewGradients:
 
 @dataclass(frozen=True)
 class Forward:
-    """Forward pass of a step, up to what the loss is computed from."""
+    """Forward pass of a step, up to the inputs of the loss."""
 
     rendered: Render
-    """The render, in the colours that the view shows."""
+    """The render, with its colours as changed by view modules."""
     inputs: LossInputs
     """Inputs of the terms of the loss."""
     of_views: Mapping[str, torch.Tensor]
@@ -218,7 +214,7 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
 
 
 def view_gradients(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> ViewGradients:
-    """Render the next view and return what it contributes; its loss, and what stops the step, stand in ``buffers``.
+    """Render the next view; return its gradients and statistics. Loss and stop flag go to ``buffers``.
 
     Arguments are those of `step`.
     """
@@ -240,7 +236,7 @@ def forward(
     gaussians: Gaussians, learned: LearnedViews, dropout_seed: int | None, views: ViewStack, buffers: StepBuffers,
     plan: StepPlan, render: Renderer,
 ) -> Forward:  # fmt: skip
-    """Render the next view, and gather what the terms of the loss are computed from.
+    """Render the next view, and gather the inputs of the loss terms.
 
     Args:
         gaussians: The Gaussians.
@@ -266,13 +262,23 @@ def forward(
     given = views.camera(viewmat, K, buffers.of_view(views.distortions)[None] if views.distortions.numel() else None)
     camera = learned.before_render(given, values)
     rendered = render(gaussians, camera, plan.degree, factors, shift)
-    own = {n: t[0] for n, t in values.items()}
-    rendered = replace(rendered, rgb=seen(learned.modules, rendered.rgb, own))
+    of_view = {n: t[0] for n, t in values.items()}
+    rendered = replace(rendered, rgb=seen(learned.modules, rendered.rgb, of_view))
     outputs = {n: getattr(rendered, n) for n in outputs_of(plan.terms)}
     lens = None if camera.distortion is None else camera.distortion[0]
     single = replace(camera, viewmat=camera.viewmat[0], K=camera.K[0], distortion=lens)
     inputs = LossInputs(outputs, target, gaussians, single, settings[Setting.STEP])
-    return Forward(rendered, inputs, learned.regularisation(own), lrs, settings)
+    return Forward(rendered, inputs, learned.regularisation(of_view), lrs, settings)
+
+
+def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views: Sequence[torch.Tensor] = ()) -> torch.Tensor:
+    """Return the sum of the loss terms, the terms of view modules (``of_views`` [] each) and the strategy's term, shape []."""
+    values = [*term_values(plan.terms, inputs), *of_views]
+    extra = strategy.regularisation(plan.phase, inputs.gaussians)
+    total = values[0]
+    for value in values[1:] if extra is None else [*values[1:], extra]:
+        total = total + value
+    return total
 
 
 @torch.no_grad()
@@ -289,22 +295,12 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
         table.columns[name] += value
 
 
-def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views: Sequence[torch.Tensor] = ()) -> torch.Tensor:
-    """Return the sum of the terms, of what view modules add (``of_views`` [] each), and of the strategy's part, shape []."""
-    values = [*term_values(plan.terms, inputs), *of_views]
-    extra = strategy.regularisation(plan.phase, inputs.gaussians)
-    total = values[0]
-    for value in values[1:] if extra is None else [*values[1:], extra]:
-        total = total + value
-    return total
-
-
 class OverLimitError(ResourceError):
-    """A captured step would not keep to the fit's memory limit."""
+    """A captured step would exceed the memory limit of the fit."""
 
 
 class StepGraphs:
-    """Captured steps, one for each plan and kind of view; made when they are first asked for."""
+    """Captured steps, one for each plan and kind of view; captured at first use."""
 
     def __init__(
         self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor,

@@ -21,10 +21,9 @@ from warpgs.pipeline.train.background import random_shift
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.context import StrategyContext
 from warpgs.pipeline.train.learned_views import LearnedViews
-from warpgs.pipeline.train.loss import outputs_of
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
-from warpgs.pipeline.train.setup import prepare, prepared_views, samples, terms_of
+from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
 from warpgs.pipeline.train.step import CAPACITY_FACTOR, MAX_STEPS, Learned, OverLimitError, StepBuffers, StepPlan
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.stopping import STATE, Stopping
@@ -43,7 +42,7 @@ class Trainer:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
     chosen: list[int] | None = None
-    """Views of the steps that are being taken; None where none is."""
+    """Numbers of the views of the steps in progress; None between steps."""
 
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
@@ -86,7 +85,8 @@ class Trainer:
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
-        assert config.steps is not None and config.half_resolution is not None  # `settings_by_views` has chosen
+        # `settings_by_views` has chosen
+        assert config.steps is not None and config.sh_degree is not None and config.half_resolution is not None
         self.half_resolution = config.half_resolution
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
@@ -99,7 +99,7 @@ class Trainer:
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
 
-        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, extent, device), {})
+        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, config.sh_degree, extent, device), {})
         self.context = StrategyContext(
             config.groups(), config.strategy_config, self.table, self.generator, config.seed,
             plan_phases(config.phases, config.steps), extent, config.rule, self.background,
@@ -107,15 +107,20 @@ class Trainer:
         """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
         self.strategy, self.stopping = find_strategy(config.strategy)(self.context), Stopping(config.stopping)
         self.table.add_columns(self.strategy.columns())
-        of_views = LearnedViews.first(config.view_modules, train, device)
-        self.table.batch = of_views.table.batch = self.batch
-        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(of_views.table.params)))
-        dropout_seed, centers = config.seed if self.dropout > 0 else None, camera_centers(cameras, device)
-        self.learned = Learned(self.table, of_views, self.strategy, dropout_seed, centers)
+        self.learned = self._make_learned(train)
+        learned = self.learned.views
+        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(learned.table.params)))
         self.taker = StepTaker(self.learned, self.buffers, config.rule, self.background, self.batch, ranks)
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
-        self._begin(with_learned(views, of_views))
+        self._begin(with_learned(views, learned))
+
+    def _make_learned(self, train: list[View]) -> Learned:
+        """Return what steps change: the Gaussians, the parameters of view modules, and the strategy."""
+        views = LearnedViews.first(self.config.view_modules, train, self.device)
+        self.table.batch = views.table.batch = self.batch
+        seed = self.config.seed if self.dropout > 0 else None
+        return Learned(self.table, views, self.strategy, seed, camera_centers([v.camera for v in train], self.device))
 
     def _begin(self, views: list[TrainingView]) -> None:
         """Train on these views, or on what early stopping leaves of them."""
@@ -151,12 +156,12 @@ class Trainer:
 
     def degree(self, step: int) -> int:
         """Return the degree of the harmonics in use at a step."""
-        highest = self.config.init.max_sh_degree
+        highest = self.config.sh_degree
         assert highest is not None  # `settings_by_views` has chosen
         return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
 
     def plan_of(self, step: int) -> StepPlan:
-        """Return the plan of a step, counted from 1."""
+        """Return the choices that step number ``step``, from 1, is made with."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
@@ -164,7 +169,7 @@ class Trainer:
         return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits)
 
     def next_view(self) -> int:
-        """Return the number of the next view; they come in random order, each once before any comes again."""
+        """Return the number of the next view. The order is random; each view comes once before any comes again."""
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
@@ -188,7 +193,7 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that found no memory; where none of its series was taken, its views come again."""
+        """Return the error for a step that found no memory. Where no step of its series was taken, its views are put back."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
@@ -279,6 +284,7 @@ class Trainer:
         return True
 
     def _lr_row(self, step: int) -> list[float]:
+        """Return the learning rates of a step as `StepBuffers` holds them: of the Gaussians, then of view modules."""
         row = self.table.lr_row(self.lrs(step), step, self.config.optimizer.head_lrs)
         views = self.learned.views
         return row + views.table.lr_row(views.lrs(self.progress(step), self.context.extent), step, {})
@@ -330,8 +336,8 @@ class Trainer:
         shown, self.stacks, self.places = stack_views(shown, len(views))
         self.context.views = shown[: len(views)]
         layout = layout_of(
-            self.table, shown, kept=self.stopping.whole, scored=samples(c), captured=self.captured,
-            depth_supervised="depth" in outputs_of(self.terms), modules=c.view_modules, sums=self.taker.sums,
+            self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
+            sums=self.taker.sums,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], c.rule)
         self.memory, self.layout = plan(
@@ -342,7 +348,7 @@ class Trainer:
         self.count_changed()
 
     def count_changed(self) -> None:
-        """Set how many instances a step may have at a time, None for no limit: it depends on the number of Gaussians."""
+        """Update the limit of instances, which depends on the number of Gaussians; None for no limit."""
         limit = self.memory_limit
         self.context.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch.nn.functional import interpolate
 
 from warpgs.pipeline.metrics.region import OPAQUE
 from warpgs.pipeline.train.learned_views import LearnedView, LearnedViews, seen
+from warpgs.runtime.step_sizes import FLOAT, STEP, Needs, StepSizes
 from warpgs.scene import Camera, View
 
 Kind = tuple[int, int, bool, str]
@@ -75,6 +76,27 @@ class TrainingView:
             return self.mask
         opaque = (self.alpha > OPAQUE).to(self.image.dtype)
         return opaque if self.mask is None else opaque * self.mask
+
+
+def step_bytes(sizes: StepSizes) -> Needs:
+    """Return the bytes of the view of a step.
+
+    On CUDA image, mask, opacity and disparity are copied from the stacks. Views that know their opacity stand over the
+    background of the step, beside what was added to it.
+    """
+    copies = (3 + sizes.masked + sizes.cutout + sizes.depth) * sizes.cuda
+    return dict.fromkeys(STEP, FLOAT * sizes.pixels * (copies + 6 * sizes.cutout))
+
+
+def view_bytes(views: Iterable[TrainingView]) -> int:
+    """Return the bytes of views: images, masks, opacities, maps and scores, memory that several share counted once.
+
+    Stacks are not counted: on CUDA images, masks, opacities and maps of the views are parts of them (`stack_views`), elsewhere
+    there are none.
+    """
+    tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.semantic, v.geometry, v.consistent, *v.maps.values()))
+    storages = (t.untyped_storage() for t in tensors if t is not None)
+    return sum({s.data_ptr(): s.nbytes() for s in storages}.values())
 
 
 def with_alpha(views: Sequence[View]) -> list[View]:

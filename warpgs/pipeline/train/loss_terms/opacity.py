@@ -9,6 +9,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, register, total
+from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 
 
 @register("alpha")
@@ -23,6 +24,10 @@ class AlphaDifference(LossTerm):
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
             raise UsageError(f"alpha: weight {self.weight} must lie between 0 and 1000")
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the difference, its magnitude and its gradient."""
+        return {LOSS: 3 * FLOAT * sizes.pixels}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
         """Compute ``weight`` times the mean absolute difference of opacities over the pixels that count, shape []."""

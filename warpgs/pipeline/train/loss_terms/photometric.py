@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import torch
 
-from warpgs.kernels.ssim import differences
+from warpgs.kernels.ssim import difference_bytes, differences
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, register, total
+from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 
 
 @functools.cache
@@ -56,6 +57,11 @@ class Photometric(LossTerm):
 
     ssim_weight: float = 0.2
     """Fraction lambda of the structural term, in [0, 1]."""
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the differences and, with a mask, of what it leaves of both images."""
+        masked = 7 * FLOAT * sizes.pixels if sizes.masked else 0  # two images, and the mask's own
+        return {LOSS: difference_bytes(sizes) + masked}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
         """Compute `photometric_loss` of the render and the view's image, shape []."""

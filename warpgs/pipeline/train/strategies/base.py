@@ -11,6 +11,7 @@ from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.context import Growth, Settings, StrategyContext
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
+from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Gaussians
 from warpgs.schema import anything
 
@@ -52,6 +53,10 @@ class Strategy:
     def warmup_config(cls, own: Any) -> Any:
         """Return the own settings for a warm-up of three steps, in which everything that a fit uses should come once."""
         return own
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes that the strategy takes at the moments of a step, or in an event; columns are counted apart."""
+        return {}
 
     def columns(self) -> Mapping[str, Column]:
         """Return the columns that the strategy keeps of each Gaussian, by name; they are saved with every checkpoint."""

@@ -19,6 +19,7 @@ from warpgs.pipeline.train.strategies.base import Strategy, register
 from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
 from warpgs.pipeline.train.strategies.sampling_event import FINE, MAX_VIEWS, Event, MethodConfig, sampling_event
 from warpgs.pipeline.train.views import TrainingView
+from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 
 COARSE = 0
 """Layer of the Gaussians that were not sampled; that of the others is `FINE`."""
@@ -49,6 +50,10 @@ class ImportanceSampling(Strategy):
         """Step of each sampling event, Gaussians added and evicted, and the quantile of the gate in each view."""
         self.on_event: Callable[[int, Event], None] | None = None
         """Function that is called with the step and the event after each event."""
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of image, three scores and their sum, which an event keeps of each view."""
+        return {SAMPLING: 7 * FLOAT * sizes.pixels * min(sizes.views, MAX_VIEWS)} if self.method.events else {}
 
     def columns(self) -> Mapping[str, Column]:
         """Return the gradients' columns, the layer of each Gaussian, and the step at which it was sampled."""

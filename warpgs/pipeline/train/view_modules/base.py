@@ -11,6 +11,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.plugins import Registry
 from warpgs.render.rasterize import RasterizeOptions
+from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 
 CAMERA_BYTES = 4 * (16 + 9)
@@ -110,16 +111,10 @@ class ViewModule:
         """Return a term of the loss for the step's view, shape []; None for none. ``values`` are of that view, [...]."""
         return None
 
-    def bytes(self, count: int, pixels: int) -> dict[str, int]:
-        """Return the bytes that a step takes on top, at two of its moments; none by default.
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes that the module takes at the moments of a step; none by default.
 
-        Args:
-            count: Number of Gaussians.
-            pixels: Number of pixels of the largest view.
-
-        Returns:
-            ``loss``: what stands beside the render when the loss is computed; ``projection``: what stands there when Gaussians
-            get their gradients, `CAMERA_BYTES` for each where `before_render` is learned.
+        A module that learns `before_render` takes `CAMERA_BYTES` for each Gaussian in the backward pass of projection.
         """
         return {}
 

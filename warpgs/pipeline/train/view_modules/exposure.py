@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch.autograd.function import once_differentiable
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.evaluate import render_view
 from warpgs.pipeline.metrics.matched_psnr import RULE, matched_psnr
 from warpgs.pipeline.train.schedule import check_lrs, log_linear
 from warpgs.pipeline.train.view_modules.base import FittedViews, Tensors, ViewModule, register
+from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 from warpgs.scene import View
 
 EXPOSURE = "exposure_affine"
@@ -51,7 +52,7 @@ class _Exposed(torch.autograd.Function):
         return found
 
     @staticmethod
-    @once_differentiable
+    @first_order
     def backward(ctx: Any, v: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         rgb, exposure = ctx.saved_tensors
         m = exposure.view(CHANNELS, CHANNELS + 1)
@@ -124,9 +125,9 @@ class Exposure(ViewModule):
         square = values[EXPOSURE].double().square().sum()
         return (self.weight * square).to(values[EXPOSURE].dtype)
 
-    def bytes(self, count: int, pixels: int) -> dict[str, int]:
+    def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the render under its exposure, beside the one without."""
-        return {"loss": 4 * CHANNELS * pixels}
+        return {LOSS: FLOAT * CHANNELS * sizes.pixels}
 
     def figures(self, fitted: FittedViews) -> dict[str, Any]:
         """Return what exposures were learned.

@@ -19,6 +19,7 @@ from warpgs.errors import UsageError
 from warpgs.geometry import matmul, nearest_rotation
 from warpgs.pipeline.train.schedule import check_lrs, log_linear
 from warpgs.pipeline.train.view_modules.base import CAMERA_BYTES, FittedViews, Tensors, ViewModule, register
+from warpgs.runtime.step_sizes import PROJECTION, Needs, StepSizes
 from warpgs.scene import Camera, View
 
 ROTATION, TRANSLATION = "pose_rotation", "pose_translation"
@@ -180,9 +181,9 @@ class RefinePoses(ViewModule):
         """Return the camera after the increments of its views."""
         return replace(camera, viewmat=moved(camera.viewmat, values[ROTATION], values[TRANSLATION]))
 
-    def bytes(self, count: int, pixels: int) -> dict[str, int]:
+    def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the gradient of the camera."""
-        return {"projection": CAMERA_BYTES * count}
+        return {PROJECTION: CAMERA_BYTES * sizes.count}
 
     def cameras(
         self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors

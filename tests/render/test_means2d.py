@@ -1,0 +1,83 @@
+"""Gradients of the projected means, as density strategies read them: summed over pixels, and summed by magnitude."""
+
+import pytest
+import torch
+
+from tests.gaussians import camera, cloud, hand_placed, leaves
+from warpgs.errors import UsageError
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+
+
+def scalar(render):
+    """A loss that reads all three images."""
+    return render.rgb.square().sum() + render.alpha.square().sum() + 0.1 * render.depth.square().sum()
+
+
+@pytest.mark.parametrize("colors", [None, 5], ids=["harmonics", "channels"])
+def test_absgrad_sums_the_magnitude_of_each_pixels_gradient(device, colors):
+    """Against one backward pass for each pixel, in float64; gradients keep their bits."""
+    gaussians, cam = leaves(hand_placed(device=device, degree=1)), camera(13, 11, cameras=2, device=device)
+    values = None if colors is None else torch.randn(6, colors, generator=torch.Generator().manual_seed(0)).to(gaussians.means)
+    found = []
+    for absgrad in (False, True):
+        r = rasterize(gaussians, cam, RasterizeOptions(absgrad=absgrad, colors=values))
+        means2d = r.means2d
+        v = torch.autograd.grad(scalar(r), list(gaussians.tensors().values()), retain_graph=True, allow_unused=True)
+        found.append((means2d.grad, *(t for t in v if t is not None)))
+    assert all(torch.equal(a, b) for a, b in zip(*found))
+    absgrad, images = means2d.absgrad, [r.rgb, r.alpha, r.depth]  # before further passes add to it
+    upstream = torch.autograd.grad(scalar(r), images, retain_graph=True)
+    total = torch.zeros_like(means2d)
+    for y in range(11):
+        for x in range(13):
+            one = [torch.zeros_like(v) for v in upstream]
+            for v, whole in zip(one, upstream):
+                v[:, y, x] = whole[:, y, x]
+            total += torch.autograd.grad(images, r.projected, one, retain_graph=True)[0][..., :2].abs()
+    assert float((absgrad - total).norm()) <= 1e-12 * float(total.norm())  # measured: 3e-16
+    assert bool((absgrad > 1.5 * found[1][0].abs()).any())  # signs cancel in the plain sum
+
+
+@pytest.mark.parametrize(
+    "options", [{"max_instances": 60}, {"tile_size": 8}, {"deterministic": False}], ids=lambda o: next(iter(o))
+)
+def test_absgrad_does_not_depend_on_how_it_is_rendered(device, options):
+    """In chunks, by other tiles, and by atomic sums on CUDA."""
+    gaussians, cam = cloud(200, device=device), camera(75, 53, dtype=torch.float32, device=device)
+    found = []
+    for more in ({}, options):
+        r = rasterize(leaves(gaussians), cam, RasterizeOptions(absgrad=True, **more))
+        means2d = r.means2d
+        scalar(r).backward()
+        found.append(means2d.absgrad)
+    assert float((found[0] - found[1]).norm()) <= 1e-5 * float(found[0].norm())
+
+
+def test_a_strategy_holds_the_projected_means():
+    """``retain_grad`` and ``grad`` work as in the graph; two backward passes add up; ``absgrad`` is there only on request."""
+    r = rasterize(leaves(cloud(50)), camera(dtype=torch.float32))
+    means2d = r.means2d
+    means2d.retain_grad()
+    r.projected.retain_grad()
+    assert means2d.shape == (1, 50, 2) and means2d is r.means2d and means2d.grad is None
+    r.rgb.sum().backward(retain_graph=True)
+    once = means2d.grad.clone()
+    r.rgb.sum().backward()
+    assert bool(once.any()) and torch.equal(means2d.grad, 2 * once) and torch.equal(means2d.grad, r.projected.grad[..., :2])
+    assert not hasattr(means2d, "absgrad")
+    assert torch.equal(means2d.detach(), r.projected.detach()[..., :2])
+
+
+def test_without_gradients_means2d_is_plain():
+    """No gradient to hold where none is recorded."""
+    with torch.no_grad():
+        r = rasterize(leaves(cloud(5)), camera(dtype=torch.float32))
+    assert not r.means2d.requires_grad
+
+
+def test_absgrad_takes_one_pass():
+    """Magnitudes of several passes do not add up to that of their sum."""
+    gaussians, cam = cloud(5), camera(dtype=torch.float32)
+    for options in ({"features": torch.ones(5, 2)}, {"colors": torch.ones(5, 12)}):
+        with pytest.raises(UsageError, match="absgrad takes at most 11 channels in colors and no features"):
+            rasterize(gaussians, cam, RasterizeOptions(absgrad=True, **options))

@@ -1,0 +1,35 @@
+"""The docstrings of the fields of a dataclass, which Python itself does not keep."""
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import textwrap
+from typing import TypeVar
+
+Kind = TypeVar("Kind", bound=type)
+
+
+def field_docs(kind: type) -> dict[str, str]:
+    """Return the docstrings of the fields of a dataclass by name, each on one line; those of its bases included."""
+    docs: dict[str, str] = {}
+    for cls in reversed(kind.__mro__):
+        if not dataclasses.is_dataclass(cls):
+            continue
+        try:
+            source = inspect.getsource(cls)
+        except OSError:  # a class typed into an interpreter has no source
+            continue
+        (tree,) = ast.parse(textwrap.dedent(source)).body
+        for statement, after in itertools.pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
+            match statement, after:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str() as text)):
+                    docs[name] = " ".join(text.split())
+    return docs
+
+
+def document_fields(kind: Kind) -> Kind:
+    """Add the docstrings of a dataclass's fields to its own, so that ``help`` shows them; returns the class."""
+    lines = [f"    {name}: {text}" for name, text in field_docs(kind).items()]
+    kind.__doc__ = "\n".join([f"{kind.__doc__}\n", "Attributes:", *lines])
+    return kind

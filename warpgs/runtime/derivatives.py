@@ -1,0 +1,58 @@
+"""Derivatives that the kernels do not have: second ones, and those of torch.func. They are refused, never wrong."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from warpgs.errors import UsageError
+
+
+class _NotTwice(torch.autograd.Function):
+    """A gradient that depends on tensors, and raises where its own gradient is asked for."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
+        raise UsageError("the kernels have no second derivatives: leave out create_graph=True, or detach the gradient")
+
+
+def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap the backward method of an autograd function that has no derivative itself.
+
+    Unlike torch's `once_differentiable`, a second derivative with respect to any saved tensor raises: torch would report
+    that the tensor was not used. Nothing is added where gradients are taken without ``create_graph``.
+
+    Raises:
+        UsageError: On the gradient of a gradient.
+    """
+
+    @functools.wraps(backward)
+    def once(ctx: Any, *gradients: torch.Tensor | None) -> Any:
+        if not torch.is_grad_enabled():
+            return backward(ctx, *gradients)
+        with torch.no_grad():
+            found = backward(ctx, *gradients)
+        sources = (*gradients, *ctx.saved_tensors)
+        return tuple(None if v is None else _NotTwice.apply(v, *sources) for v in found)
+
+    return once
+
+
+def refuse_transforms() -> None:
+    """Check that no transform of torch.func is active.
+
+    Raises:
+        UsageError: One is.
+    """
+    if torch._C._are_functorch_transforms_active():
+        raise UsageError(
+            "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "
+            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] in place of vmap"
+        )
