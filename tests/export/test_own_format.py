@@ -83,7 +83,7 @@ def test_one_file_adds_a_format(own, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["convert", "--format", spec, "--help"])
     said = " ".join(capsys.readouterr().out.replace("│", "").split())
-    assert "--archive.packed" in said and "Make the archive smaller, in more time." in said
+    assert "--archive.packed" in said and "Make the archive smaller, in more time" in said
 
 
 def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):

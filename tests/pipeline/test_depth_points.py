@@ -65,7 +65,7 @@ def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
     bare, _ = coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep")
     more, notes = coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep", known=cloud)
     added = more.points[len(bare) :]
-    assert 0 < len(added) <= sum(seen) and f"{len(added)} of the reconstruction where there were none" in notes[-1]
+    assert 0 < len(added) <= sum(seen) and f"{len(added)} from the reconstruction" in notes[-1]
     assert np.abs(added[:, None] - inside[None]).sum(2).min(1).max() < 1e-9
     unknown = PointCloud(points, cloud.colors)
     assert len(coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep", known=unknown)[0]) == len(bare)

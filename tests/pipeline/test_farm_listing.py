@@ -13,7 +13,7 @@ def test_folders_and_globs(tmp_path):
         (tmp_path / name).mkdir(parents=True)
     assert [(j.name, j.scene) for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
     assert [j.name for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
-    with pytest.raises(UsageError, match="there is no scene"):
+    with pytest.raises(UsageError, match="no scene found"):
         list_jobs(f"{tmp_path}/*/nothing")
 
 

@@ -74,7 +74,7 @@ def test_a_term_without_a_name_of_its_own_is_refused():
 
     with pytest.raises(UsageError, match="Stronger has no name of its own"):
         dataclasses.replace(PLAIN, loss_terms=(Stronger(),))
-    with pytest.raises(UsageError, match=r"0\.5 is no loss term"):
+    with pytest.raises(UsageError, match=r"0\.5 is not a loss term"):
         dataclasses.replace(PLAIN, loss_terms=(0.5,))
     config = dataclasses.replace(PLAIN, loss_terms=(Gray(3.0),))
     assert FitConfig.from_json(config.to_json()) == config

@@ -120,7 +120,7 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     shutil.copy(tmp_path / "foreign" / TENSORS, tmp_path / "run" / TENSORS)
     before = contents(tmp_path / "run")
     word = "seed" if key == "config" else "fingerprint"
-    with pytest.raises(DataError, match=f"of another fit than config.json beside it: {word} differs"):
+    with pytest.raises(DataError, match=f"and config.json beside it belong to different fits: {word} differs"):
         fit(folder, tmp_path / "run", resume=True)
     assert contents(tmp_path / "run") == before
 

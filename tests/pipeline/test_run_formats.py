@@ -68,6 +68,6 @@ def test_the_format_is_a_number_in_both_files(run, tmp_path):
     (copy / TENSORS).write_bytes(body + hashlib.sha256(body).digest())
     with pytest.raises(DataError, match=r"checkpoint is of warpgs 7\.0\.0, in a format that warpgs 0\.2\.0 does not read"):
         load_checkpoint(copy)
-    with pytest.raises(DataError, match="is no record of a fit"):
+    with pytest.raises(DataError, match="not a record of a fit"):
         (copy / "config.json").write_text("[1]")
         open_run(copy)

@@ -80,7 +80,7 @@ EXTRAS = {
     "view": ("viser", "the viewer and pages to send"),
     "formats": ("zstandard", "SPZ of version 4"),
 }
-"""Extras that someone with photographs may want: the module that shows that one is there, and what it is for."""
+"""Optional dependencies for users with photographs: the module that shows that one is installed, and its purpose."""
 
 
 def _reason(error: BaseException) -> str:
@@ -193,7 +193,7 @@ def _cuda() -> Iterable[Finding]:
 
 
 def _quiet_warp():
-    """Warp, initialised without its banner and warnings: what they say is said by the report."""
+    """Warp, initialised without its banner and warnings; the report covers them."""
     import warp
 
     prepare_kernel_cache()
@@ -260,7 +260,7 @@ def _kernel_cache() -> Iterable[Finding]:
         yield Finding(topic, MISSING, _reason(e), "fix warp-lang first", True)
         return
     if refused:
-        remedy = "set WARP_CACHE_PATH to a folder that you, and nobody else, may write to"
+        remedy = "set WARP_CACHE_PATH to a folder that only you may write to"
         yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for a minute or two", remedy, True)
         return
     size = _size(folder)
@@ -341,7 +341,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
     with ThreadPoolExecutor(len(APART)) as pool:
         apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
         checks = [check for check in CHECKS if check not in APART]
-        here = {check: _findings(check) for check in counted(checks, tell, "looking at this machine", "parts")}
+        here = {check: _findings(check) for check in counted(checks, tell, "checking this machine", "parts")}
         return [f for check in CHECKS for f in (here[check] if check in here else apart[check].result())]
 
 

@@ -154,7 +154,7 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
     factor, flags, done = float(downscale), f"--downscale {downscale}", loaded.done
     if max_side and round(max(width, height) / downscale) > max_side:
         factor, flags = max(width, height) / max_side, f"--max-side {max_side}"
-        done = (*done, f"{REDUCED}{max_side} px on the longer side; --max-side names another, 0 keeps the size")
+        done = (*done, f"{REDUCED}{max_side} px on the longer side; change it with --max-side, 0 for full size")
     if factor == 1:
         return loaded
     small_w, small_h = round(width / factor), round(height / factor)

@@ -37,7 +37,7 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     j, n = best[0]
     matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
     if j in found.views:
-        return f"{matched}, too few of them at places whose depth is known"
+        return f"{matched}, too few of them at places of known depth"
     group = next((g for g in found.groups[1:] if i in g), ())
     together = f", in a group of {len(group)} by itself" if group else ""
     return f"{matched}, which has no pose either{together}"

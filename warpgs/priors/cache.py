@@ -110,6 +110,6 @@ class MapCache:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, save({n: np.ascontiguousarray(m) for n, m in zip(names, maps)}))
         except (OSError, ResourceError) as e:
-            note = f"maps are not kept for the next time ({e}); WARPGS_CACHE names another folder"
+            note = f"maps are not cached ({e}); set WARPGS_CACHE to another folder"
             if not any(n.startswith("maps are not kept") for n in self.notes):
                 self.notes.append(note)

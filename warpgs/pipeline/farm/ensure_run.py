@@ -37,7 +37,7 @@ class Outcome:
 
 
 def _scores(path: Path) -> dict[str, Any] | None:
-    """Read metrics.json or eval.json; None where there is none or it is not whole."""
+    """Read metrics.json or eval.json; None if it is missing or incomplete."""
     try:
         value: dict[str, Any] = schema.read(path, path.parent)
         METRICS(value, "")
@@ -151,7 +151,7 @@ def _outcome(
         else:
             resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
     elif os.path.exists(folder) and not is_empty(folder):
-        note = f"what was there {why}; moved to {_set_aside(folder).name} and done anew"
+        note = f"old results: {why}; moved to {_set_aside(folder).name} and fitted again"
         state = "redone"
 
     def fit(go_on: bool) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     else:
         found = _named(sorted(Path(p) for p in glob.glob(jobs)))
     if not found:
-        raise UsageError(f"{jobs}: there is no scene; give a folder of scenes, a glob in quotes, or a .jsonl file")
+        raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
     taken: dict[str, ListedJob] = {}
     for job in found:
         if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:

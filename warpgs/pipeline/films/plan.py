@@ -1,4 +1,4 @@
-"""Plans of films: which cameras a path has for a model, and what was chosen for the user."""
+"""Plans of films: the cameras of a path for a model, and notes on the choices made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from warpgs.scene import Camera, Gaussians
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
 """Names of paths; the name of a JSON file of keyframes is one, too."""
 SECONDS = 3.0
-"""Duration of a film where none is given."""
+"""Default duration of a film."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 """Duration of a film through training views: for each view, and at most."""
 MIN_FRAMES_PER_VIEW = 4
@@ -84,7 +84,7 @@ class FilmPlan:
     remedy: str
     """Advice for frames that show nothing."""
     notes: list[str]
-    """Lines for the user on what was chosen."""
+    """Lines for the user on the choices made."""
 
 
 @torch.no_grad()

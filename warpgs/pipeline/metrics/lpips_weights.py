@@ -98,7 +98,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     try:
         file = open_input(path)
     except FileNotFoundError as e:
-        raise DataError(f"{path}: there is no such file; give a .pth file with a state dict") from e
+        raise DataError(f"{path}: no such file; give a .pth file with a state dict") from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
     with file:
@@ -215,7 +215,7 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     try:
         data = read_input(path)
     except FileNotFoundError as e:
-        raise DataError(f"{path}: there is no such file; `warpgs convert-lpips` makes one from published weights") from e
+        raise DataError(f"{path}: no such file; `warpgs convert-lpips` makes one from published weights") from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); `warpgs convert-lpips` makes such a file") from e
     try:

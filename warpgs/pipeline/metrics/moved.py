@@ -24,7 +24,7 @@ FLOOR = 0.005
 MIN_VIEWS = 2
 """Fewest other views that must show a point."""
 MIN_TRAINING = 6
-"""Fewest training views of which anything is said: with fewer the model has room to fit what one of them shows alone."""
+"""Fewest training views for this check: with fewer, the model can fit objects that only one view shows."""
 NEIGHBORS = 8
 """Views taken nearest by in which a point is looked up."""
 MAX_DEPTH_ERROR = 0.1
@@ -139,7 +139,7 @@ def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[
 
 
 def moved_notes(fractions: dict[str, float]) -> list[str]:
-    """Return the sentence that names views with such regions, by the fraction of their pixels; none where there are none."""
+    """Return notes that name views with such regions, by the fraction of their pixels."""
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
     if not named:
         return []

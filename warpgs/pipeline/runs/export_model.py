@@ -29,7 +29,7 @@ from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 
 ROUNDING = 1e-4
-"""Change of a log scale below which nothing is said: a hundredth of a percent."""
+"""Smallest change of a log scale that is reported: a hundredth of a percent."""
 
 
 def convert(

@@ -45,7 +45,7 @@ def mesh(
     device, _ = choose_device(device_name)
     run = open_run(folder, device)
     if not run.train:
-        raise DataError(f"{folder}: it has no training views, so nobody knows what was seen; fit again")
+        raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
     cameras, scale = [run.scene_cameras[n] for n in run.train], run.normalization.scale
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)

@@ -26,7 +26,7 @@ POINTS, COLORS, BACKGROUNDS = ("gaussians", "start"), ("own", "coverage"), ("whi
 SIZES = (64, 8192)
 """Smallest and largest side of a plot [px]."""
 MIN_OPACITY = 0.1
-"""Least opacity of a Gaussian that is shown: fainter ones are seen by nobody."""
+"""Least opacity of a Gaussian that is shown: fainter ones are invisible."""
 MAX_POINTS = {"gaussians": 50_000, "start": 300_000}
 """Number of Gaussians and of points shown; of more, a sample."""
 CLASSES = (

@@ -41,7 +41,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     if (scene / JSON).is_file():
         record = read_record(scene)
         if record["source_sha256"] != source_digest(source, request.allow_outside):
-            raise UsageError(f"{source} does not hold the photographs of {scene}, whose poses it keeps; give another --out")
+            raise UsageError(f"{source} holds the poses of other photographs than {scene}; give another --out")
     else:
         progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
         threads = torch.get_num_threads()

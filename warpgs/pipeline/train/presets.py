@@ -114,7 +114,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
         return _config_of_file(Path(preset), Path(preset).name)
     name = DEFAULT_PRESET if preset is None else preset
     if not isinstance(name, str):
-        raise UsageError(f"{name!r} is no preset; give a name, a path, a FitConfig or a mapping")
+        raise UsageError(f"{name!r} is not a preset; give a name, a path, a FitConfig or a mapping")
     if ":" not in name:
         return _named(name)
     found = load_object("preset", name)
@@ -142,7 +142,7 @@ def chosen_settings(
 
 
 def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
-    """Return a note on where settings come from: ``origin``, and what was changed from there."""
+    """Return a note on the source of the settings: ``origin``, and the changes to it."""
     from warpgs.pipeline.train.overrides import changed_settings
 
     changed = changed_settings(start, config)
@@ -181,7 +181,7 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
     except (SchemaError, RecursionError) as e:
         raise DataError(f"{path}: has more than {MAX_DEPTH} tables and lists in each other; {remedy}") from e
     except ValueError as e:  # no TOML, or no UTF-8
-        raise DataError(f"{path}: is no TOML ({e}); {remedy}") from e
+        raise DataError(f"{path}: not valid TOML ({e}); {remedy}") from e
     return values, hashlib.sha256(data).hexdigest()[:12]
 
 

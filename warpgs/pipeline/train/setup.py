@@ -35,7 +35,7 @@ class Preparation:
     priors: list[Prior] | None
     """One a view; None where nothing asks for them."""
     notes: list[str]
-    """Sentences on what was chosen, assumed and missing."""
+    """Notes on choices, assumptions and missing inputs."""
 
 
 def prepare(
@@ -71,7 +71,7 @@ def prepare(
 
     @functools.cache
     def start() -> Start:
-        progress("finding the first points")
+        progress("finding start points")
         found = initial_points(train, points, config.init, generator, usable, progress)
         return subsample(found, config.max_gaussians, generator)
 
@@ -90,7 +90,7 @@ def prepare(
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
-    """Refuse settings that compare views with each other where a camera is no pinhole; only the kernels know other models."""
+    """Refuse settings that compare views with each other if a camera is not a pinhole; only the kernels know others."""
     others = sorted({v.camera.model for v in train} - {"pinhole"})
     if others and (config.init.source != "points" or samples(config)):
         raise UsageError(
@@ -110,7 +110,7 @@ def needs_priors(config: FitConfig) -> bool:
 
 
 def terms_of(config: FitConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
-    """Return all loss terms of a fit by its settings; ``cutout`` says that its views know their opacity."""
+    """Return all loss terms of a fit by its settings; ``cutout``: its images have an alpha channel."""
     return (*built_in_terms(config.loss, cutout), *config.loss_terms)
 
 
