@@ -87,7 +87,7 @@ def _replaced(
     except OSError as e:
         amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
         raise ResourceError(
-            f"{path}: {amount}cannot be written ({e.strerror or e}); what was there before is untouched. {_remedy(e)}"
+            f"{path}: {amount}cannot be written ({e.strerror or e}); the old file is untouched. {_remedy(e)}"
         ) from e
 
 

@@ -55,7 +55,7 @@ def test_a_missing_mask_is_named_by_its_id(tmp_path):
     """Matching by sorted order would give every later view its neighbour's mask."""
     scenes.write_colmap(tmp_path, names=RECT)
     write_masks(tmp_path / "idrmasks", [0, 1, 3, 4])
-    with pytest.raises(DataError, match=r"there is no mask for image id 2 .* rect_001_... is id 0"):
+    with pytest.raises(DataError, match=r"no mask for image id 2 .* rect_001_... is id 0"):
         load_scene(tmp_path)
 
 

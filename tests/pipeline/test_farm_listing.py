@@ -35,7 +35,7 @@ def test_lines_are_flags_of_fit(tmp_path):
 @pytest.mark.parametrize(
     ("line", "word"),
     [
-        ("{", "is no JSON"),
+        ("{", "not valid JSON"),
         ("[]", "must be an object"),
         ('{"name": "a"}', "scene is missing"),
         ('{"scene": 3}', "scene must be text"),

@@ -67,8 +67,8 @@ def failure(capsys, code, *arguments):
 def test_mistakes_get_one_line(scene, tmp_path, capsys):
     """2 usage, 3 data, 4 resources."""
     out = tmp_path / "out"
-    assert "say show or export" in failure(capsys, 2, "priors")
-    assert "say show or export" in failure(capsys, 2, "priors", "draw")
+    assert "give show or export" in failure(capsys, 2, "priors")
+    assert "give show or export" in failure(capsys, 2, "priors", "draw")
     assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
     assert "--threads must be a number from 0" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
     assert "name it by --depth-model" in failure(capsys, 2, *show(scene, "--out", out, "--depth-size", 64))

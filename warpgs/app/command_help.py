@@ -28,7 +28,7 @@ def help_text(kind: type, program: str, description: str) -> str:
         program: Name of the program and the command.
         description: Words about the command; lines of lists begin with two spaces.
     """
-    usage, positionals, flags, more = [program], [], [], []
+    docs, usage, positionals, flags, more = field_docs(kind), [program], [], [], []
     for field in dataclasses.fields(kind):
         hint, markers = _parts(typing.get_type_hints(kind, include_extras=True)[field.name])
         if dataclasses.is_dataclass(hint):
@@ -38,9 +38,9 @@ def help_text(kind: type, program: str, description: str) -> str:
         elif "Positional" in str(markers):
             several = typing.get_origin(hint) is tuple
             usage.append(field.name.upper() + " ..." * several)
-            positionals.append((field.name.upper(), field_docs(kind)[field.name].removesuffix(".")))
+            positionals.append((field.name.upper(), docs.get(field.name, "").removesuffix(".")))
         else:
-            row = _row(field, hint, "", field_docs(kind)[field.name])
+            row = _row(field, hint, "", docs.get(field.name, ""))
             flags.append(row)
             if _required(field):
                 usage.append(row[0])

@@ -14,7 +14,7 @@ from warpgs.io.exif import read_exif
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
-"""First words of what is noted of an image that `load_image` brought to its longest side."""
+"""First words of the note on an image that `load_image` brought to its longest side."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".hif")
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
@@ -226,7 +226,7 @@ def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
 
 
 def _over_background(loaded: LoadedImage, background: tuple[float, float, float]) -> LoadedImage:
-    """Return an image whose colours, multiplied by their opacity until now, lie over a background."""
+    """Return an image with colours, premultiplied by their opacity, over a background."""
     image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha
     if alpha is not None:
         alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more

@@ -108,7 +108,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     complete = [r for r, p in found if not p.missing]
     broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
     if not complete and broken:
-        raise DataError(f"{root}: {broken[0]}, and there is no other format. Copy the whole reconstruction")
+        raise DataError(f"{root}: {broken[0]}, and no other format was found. Copy the whole reconstruction")
     if not complete:
         images = ". It holds images without cameras: `warpgs poses` finds those" if list_images(root) else ""
         if not images and (unread := unread_note(root)):
@@ -127,7 +127,7 @@ def _check_folder(root: Path) -> None:
     if root.is_file():
         raise DataError(f"{root}: is a file; give the folder that holds the images and their cameras")
     if not root.is_dir():
-        raise DataError(f"{root}: there is no such folder; give the folder that holds the images and their cameras")
+        raise DataError(f"{root}: no such folder; give the folder that holds the images and their cameras")
 
 
 def _accepted(root: Path, reader: Reader) -> Reader:

@@ -138,7 +138,7 @@ def find_reader(choice: str | type[Reader] | Reader) -> Reader:
     if isinstance(choice, Reader):
         return choice
     if not isinstance(choice, (str, type)):
-        raise UsageError(f"{choice!r} is no reader; give a name, module:Class, or a class or object derived from Reader")
+        raise UsageError(f"{choice!r} is not a reader; give a name, module:Class, or a class or object derived from Reader")
     if isinstance(choice, type) or ":" not in choice:
         return READERS.find(choice)()
     cls = READERS.load(choice)

@@ -1,4 +1,4 @@
-"""Fusion of what all cameras see into a mesh: distances, then triangles, then their colours."""
+"""Fusion of the depth of all cameras into a mesh: distances, then triangles, then their colours."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class MeshOptions:
 
 @dataclass(frozen=True)
 class FusedMesh:
-    """A mesh with what was found on the way."""
+    """A mesh with its statistics."""
 
     mesh: Mesh
     """The mesh, in the units of the cameras."""
@@ -112,7 +112,7 @@ def fuse(
         ResourceError: The grid does not fit into memory.
         UsageError: A camera is no pinhole, or an option is out of range.
     """
-    views = surface_views(gaussians, cameras, render, options.depth, "looking where surfaces are", stage)
+    views = surface_views(gaussians, cameras, render, options.depth, "finding surfaces", stage)
     samples = [sample_surface(v, max(1, SAMPLES // len(cameras))) for v in views]
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
     planned(plan, check_memory(plan, gaussians.means.device))

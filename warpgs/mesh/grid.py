@@ -48,7 +48,7 @@ class GridPlan:
 
     @property
     def truncation(self) -> float:
-        """Largest distance from a surface that is told apart [u]."""
+        """Largest distance from a surface that is stored [u]."""
         return TRUNCATION * self.voxel
 
 

@@ -33,7 +33,7 @@ LINE_DISTANCE = 2.0
 MIN_SPARSE = 16
 """Smallest number of matches from which flow is interpolated."""
 NET_STRIDE = 8
-"""Side length [px] of whose multiples networks of the RAFT kind take images."""
+"""Multiple of both image sides [px] for networks of the RAFT kind."""
 RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
 """Factor and offset from colours in [0, 1] to a network's input: RAFT's original code takes 0..255, torchvision's -1..1."""
 

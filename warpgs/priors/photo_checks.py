@@ -40,11 +40,11 @@ FINE, COARSE = 1.0, 2.0
 PATCH = 15
 """Side of the square around a match in which detail and colour are measured [px]."""
 NOISE = 0.1 / 255**2
-"""Mean square that is added to both bands of detail: less than a level of an 8-bit image tells nothing."""
+"""Mean square that is added to both bands of detail: less than a level of an 8-bit image is noise."""
 DARKEST, BRIGHTEST = 0.04, 0.94
 """Colours in [0, 1] between which brightness is compared: outside, a photograph is black or clipped."""
 REMEDY = "fix it in the camera, or try --exposure"
-"""Remedy for photographs whose colours differ."""
+"""Remedy for photographs with different colours."""
 MAX_NAMED = 6
 """Photographs that one sentence names."""
 PROGRESS_INTERVAL = 5.0

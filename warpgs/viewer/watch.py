@@ -94,7 +94,7 @@ def _pause() -> None:
 
 
 def _update(window: Window, path: Path, device: str) -> None:
-    """Show the newest checkpoint; one that cannot be read is said, and the one before stays."""
+    """Show the newest checkpoint; report an unreadable one and keep the one before."""
     try:
         window.show(content_of_run(path, device, window.content.views))
     except WarpgsError as e:

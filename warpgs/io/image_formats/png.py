@@ -1,4 +1,4 @@
-"""PNG: the checksum of every chunk, and that of the compressed pixels, whose number must be what the header says."""
+"""PNG: the checksum of every chunk, and that of the compressed pixels; their number must match the header."""
 
 from __future__ import annotations
 

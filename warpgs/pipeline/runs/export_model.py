@@ -97,7 +97,7 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
         gaussians = limit_degree(gaussians, kind.max_degree)
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
-        lines.append(f"the file does not hold the colour behind the scene, which was #{color} in the fit")
+        lines.append(f"the file does not hold the background colour of the fit, #{color} in the fit")
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:

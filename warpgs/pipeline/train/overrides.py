@@ -141,7 +141,7 @@ def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> t
 
 def _found(registry: Registry[Any], name: Any, own_code: bool) -> type[Any]:
     if not isinstance(name, (str, type)):
-        raise UsageError(f"{name!r} is no {registry.kind}; give one of {', '.join(registry.names())}")
+        raise UsageError(f"{name!r} is not a {registry.kind}; give one of {', '.join(registry.names())}")
     return registry.load(name) if own_code and isinstance(name, str) else registry.find(name)
 
 
