@@ -108,7 +108,7 @@ def test_a_file_that_fails_is_not_half_loaded(registry, own):
 
 
 def test_an_unknown_name_lists_those_there_are(registry):
-    with pytest.raises(UsageError, match=r"there is not a strategy 'best'; choose one of .*clone_split.* or give module:Class"):
+    with pytest.raises(UsageError, match=r"unknown strategy 'best'; choose one of .*clone_split.* or give module:Class"):
         registry.find("best")
     with pytest.raises(UsageError, match="int is not a strategy"):
         registry.find(int)

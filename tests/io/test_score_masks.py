@@ -83,7 +83,7 @@ def test_masks_that_cannot_be_used_are_named(tmp_path):
     refused("there are no masks")
     for name in "abcde":
         scenes.save(folder / f"{name}.png", mask_of(0))
-    refused("no numbers that tell them apart")
+    refused("no distinct numbers")
     shutil.rmtree(folder)
     write_masks(folder)
     scenes.save(folder / "002.png", np.full((20, 20), 255, np.uint8))

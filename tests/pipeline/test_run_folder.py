@@ -131,7 +131,7 @@ def test_a_fit_that_was_killed_before_it_had_a_record_can_be_begun_again(folder,
     out.mkdir()
     (out / LOCK).write_text("")
     (out / LEFT).write_text('{"format": 2,')
-    with pytest.raises(UsageError, match="holds no config.json; give the folder"):
+    with pytest.raises(UsageError, match=r"holds no config\.json; give the folder"):
         fit(folder, out, resume=True)
     assert fit(folder, out).step == 2
     assert not (out / LEFT).exists() and not (out / LOCK).exists()

@@ -111,5 +111,5 @@ class MapCache:
             write_bytes(path, save({n: np.ascontiguousarray(m) for n, m in zip(names, maps)}))
         except (OSError, ResourceError) as e:
             note = f"maps are not cached ({e}); set WARPGS_CACHE to another folder"
-            if not any(n.startswith("maps are not kept") for n in self.notes):
+            if not any(n.startswith("maps are not cached") for n in self.notes):
                 self.notes.append(note)
