@@ -113,7 +113,7 @@ def filling(folder: Path) -> Iterator[Path]:
     """
     target = folder.absolute() if is_below(folder) else Path(os.path.realpath(folder))
     if os.path.realpath(target) == os.path.realpath(Path.cwd()):
-        raise UsageError(f"{folder}: is the folder that you are in, and it would be made anew under you; name another one")
+        raise UsageError(f"{folder}: refusing to replace the current directory; choose another path")
     make_folder(target.parent)
     try:
         above = open_folder(target.parent)

@@ -184,7 +184,7 @@ def own_frame(error: BaseException) -> str:
 def _import_module(name: str) -> ModuleType:
     """Import a module by its full dotted name."""
     if not name or name.startswith("."):
-        raise ImportError(f"{name!r} is no full name of a module")
+        raise ImportError(f"{name!r} is not a full module name")
     return importlib.import_module(name)
 
 

@@ -46,7 +46,7 @@ def parse(text: str | bytes) -> Any:
     try:
         value = json.loads(text)
     except RecursionError as e:
-        raise SchemaError(f"has more than {MAX_DEPTH} lists and objects in each other") from e
+        raise SchemaError(f"is nested deeper than {MAX_DEPTH} lists and objects") from e
     except ValueError as e:
         raise SchemaError(f"not valid JSON: {e}") from e
     check_depth(value, MAX_DEPTH)
@@ -74,7 +74,7 @@ def check_depth(value: Any, most: int) -> None:
     while level := [part for outer in level for part in _parts(outer)]:
         depth += 1
         if depth > most:
-            raise SchemaError(f"has more than {most} lists and objects in each other")
+            raise SchemaError(f"is nested deeper than {most} lists and objects")
 
 
 def _parts(value: Any) -> list[Any]:

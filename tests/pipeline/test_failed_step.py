@@ -87,5 +87,5 @@ def test_what_is_not_finite_is_counted(tmp_path, capsys):
         with pytest.raises(DataError, match="not a failed step"):
             read_failed_step(tmp_path / name, CPU)
     del bundle[0]["K"]
-    with pytest.raises(DataError, match="not whole"):
+    with pytest.raises(DataError, match="incomplete"):
         findings(bundle)

@@ -51,7 +51,7 @@ def test_lines_are_flags_of_fit(tmp_path):
         ('{"scene": "a", "name": ".b"}', "cannot be the name"),
         ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, and the name of a job at most 200"),
         ('{"scene": "a", "name": "%s"}' % (101 * "x"), "cannot be the name"),
-        ("[" * 60 + "]" * 60, "in each other"),
+        ("[" * 60 + "]" * 60, "nested deeper"),
     ],
 )
 def test_lines_that_are_no_jobs(tmp_path, line, word):

@@ -99,7 +99,7 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ('base = "json:dumps"', "is code, which is never imported because a file names it"),
         ('base = "best"', "base 'best' is not one of"),
         ("base = 3", "base must be text, not 3"),
-        ('base = "my.toml"', "leads back here"),
+        ('base = "my.toml"', "is circular"),
         ('preset = "quick"', "unknown setting 'preset'"),
     ],
 )
@@ -117,8 +117,8 @@ def test_a_wrong_setting_is_named(tmp_path, text, said):
         (b"steps = 1\nseed = = 2", "at line 2"),
         (b"steps = 1\nsteps = 2", "not valid TOML"),
         (b"\xff\xfe", "not valid TOML"),
-        (b"x = " + b"[" * 5000 + b"]" * 5000, "in each other"),
-        (b"a = " + b"[" * 20 + b"]" * 20, "in each other"),
+        (b"x = " + b"[" * 5000 + b"]" * 5000, "nested deeper"),
+        (b"a = " + b"[" * 20 + b"]" * 20, "nested deeper"),
         (b"#" * (MAX_BYTES + 1), "larger than"),
         (b"a = 1\n" + b"a." * (MAX_DOTS + 1) + b"a = 1", "more than 100 dots in a line"),
         (None, "cannot be read"),
@@ -223,7 +223,7 @@ def test_a_fit_takes_keywords_and_records_where_settings_come_from(tmp_path):
         ({"init_opacity": float("nan")}, "init_opacity must be a finite number"),
         ({"opacity": 0.3}, "did you mean init_opacity"),
         ({"sh_degree": 4}, r"sh-degree must lie in \[0, 3\], not 4"),
-        ({"downscale": 2}, "downscale says how a scene is read"),
+        ({"downscale": 2}, "downscale is an option of reading a scene"),
     ):
         with pytest.raises(UsageError, match=said):
             warpgs.fit(scene, "quick", out=tmp_path / "x", **wrong, **options)

@@ -75,7 +75,7 @@ def chosen_formats(a: Any, target: Path) -> list[Format]:
     for group, config in _with_options(a.format).items():
         if settings_of(config, getattr(a, group)) != config() and config is not written.Config:
             flag = group.replace("_", "-")
-            raise UsageError(f"--{flag}.* are options of another format than that of {target}; leave them out")
+            raise UsageError(f"--{flag}.* are not options of the format of {target}; leave them out")
     if written.Config is None:
         return named
     made = written(settings_of(written.Config, getattr(a, flag_group(written.name))))

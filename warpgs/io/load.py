@@ -53,7 +53,7 @@ def load_scene(
             them. None for 1600 where ``downscale`` is None too, else for no limit.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let names and links of the scene lead to files outside its folder.
-        masks: Fate of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
+        masks: Treatment of masked-out pixels: ignore (they do not count, in fit and score) or cutout
             (they are transparent, gray ones in part: `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
         black_is_empty: Dark pixels around an object and in its holes are transparent, where every image shows one on black and

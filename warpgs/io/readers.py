@@ -39,7 +39,7 @@ class ReadOptions:
     allow_outside: bool = False
     """Names and links of the scene may lead to files outside its folder."""
     masks: str = "ignore"
-    """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    """Treatment of masked-out pixels: ignore (they do not count) or cutout (they are transparent)."""
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True

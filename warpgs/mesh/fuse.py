@@ -45,7 +45,7 @@ class MeshOptions:
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
         if self.voxel is not None and self.resolution is not None:
-            raise UsageError("--voxel and --resolution say the same; give one of them")
+            raise UsageError("--voxel and --resolution exclude each other; give one of them")
         if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
             raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {self.resolution}")
         if self.max_faces < MIN_FACES:

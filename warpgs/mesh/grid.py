@@ -82,7 +82,7 @@ def plan_grid(
         UsageError: A number is out of range.
     """
     if not len(points):
-        raise DataError("no training view shows a surface: alpha is below 1/2 everywhere; fit again, with more steps")
+        raise DataError("no training view shows a surface: alpha is below 0.5 everywhere; fit again with more steps")
     low, high = find_box(points)
     longest = float((high - low).max())
     if voxel is None:

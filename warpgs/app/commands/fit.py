@@ -232,7 +232,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
     if a.threads:
         set_threads(a.threads)
     request = stored_request(a.out)
-    say(f"continued as it was started: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    say(f"continuing as before: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
     device, view_port = a.device or request.device, a.view_port if a.view else None
     return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 

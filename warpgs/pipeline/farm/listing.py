@@ -50,7 +50,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     path = Path(jobs)
     if path.is_dir():
         if any(r.probe(path) is not None for r in all_readers()):
-            raise UsageError(f"{jobs} is one scene: fit it with `warpgs fit`, or give the folder above it")
+            raise UsageError(f"{jobs} is a single scene: fit it with `warpgs fit`, or give its parent folder")
         found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
     elif path.suffix == ".jsonl":
         found = _read(path)

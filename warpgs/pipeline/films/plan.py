@@ -141,7 +141,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         UsageError: The path is unknown.
     """
     if path not in PATHS and not path.lower().endswith(".json"):
-        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)}, and no .json file of keyframes")
+        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)} or a .json file of keyframes")
     scene = model.cameras()
     train = [scene[n] for n in model.train]
     depth, coverage = depth_and_coverage(model.gaussians(), train, model.options())
@@ -158,7 +158,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         return FilmPlan(_numbered(cameras), coverage, remedy, [words])
     notes = [f"{len(train)} training cameras look {rig.describe()}"]
     if rig.turned:
-        notes.append("the photographs lie on their side; the film is upright, by the plane that the cameras stand in")
+        notes.append("the photographs lie on their side; the film is upright, by the plane of the cameras")
     kind = BY_KIND[rig.kind] if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)

@@ -145,6 +145,4 @@ def moved_notes(fractions: dict[str, float]) -> list[str]:
         return []
     words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
     more = f" and {len(named) - 6} more" if len(named) > 6 else ""
-    return [
-        f"something moved, or looks otherwise than in the views beside it, in {words}{more}; a mask takes it out of the fit"
-    ]
+    return [f"moving or changing objects in {words}{more}; mask them out"]

@@ -125,7 +125,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); check the path and its permissions") from e
     except (SafetensorError, ValueError) as e:
-        raise DataError(f"{path}: is damaged or no safetensors file ({e}); write it again with warpgs.save") from e
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with warpgs.save") from e
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
         raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:

@@ -121,5 +121,5 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
         state = schema.parse(metadata["state"])
         schema.mapping(schema.anything)(state, "")
     except (KeyError, schema.SchemaError) as e:
-        raise DataError(f"{path}: its state is not whole ({e}); fit again, or restore it") from e
+        raise DataError(f"{path}: its state is incomplete or damaged ({e}); fit again, or restore it") from e
     return tensors, state

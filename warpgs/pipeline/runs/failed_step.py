@@ -136,7 +136,7 @@ def findings(bundle: Bundle) -> list[str]:
             lines += [f"    its gradient by {n} is not finite" for n in broken]
         lines += [f"  view module {n}: {float(t.detach()):g}" for n, t in found.of_views.items()]
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as e:
-        raise DataError(f"the failed step is not whole ({e!r}); fit again to have it written anew") from e
+        raise DataError(f"the failed step is incomplete ({e!r}); fit again to write it again") from e
     return lines
 
 

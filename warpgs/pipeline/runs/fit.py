@@ -232,7 +232,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
     with background_warmup(c, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
-            job.notes.append(f"camera model {models}: photographs are not compared with each other; coverage is not measured")
+            job.notes.append(f"camera model {models}: photographs are not compared; coverage is not measured")
         else:
             job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background

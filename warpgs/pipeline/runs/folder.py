@@ -76,7 +76,7 @@ def _check_folder(out: Path, resume: bool) -> None:
         if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
     except OSError as e:
-        raise UsageError(f"{out}: cannot be looked into ({e.strerror or e}); choose another --out") from e
+        raise UsageError(f"{out}: cannot be read ({e.strerror or e}); choose another --out") from e
 
 
 def camera_values(camera: Camera) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         check_record(record)
     except schema.SchemaError as e:
-        raise DataError(f"{path}: is not whole, {e}; restore it, or fit the scene again into a new --out") from e
+        raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again into a new --out") from e
     return record
 
 
@@ -300,11 +300,11 @@ def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Pat
     try:
         MODEL_STATE(state, "")
     except schema.SchemaError as e:
-        raise DataError(f"{path}: its state is not whole, {e}; restore it, or fit the scene again") from e
+        raise DataError(f"{path}: its state is incomplete or damaged: {e}; restore it, or fit the scene again") from e
     found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
     if "sh_packed" in found and "degrees" in tensors:
         try:
             found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
         except ValueError as e:
-            raise DataError(f"{path}: is not whole, {e}; restore it, or fit the scene again") from e
+            raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again") from e
     return checked_gaussians(found, str(path)), state["step"]

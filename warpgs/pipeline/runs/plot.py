@@ -89,7 +89,7 @@ def _start(stored: StoredRun) -> tuple[np.ndarray, np.ndarray, None]:
     """Return positions [N, 3] and colours [N, 3] of the points of the scene's reconstruction."""
     scene, _, _ = scene_of(stored)
     if scene.points is None or not len(scene.points):
-        raise DataError(f"{scene.path}: its format ({scene.format}) brings no points; leave out --points start")
+        raise DataError(f"{scene.path}: its format ({scene.format}) has no points; leave out --points start")
     return scene.points.points, scene.points.colors, None
 
 

@@ -123,11 +123,11 @@ def _summary(r: dict[str, Any]) -> str:
     where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
     error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
     if r["rule"] == "exact":
-        words = f"no cut-off changes the images (rule exact); float32 is off float64 by {error}"
+        words = f"rule exact has no cut-offs; float32 differs from float64 by {error}"
     else:
         ratio = r["render_ms"] / r["exact_ms"]
         words = (
-            f"rule {r['rule']} is off exact, in float64, by {error}; a view took {r['render_ms']:.1f} ms instead of "
+            f"rule {r['rule']} differs from rule exact in float64 by {error}; a view took {r['render_ms']:.1f} ms instead of "
             f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
         )
     if r["half_resolution"] > 0:

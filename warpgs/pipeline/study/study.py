@@ -201,7 +201,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
     elif lacking:
         notes.append(f"{lacking} runs lack {metrics[-1].label}: they are left out of its column")
     if len(request.scenes) > 1:
-        notes.append("deviations and intervals are over seeds, of the mean over these scenes: they say nothing of other scenes")
+        notes.append("deviations and intervals are over seeds, for the mean over these scenes; they do not cover other scenes")
     return notes
 
 

@@ -157,7 +157,7 @@ def check_modules(modules: Sequence[ViewModule]) -> None:
             )
         if not VIEW_MODULES.has(kind):
             raise UsageError(
-                f"the view module {kind.__qualname__} has no name of its own; register it "
+                f"the view module {kind.__qualname__} has no registered name; register it "
                 'with @register("name") of warpgs.pipeline.train.view_modules.base above the class, or name it as module:Class'
             )
         if any(type(m) is kind for m in modules[:i]):
