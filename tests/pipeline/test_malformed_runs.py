@@ -104,9 +104,9 @@ def test_a_path_that_is_too_long_for_any_system(run, capsys):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('{"format": 2, "config": ', "not valid JSON"), ("[]", "no record of a fit"), ("", "not valid JSON"), ("9" * 5000, "not valid JSON"),
-        ("[" * 100_000, "nested deeper"), ('{"a":' * 100_000, "nested deeper"),
-        ("\xff", "not valid JSON"),
+        ('{"format": 2, "config": ', "not valid JSON"), ("[]", "not a record of a fit"), ("", "not valid JSON"),
+        ("9" * 5000, "not valid JSON"),
+        ("[" * 100_000, "nested deeper"), ('{"a":' * 100_000, "nested deeper"), ("\xff", "not valid JSON"),
     ],
 )  # fmt: skip
 def test_a_record_that_is_no_json_object(run, text, words):
