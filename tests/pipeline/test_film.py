@@ -125,7 +125,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     )
     assert 0.02 < plan.coverage < 0.9
     done = render_film(model, plan, tmp_path / "a.webp", FilmSettings())
-    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing, numbers 3 to 4: the path leaves what the photographs")
+    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing, numbers 3 to 4: the path leaves the captured area")
     assert "--path interpolate" in done.notes[-1] and done.files == [tmp_path / "a.webp"]
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
     done = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())

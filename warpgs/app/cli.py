@@ -22,7 +22,7 @@ COMMANDS = {
     "demo": "write a synthetic scene to try things with",
     "poses": "find the poses of photographs or a video; gives a scene folder",
     "fit": "fit Gaussians to a scene folder and fill a run folder",
-    "view": "look at a run, a PLY file or a fit that goes on, in a browser",
+    "view": "show a run, a PLY file or a running fit in a browser",
     "render": "render a run as a film: along a path, its views, or keyframes",
     "plot": "show a run's cameras and Gaussians in one image",
     "priors": "show depth and saliency before a fit, or write networks as ONNX",

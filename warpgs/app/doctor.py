@@ -151,7 +151,7 @@ def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
     memory = machine_memory()
     if memory is None:
-        assumed = f"the system does not say how much there is; {format_bytes(ASSUMED_BYTES)} are assumed"
+        assumed = f"the system does not report it;{format_bytes(ASSUMED_BYTES)} are assumed"
         yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory
@@ -242,7 +242,7 @@ def _prior_cache() -> Iterable[Finding]:
             pass
     except OSError as e:
         remedy = "set WARPGS_CACHE to a folder that you may write to"
-        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run anew each time", remedy)
+        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run again each time", remedy)
         return
     yield Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")
 

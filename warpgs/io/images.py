@@ -220,7 +220,7 @@ def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
         alpha = None
     if mask is not None and not mask.any():
         raise DataError(
-            f"{path}: its mask leaves no pixel; --mask-keeps says which of its colours, white or black, keeps a pixel"
+            f"{path}: its mask leaves no pixel; set --mask-keeps to the mask's colour of kept pixels, white or black"
         )
     return LoadedImage(image, mask, loaded.K, tuple(done), alpha, kept)
 
@@ -285,5 +285,5 @@ def load_image(
         loaded = _undistort(loaded, lens)
     loaded = _shrink(path, loaded, downscale, max_side)
     if loaded.mask is not None and not loaded.mask.any():
-        raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
+        raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; check all three")
     return _over_background(loaded, background)

@@ -111,7 +111,7 @@ def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cac
 
 def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
     if depths is None:
-        notes.append("depth: none, since there is neither a network nor a depth from other views; geometry does not count")
+        notes.append("depth: none, without a network and depth from other views; geometry is not scored")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
     fractions = [float(d.valid.mean()) for d in depths]
     span = f"{min(fractions):.1%} to {max(fractions):.1%}"

@@ -140,7 +140,7 @@ def _machine_or_assumed() -> Memory:
 @functools.cache
 def _say_assumed() -> None:
     say(
-        f"warpgs: this system does not say how much memory it has (psutil finds none, nor does a container set a limit); "
+        f"warpgs: the memory of this system is unknown (neither psutil nor a container reports it); "
         f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
         error=True,
     )

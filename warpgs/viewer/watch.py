@@ -171,7 +171,7 @@ def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
     """
     server = open_server(port)
     try:
-        say(f"the fit can be seen at {address(server)} while it goes on; `warpgs view {folder}` shows it afterwards")
+        say(f"watch the fit at {address(server)}; afterwards run `warpgs view {folder}`")
         live = LiveView(server, folder.resolve().name, folder)
         try:
             yield live

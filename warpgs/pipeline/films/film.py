@@ -212,7 +212,7 @@ def render_path(
         plan = plan_film(model, path, settings)
     else:
         own = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
-        plan = FilmPlan(own, 0.0, "look at the poses and the units of the cameras", [])
+        plan = FilmPlan(own, 0.0, "check the poses and the units of the cameras", [])
     done = render_film(model, plan, Path(out), settings, coverage=coverage)
     for note in done.notes:
         say(f"warpgs: {note}", error=True)

@@ -165,7 +165,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         remedy = "the model shows nothing there: `warpgs eval` scores each view"
     else:
         cameras = camera_path(kind, rig, train, settings.count(SECONDS))
-        there_and_back = " there and back over what the cameras saw" if rig.span is not None and kind == "turntable" else ""
+        there_and_back = " there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
         words = f"path {kind}{there_and_back}"
         remedy = "--path interpolate stays at the training views"
     cameras = [framed(c, settings.size, settings.fov_y) for c in cameras]

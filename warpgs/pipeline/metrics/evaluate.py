@@ -23,7 +23,7 @@ VARIANTS = {
 }
 """Definition of each score, for result files and reports. Every paper's table depends on these words."""
 ALPHA_VARIANTS = {
-    "psnr_whole": "of a view that knows its opacity: over all its pixels that its mask keeps, over the background of the fit",
+    "psnr_whole": "of a view with an alpha channel: over all unmasked pixels, over the background of the fit",
     "psnr_foreground": "the same over the pixels of an opacity above 0.5",
     "alpha_empty": "mean rendered alpha over the pixels of an opacity below 0.02: 0 is right",
     "alpha_object": "mean rendered alpha over the pixels of an opacity above 0.98: 1 is right",

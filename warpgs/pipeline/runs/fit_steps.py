@@ -122,9 +122,9 @@ def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteErr
     name = job.split.train[error.view]
     save_failed_step(out / FAILED, failed_step(trainer, error.view, name, error.slot))
     return NotFiniteError(
-        f"{error}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "
-        f"{out / FAILED}` names the non-finite values. A fit repeats exactly: continued with --resume, it comes to the "
-        "same place; other settings, lower learning rates above all, lead elsewhere"
+        f"{error}, on {name}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
+        f"{out / FAILED}` names the non-finite values. --resume repeats the same step; fit again into a new --out with "
+        "lower learning rates"
     )
 
 

@@ -138,7 +138,7 @@ def read_record(folder: Path) -> dict[str, Any]:
         stored = record.get("versions")
         version = stored.get("warpgs", "unknown") if isinstance(stored, dict) else "unknown"
         raise DataError(
-            f"{path}: this run is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it with "
+            f"{path}: warpgs {version} wrote this run, in a format that warpgs {__version__} does not read. Open it with "
             f"warpgs {version}, or fit the scene again into a new --out; its point_cloud.ply stays readable"
         )
     try:

@@ -63,7 +63,11 @@ def lost_lines(out: Path | None) -> list[str]:
     rows = read_record(out / POSED_SCENE)["photographs"]
     lost = sum(not p["registered"] for p in rows)
     why = out / POSED_SCENE / TEXT
-    return [f"{lost} of {len(rows)} photographs have no pose and were not used: {why} says why, and what to do"] if lost else []
+    return (
+        [f"{lost} of {len(rows)} photographs have no pose and were not used: see {why} for reasons and remedies"]
+        if lost
+        else []
+    )
 
 
 def _notes(record: dict[str, Any]) -> list[str]:

@@ -40,6 +40,6 @@ def check_state(
         torch.Generator().set_state(tensors["generator"])
     except (KeyError, TypeError, RuntimeError) as e:
         raise DataError(
-            "the stored state is not whole: generator, the state of the random numbers, is missing or damaged; restore it, or "
+            "the stored state is incomplete: generator, the state of the random numbers, is missing or damaged; restore it, or "
             "fit the scene again"
         ) from e
