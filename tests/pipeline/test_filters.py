@@ -78,7 +78,7 @@ def test_boxes():
         ("1,2,3", "takes 6 finite"), ("a", "six numbers"), ("[" * 9000, "six numbers"),
         ('{"size": [1, 1, 1]}', "center takes 3"),
         ("0,0,0,1,1,0", "longer than 0"), ("0,0,0,1,1,NaN", "finite"),
-        ('{"center": [0,0,0], "size": [1,1,1], "rotation": [[2,0,0],[0,1,0],[0,0,1]]}', "no rotation"),
+        ('{"center": [0,0,0], "size": [1,1,1], "rotation": [[2,0,0],[0,1,0],[0,0,1]]}', "must be a rotation matrix"),
     ],
 )  # fmt: skip
 def test_boxes_that_are_none(text, match):

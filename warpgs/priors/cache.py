@@ -95,7 +95,7 @@ class MapCache:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
-            self.notes.append(f"{path}: a stored map could not be read ({e}) and was made again")
+            self.notes.append(f"{path}: a stored map could not be read ({e}) and was computed again")
             return None
         maps = tuple(stored.get(n) for n in names)
         if all(m is not None and m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps):
