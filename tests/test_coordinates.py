@@ -89,5 +89,5 @@ def test_mistakes_are_named(tmp_path):
     from safetensors.torch import save_file
 
     save_file({"means": g.means}, tmp_path / "b")
-    with pytest.raises(DataError, match="is no model of format"):
+    with pytest.raises(DataError, match="not a model of format"):
         load(tmp_path / "b")

@@ -80,8 +80,8 @@ def test_a_name_without_a_colon_is_loaded_as_it_is_found(registry):
 @pytest.mark.parametrize(
     ("spec", "said"),
     [
-        ("{own}:Other", "is no strategy: it must be a class that derives from warpgs.Strategy"),
-        ("{own}:number", "is no strategy"),
+        ("{own}:Other", "is not a strategy: it must be a class that derives from warpgs.Strategy"),
+        ("{own}:number", "is not a strategy"),
         ("{own}:Missing", "is not there: .* has no Missing"),
         ("{own}x.py:Own", "cannot be imported .*there is no file"),
         ("no_such_module_of_anyone:Own", "cannot be imported .*path/to/file.py:Own"),
@@ -108,9 +108,9 @@ def test_a_file_that_fails_is_not_half_loaded(registry, own):
 
 
 def test_an_unknown_name_lists_those_there_are(registry):
-    with pytest.raises(UsageError, match=r"there is no strategy 'best'; choose one of .*clone_split.* or give module:Class"):
+    with pytest.raises(UsageError, match=r"unknown strategy 'best'; choose one of .*clone_split.* or give module:Class"):
         registry.find("best")
-    with pytest.raises(UsageError, match="int is no strategy"):
+    with pytest.raises(UsageError, match="int is not a strategy"):
         registry.find(int)
 
 

@@ -50,7 +50,7 @@ def test_depth_and_size_are_bounded(inner, monkeypatch):
     least = parse(nested(schema.MAX_DEPTH - 1))
     assert isinstance(least, list) and json.dumps(least)
     for depth in (schema.MAX_DEPTH + 2, 100_000):
-        with pytest.raises(SchemaError, match="in each other"):
+        with pytest.raises(SchemaError, match="nested deeper"):
             parse(nested(depth))
     monkeypatch.setattr(schema, "MAX_BYTES", 10)
     assert parse("[1, 2, 3]") == [1, 2, 3]
@@ -61,7 +61,7 @@ def test_depth_and_size_are_bounded(inner, monkeypatch):
 @pytest.mark.parametrize("bad", [b"", b"[", b"\xff\xfe\xfd", b"9" * 5000, b'{"a":}'])
 def test_what_is_no_json(bad, tmp_path):
     (tmp_path / "a").write_bytes(bad)
-    with pytest.raises(SchemaError, match="no JSON"):
+    with pytest.raises(SchemaError, match="not valid JSON"):
         schema.read(tmp_path / "a")
 
 

@@ -21,6 +21,8 @@ LOW_PASS = 0.3
 TILE_SIZE = 16
 """Side of a tile [px] where no other is asked for, in fits too."""
 
+K_TOLERANCE = 1e-5
+"""Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""
 NEAR = 0.01
 """Nearest depth that is rendered [u]."""
 

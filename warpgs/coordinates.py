@@ -45,7 +45,7 @@ def checked_normalization(normalization: Normalization | None, units: str, where
     if normalization is None:
         if units == "scene":
             raise UsageError(
-                f"{where}: scene units need the scene's normalization, without which nobody finds back to file units; give "
+                f"{where}: scene units need the scene's normalization; give "
                 "normalization=scene.normalization, or units='file' for Gaussians that belong to no scene"
             )
         return Normalization()

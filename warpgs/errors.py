@@ -18,7 +18,7 @@ class UsageError(WarpgsError):
 
 
 class DataError(WarpgsError):
-    """A scene, an image, a model file or a run folder is not what it must be."""
+    """A scene, an image, a model file or a run folder is invalid."""
 
     exit_code = 3
 
@@ -27,13 +27,13 @@ class NotFiniteError(WarpgsError):
     """The loss or a parameter of a fit stopped being a number."""
 
     view: int | None = None
-    """Number of the training view whose loss it was; None where it was another number."""
+    """Number of the training view with that loss; None for other values."""
     slot: int = 0
     """Number of that view among those of the step."""
 
 
 class ResourceError(WarpgsError):
-    """Memory, disk or a device does not suffice; the message names what is needed and what there is."""
+    """Memory, disk or a device does not suffice; the message names need and supply."""
 
     exit_code = 4
 

@@ -87,7 +87,7 @@ def _replaced(
     except OSError as e:
         amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
         raise ResourceError(
-            f"{path}: {amount}cannot be written ({e.strerror or e}); what was there before is untouched. {_remedy(e)}"
+            f"{path}: {amount}cannot be written ({e.strerror or e}); the old file is untouched. {_remedy(e)}"
         ) from e
 
 
@@ -113,7 +113,7 @@ def filling(folder: Path) -> Iterator[Path]:
     """
     target = folder.absolute() if is_below(folder) else Path(os.path.realpath(folder))
     if os.path.realpath(target) == os.path.realpath(Path.cwd()):
-        raise UsageError(f"{folder}: is the folder that you are in, and it would be made anew under you; name another one")
+        raise UsageError(f"{folder}: refusing to replace the current directory; choose another path")
     make_folder(target.parent)
     try:
         above = open_folder(target.parent)

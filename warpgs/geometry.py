@@ -97,13 +97,13 @@ def cofactors(m: np.ndarray) -> np.ndarray:
 
 
 def inverse(m: np.ndarray) -> np.ndarray:
-    """Return the inverse of m [3, 3] by its cofactors, without LAPACK, whose kernels go by the processor (see `matmul`)."""
+    """Return the inverse of m [3, 3] by its cofactors, without LAPACK: its kernels depend on the processor (see `matmul`)."""
     c = cofactors(m)
     return c.T / (m[0] * c[0]).sum()
 
 
 def nearest_rotation(m: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to m [3, 3], whose determinant is positive: its polar factor, by Newton (Higham 1986)."""
+    """Return the rotation nearest to m [3, 3] of positive determinant: its polar factor, by Newton (Higham 1986)."""
     for _ in range(10):  # from a matrix that is orthogonal to 0.1 it takes five; more change nothing
         c = cofactors(m)
         nearer = 0.5 * (m + c / (m[0] * c[0]).sum())

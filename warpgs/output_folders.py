@@ -311,6 +311,6 @@ def _link(path: Path) -> RefusedError:
 
 def _replaced(path: Path) -> RefusedError:
     return RefusedError(
-        f"{path}: is no longer the folder that this command began to write into; it was moved, removed or replaced. Put it "
+        f"{path}: the folder was moved, removed or replaced while this command wrote into it. Put it "
         "back, or choose another folder"
     )

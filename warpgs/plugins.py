@@ -110,7 +110,7 @@ class Registry(Generic[T]):
                 f"the {self.kind} {name!r} is a class of your own, which is never imported because a file names it; give it "
                 "again, on the command line or as a class in Python"
             )
-        raise UsageError(f"there is no {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
+        raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 
     def load(self, spec: str) -> type[T]:
         """Return the class of a name, importing ``module:Class`` or ``path/to/file.py:Class``: runs that code.
@@ -127,7 +127,7 @@ class Registry(Generic[T]):
 
     def _checked(self, cls: object, name: str) -> type[T]:
         if not (isinstance(cls, type) and issubclass(cls, self.base)):
-            raise UsageError(f"{name} is no {self.kind}: it must be a class that derives from warpgs.{self.base.__name__}")
+            raise UsageError(f"{name} is not a {self.kind}: it must be a class that derives from warpgs.{self.base.__name__}")
         return cls
 
 
@@ -184,7 +184,7 @@ def own_frame(error: BaseException) -> str:
 def _import_module(name: str) -> ModuleType:
     """Import a module by its full dotted name."""
     if not name or name.startswith("."):
-        raise ImportError(f"{name!r} is no full name of a module")
+        raise ImportError(f"{name!r} is not a full module name")
     return importlib.import_module(name)
 
 

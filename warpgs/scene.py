@@ -62,7 +62,7 @@ class View:
     score_mask: np.ndarray | None = None
     """True where a render is scored, bool, shape [H, W]; the fit does not see it. None where ``mask`` decides both."""
     alpha: np.ndarray | None = None
-    """Opacity of what was photographed, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None
+    """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None
     where the image is opaque."""
     alpha_estimated: bool = False
     """True where ``alpha`` was estimated from a black background: it says where Gaussians start and what is scored. The loss
@@ -129,7 +129,7 @@ class Scene:
 
     @property
     def transparent(self) -> bool:
-        """True where a view knows its opacity: the scene is an object cut out."""
+        """True if a view has an alpha channel: the scene is an object cut out."""
         return any(v.alpha is not None for v in self.views)
 
     def view(self, name: str) -> View:

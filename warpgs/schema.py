@@ -1,4 +1,4 @@
-"""Schemas of JSON that anybody may have written: its size and depth are bounded, and every value is of the kind expected.
+"""Schemas of untrusted JSON: its size and depth are bounded, and every value has the expected type.
 
 A schema is a function of a value and of its place in the file. It returns nothing and raises `SchemaError` where the value is
 another than it may be.
@@ -31,7 +31,7 @@ Schema = Callable[[Any, str], None]
 
 
 class SchemaError(ValueError):
-    """Text that is no JSON, or a value that its schema does not allow; the message names the place."""
+    """Text that is not JSON, or a value that its schema does not allow; the message names the place."""
 
 
 def parse(text: str | bytes) -> Any:
@@ -46,9 +46,9 @@ def parse(text: str | bytes) -> Any:
     try:
         value = json.loads(text)
     except RecursionError as e:
-        raise SchemaError(f"has more than {MAX_DEPTH} lists and objects in each other") from e
+        raise SchemaError(f"is nested deeper than {MAX_DEPTH} lists and objects") from e
     except ValueError as e:
-        raise SchemaError(f"is no JSON: {e}") from e
+        raise SchemaError(f"not valid JSON: {e}") from e
     check_depth(value, MAX_DEPTH)
     return value
 
@@ -74,7 +74,7 @@ def check_depth(value: Any, most: int) -> None:
     while level := [part for outer in level for part in _parts(outer)]:
         depth += 1
         if depth > most:
-            raise SchemaError(f"has more than {most} lists and objects in each other")
+            raise SchemaError(f"is nested deeper than {most} lists and objects")
 
 
 def _parts(value: Any) -> list[Any]:
@@ -182,7 +182,7 @@ def items(schema: Schema, count: int | None = None) -> Schema:
 
 
 def mapping(schema: Schema, names: Schema = text) -> Schema:
-    """Return the schema of objects whose names are as ``names`` has it, and their values as ``schema``."""
+    """Return the schema of objects with names by ``names`` and values by ``schema``."""
 
     def check(value: Any, place: str) -> None:
         if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Temporary files and folders, each locked by its owner: whoever finds one that is not locked removes it.
+"""Temporary files and folders, each locked by its owner: any process removes one without a lock.
 
 The system gives a lock free when its holder ends, killed or not. So a temporary file of a process at work is never taken for a
 leftover, and nothing of a killed one stays for longer than until the next command.
@@ -87,7 +87,7 @@ class TemporaryFile:
 
 
 class TemporaryFolder:
-    """A new folder that its owner removes, or gives another name; the lock beside it says that the owner is at work."""
+    """A new folder that its owner removes, or gives another name; the lock beside it shows that the owner is at work."""
 
     def __init__(self, above: Folder, prefix: str = ".warpgs-", mode: int = 0o777):
         """Make the folder.
@@ -178,7 +178,7 @@ def sweep(folder: Folder, own: bool = False) -> None:
 
 
 def _sweep_one(folder: Folder, name: str, mode: int) -> None:
-    """Remove one temporary entry, if nobody holds it."""
+    """Remove one temporary entry without a lock."""
     if stat.S_ISLNK(mode):
         folder.unlink(name)
     elif stat.S_ISDIR(mode) or name.endswith(LOCKED):
@@ -224,7 +224,7 @@ def _owned(descriptor: int) -> bool:
 
 
 def _locked(descriptor: int) -> bool:
-    """Lock a file; return False where it is held, or where nobody can tell."""
+    """Lock a file; return False if it is held, or if locks do not work there."""
     try:
         return lock_descriptor(descriptor, blocking=False)
     except OSError:

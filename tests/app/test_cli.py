@@ -190,7 +190,7 @@ def failure(capsys, code: int, *arguments: str) -> str:
 def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys):
     """2 usage, 3 data, 4 resources; each names the thing and the way out, and no folder is left behind."""
     out = str(tmp_path / "new")
-    assert "no command 'train'" in failure(capsys, 2, "train")
+    assert "unknown command 'train'" in failure(capsys, 2, "train")
     assert "choose another --out" in failure(capsys, 2, "fit", str(scene), "--out", str(run))
     assert "preset 'best'" in failure(capsys, 2, "fit", str(scene), "--out", out, "--preset", "best")
     assert "device 'tpu'" in failure(capsys, 2, "fit", str(scene), "--out", out, "--device", "tpu")
@@ -206,9 +206,9 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
     assert "differs from the run" in (said := failure(capsys, 2, *again)) and "(downscale was 1" in said
     assert "leave out --frames" in failure(capsys, 2, "render", str(run), "--path", "views", "--frames", "2")
-    assert "is of --object" in failure(capsys, 2, "demo", out, "--format", "transforms")
+    assert "--format requires --object" in failure(capsys, 2, "demo", out, "--format", "transforms")
     assert "--format must be transforms or colmap" in failure(capsys, 2, "demo", out, "--object", "--format", "ply")
-    assert "--device is of --repeat" in failure(capsys, 2, "doctor", "--device", "tpu")
+    assert "--device requires --repeat" in failure(capsys, 2, "doctor", "--device", "tpu")
     assert "is the folder of a run" in failure(capsys, 2, "poses", str(run), "--out", out)
     assert "holds scenes, such as" in failure(capsys, 2, "poses", str(scene.parent), "--out", out)
     assert "path 'zigzag'" in failure(capsys, 2, "render", str(run), "--path", "zigzag")

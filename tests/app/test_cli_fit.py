@@ -83,7 +83,7 @@ def test_every_setting_is_a_flag_with_its_own_help(capsys, monkeypatch):
     """Whatever FitConfig and its parts hold is in the help, word for word, without a second text."""
     monkeypatch.setenv("COLUMNS", "110")
     with pytest.raises(SystemExit) as end:
-        request_of(["--help", "--strategy", "mcmc", "--loss-terms", "alpha"], "")
+        request_of(["--help-all", "--strategy", "mcmc", "--loss-terms", "alpha"], "")
     text = squeezed(capsys.readouterr().out)
     flags = [*leaves(FitConfig), *leaves(MCMCConfig, "mcmc."), *leaves(AlphaDifference, "alpha.")]
     assert end.value.code == 0 and len(flags) > 80
@@ -120,14 +120,14 @@ def test_mistakes_are_named_before_anything_starts(tmp_path, capsys):
     (tmp_path / "needy.py").write_text(PLUG_INS.replace(" = 0.25", ""))
     for flags, message in [
         (["--memory-limit", "2 cows"], "2 cows"),
-        (["--strategy", "best"], "there is no strategy 'best'; choose one of"),
+        (["--strategy", "best"], "unknown strategy 'best'; choose one of"),
         (["--loss-terms", "alpha,alpha"], "two of them have the flags --alpha"),
         (["--strategy", f"{tmp_path}/none.py:A"], "there is no file"),
         (["--strategy", "json:JSONDecoder"], "must be a class that derives from"),
         (["--strategy", f"{tmp_path}/broken.py:A"], "ZeroDivisionError: division by zero"),
         (["--strategy", f"{tmp_path}/broken.py:A"], "broken.py, line 2"),
         (["--strategy", f"{tmp_path}/crooked.py:A"], "crooked.py, line 1"),
-        (["--strategy", f"{tmp_path}/clash.py:Init"], "whose flags --init there are already"),
+        (["--strategy", f"{tmp_path}/clash.py:Init"], "the plug-in name init is taken by a flag"),
         (["--loss-terms", f"{tmp_path}/needy.py:Opaque"], "has a setting without a default"),
     ]:
         assert main(["fit", *BASE, *flags]) == 2

@@ -33,6 +33,39 @@ def test_help_fits_one_screen(capsys, words, most):
     assert 20 < len(lines) <= most and max(map(len, lines)) <= 80
 
 
+@pytest.mark.parametrize("name", [*sorted({*COMMANDS} - {"fit", "priors"}), "priors show", "priors export"])
+def test_the_help_of_a_command_fits_one_screen(capsys, name):
+    """All positionals have names, required flags stand in the usage, and no type of Python is shown."""
+    with pytest.raises(SystemExit) as end:
+        main([*name.split(), "--help"])
+    text = capsys.readouterr().out
+    lines = text.splitlines()
+    assert end.value.code == 0 and 6 < len(lines) <= 45 and max(map(len, lines)) <= 80
+    assert f"usage: warpgs {name}" in text and "flags, and their [defaults]:" in lines
+    assert not re.search(r"None|PosixPath|MISSING|\[\[|``", text)
+
+
+def test_defaults_and_groups_stand_in_the_help(capsys):
+    for name, stated in {
+        "farm": ["JOBS --out PATH [flags]", "--per-gpu N", "share a GPU [1]"],
+        "plot": ["--[no-]cameras", "Show the cameras [on]", "--size N N", "[1600 1000]"],
+        "compare": ["SCENES ... --out PATH [flags]", "explained by --help-all:", "--[no-]black-is-empty"],
+        "convert": ["SOURCE TARGET [flags]", "--spz.version N", "[3]"],
+        "priors export": ["--model VALUE --out PATH [flags]"],
+    }.items():
+        with pytest.raises(SystemExit):
+            main([*name.split(), "-h"])
+        text = capsys.readouterr().out
+        assert [word for word in stated if word not in text] == [], name
+
+
+@pytest.mark.parametrize("name", ["farm", "compare"])
+def test_help_all_is_that_of_the_parser(capsys, name):
+    with pytest.raises(SystemExit) as end:
+        main([name, "--help-all"])
+    assert end.value.code == 0 and "show this help message and exit" in capsys.readouterr().out
+
+
 def test_the_help_of_fit_imports_nothing_heavy():
     heavy = "{'torch', 'warp', 'numpy', 'tyro'}"
     code = f"import sys; from warpgs.app.cli import main; main(['fit', '--help']); print({heavy} & {{*sys.modules}})"

@@ -83,7 +83,7 @@ def test_one_file_adds_a_format(own, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["convert", "--format", spec, "--help"])
     said = " ".join(capsys.readouterr().out.replace("│", "").split())
-    assert "--archive.packed" in said and "Make the archive smaller, in more time." in said
+    assert "--archive.packed" in said and "Make the archive smaller, in more time" in said
 
 
 def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):
@@ -125,8 +125,8 @@ def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
         (["b.mine"], "format .mine is not supported"),
         (["b.mine", "--format", "{own}:Nameless"], "has the suffix ''"),
         (["b.mine", "--format", "{own}:np"], "must be a class that derives from warpgs.Format"),
-        (["b.mine", "--format", "best"], "there is no format 'best'; choose one of"),
-        (["b.mine", "--format", "{own}:Archive", "--spz.version", "2"], "--spz.* are options of another format"),
+        (["b.mine", "--format", "best"], "unknown format 'best'; choose one of"),
+        (["b.mine", "--format", "{own}:Archive", "--spz.version", "2"], "--spz.* are not options of the format"),
         (["b.spz", "--spz.version", "9"], "SPZ version 9"),
         (["cameras.json", "--format", "{own}:Archive"], "--format is for Gaussians"),
     ],

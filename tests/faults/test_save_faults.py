@@ -105,7 +105,7 @@ def save_pruned(s: Saved) -> None:
         with hold_folder(s.folder):
             return
     g = s.gaussians
-    made = Pruned(g, torch.zeros(len(g), dtype=torch.int32), torch.arange(len(g)))
+    made = Pruned(g, torch.zeros(len(g), dtype=torch.int32))
     _write(s.folder / "pruned", s.run.record, made, s.run.step, s.run.normalization)
 
 

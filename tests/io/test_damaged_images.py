@@ -271,4 +271,4 @@ def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("data", [b"", b"P5 2 2 255 abcd", b"GIF89a" + bytes(20)])
 def test_other_files_are_no_images(data, tmp_path):
-    refused(tmp_path, data, "it is (empty|no JPEG, PNG, BMP, TIFF, WebP or AVIF file)")
+    refused(tmp_path, data, "it is (empty|not a JPEG, PNG, BMP, TIFF, WebP or AVIF file)")

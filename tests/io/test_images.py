@@ -131,7 +131,7 @@ def test_a_longest_side_bounds_an_image_and_scales_each_axis_of_its_camera(downs
     np.testing.assert_allclose(
         loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], [20 * size[0] / 35, 20 * size[1] / 26, *np.array(size) / 2]
     )
-    assert any("17 px on the longer side; --max-side names another" in d for d in loaded.done) == (side == 17)
+    assert any("17 px on the longer side; change it with --max-side" in d for d in loaded.done) == (side == 17)
 
 
 def test_a_longest_side_that_leaves_nothing_is_refused(tmp_path):

@@ -18,7 +18,7 @@ from warpgs.io.load import detect, load_scene
 
 
 def test_folders_that_hold_no_scene(tmp_path):
-    refused(tmp_path / "gone", "gone: there is no such folder")
+    refused(tmp_path / "gone", "gone: no such folder")
     refused(tmp_path, r"no scene format found. Looked for: sparse/0.*transforms.json.*poses_bounds.npy.*cameras.npz.*_par.txt")
     (tmp_path / "a.txt").write_text("")
     refused(tmp_path / "a.txt", "a.txt: is a file; give the folder")
@@ -28,7 +28,7 @@ def test_folders_that_hold_no_scene(tmp_path):
 def test_a_lone_broken_colmap_names_what_is_missing(kind, tmp_path):
     scenes.write_colmap(tmp_path)
     (tmp_path / "sparse" / "0" / f"{kind}.bin").unlink()
-    refused(tmp_path, rf"the COLMAP reconstruction in sparse/0 lacks {kind}.bin, and there is no other format. Copy")
+    refused(tmp_path, rf"the COLMAP reconstruction in sparse/0 lacks {kind}.bin, and no other format was found. Copy")
 
 
 def test_the_complete_format_is_taken_with_a_note(tmp_path):
@@ -205,7 +205,7 @@ def patched_pose(tmp_path, **changes):
         ({"_9": "gone.png"}, r"images/gone.png: the image file is missing; restore it"),
         ({"_9": "../images.png"}, r"'../images.png' leads out of the scene folder"),
         ({"_9": "/etc/passwd"}, r"'/etc/passwd' leads out of the scene folder"),
-        ({"_9": ".."}, r"images.txt: '..' is no file name"),
+        ({"_9": ".."}, r"images.txt: '..' is not a file name"),
     ],
 )
 def test_broken_poses_in_text(changes, message, tmp_path):
@@ -272,11 +272,11 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"transform_matrix": [[1e200] * 4] * 3}, r"frame 1 .*not rigid"),
         ({"transform_matrix": None}, r"frame 1 .*: transform_matrix is missing"),
         ({"transform_matrix": [[1.0]]}, r"frame 1 .*: transform_matrix must be \[4, 4\], not \[1, 1\]"),
-        ({"file_path": None}, r"frame 1: 'None' is no file name"),
-        ({"file_path": ""}, r"frame 1: '' is no file name"),
-        ({"file_path": "a\0b"}, r"frame 1: .* is no file name"),
-        ({"file_path": "\ud800.png"}, r"frame 1: .* is no file name"),
-        ({"file_path": "/"}, r"frame 1: '/' is no file name"),
+        ({"file_path": None}, r"frame 1: 'None' is not a file name"),
+        ({"file_path": ""}, r"frame 1: '' is not a file name"),
+        ({"file_path": "a\0b"}, r"frame 1: .* is not a file name"),
+        ({"file_path": "\ud800.png"}, r"frame 1: .* is not a file name"),
+        ({"file_path": "/"}, r"frame 1: '/' is not a file name"),
         ({"file_path": "images/../../x.png"}, r"frame 1: .* leads out of the scene folder; .*--allow-outside"),
         ({"mask_path": "../m.png"}, r"frame 1 .*, mask: '../m.png' leads out of the scene folder"),
         ({"mask_path": "m.png"}, r"m.png: the image file is missing"),

@@ -73,7 +73,7 @@ def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
     refused(tmp_path, r"reader memory does not find its format \(cameras.mem", reader=Cameras())
     (tmp_path / "cameras.mem").touch()
     refused(tmp_path, "cameras.mem lacks its sounds. Copy the whole scene", reader=Cameras(missing="its sounds"))
-    refused(tmp_path / "gone", "there is no such folder", reader=Cameras())
+    refused(tmp_path / "gone", "no such folder", reader=Cameras())
 
 
 def test_camera_models_arrive_and_change_the_fingerprint(folder):
@@ -115,13 +115,13 @@ def test_a_reader_must_return_a_scene_in_file_coordinates(change, folder):
 @pytest.mark.parametrize(
     "choice,message",
     [
-        ("nerf", "there is no reader 'nerf'; choose one of colmap, dtu, llff, middlebury, transforms, or give module:Class"),
+        ("nerf", "unknown reader 'nerf'; choose one of colmap, dtu, llff, middlebury, transforms, or give module:Class"),
         ("no_such_module:A", "the reader 'no_such_module:A' cannot be imported"),
         ("no_such_file.py:A", "the reader 'no_such_file.py:A' cannot be imported"),
         ("warpgs.io.colmap:Nothing", "warpgs.io.colmap has no Nothing"),
-        ("warpgs.io.colmap:Pose", "is no reader: it must be a class that derives from"),
-        (dict, "dict is no reader"),
-        (3, "3 is no reader; give a name"),
+        ("warpgs.io.colmap:Pose", "is not a reader: it must be a class that derives from"),
+        (dict, "dict is not a reader"),
+        (3, "3 is not a reader; give a name"),
     ],
 )
 def test_choices_that_name_no_reader(choice, message, folder):

@@ -55,7 +55,7 @@ def test_a_missing_mask_is_named_by_its_id(tmp_path):
     """Matching by sorted order would give every later view its neighbour's mask."""
     scenes.write_colmap(tmp_path, names=RECT)
     write_masks(tmp_path / "idrmasks", [0, 1, 3, 4])
-    with pytest.raises(DataError, match=r"there is no mask for image id 2 .* rect_001_... is id 0"):
+    with pytest.raises(DataError, match=r"no mask for image id 2 .* rect_001_... is id 0"):
         load_scene(tmp_path)
 
 
@@ -83,7 +83,7 @@ def test_masks_that_cannot_be_used_are_named(tmp_path):
     refused("there are no masks")
     for name in "abcde":
         scenes.save(folder / f"{name}.png", mask_of(0))
-    refused("no numbers that tell them apart")
+    refused("no distinct numbers")
     shutil.rmtree(folder)
     write_masks(folder)
     scenes.save(folder / "002.png", np.full((20, 20), 255, np.uint8))

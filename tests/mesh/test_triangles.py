@@ -84,5 +84,5 @@ def test_fewer_triangles_of_the_same_surface():
 @pytest.mark.parametrize("seen", [lambda x: x[..., 0] > 9, lambda x: x[..., 0] > 1.2])
 def test_no_surface_is_said(seen):
     """Nothing seen at all, and nothing but emptiness."""
-    with pytest.raises(DataError, match="agree on no surface"):
+    with pytest.raises(DataError, match="no surface inside the grid"):
         extract(grid_of(sphere, seen))

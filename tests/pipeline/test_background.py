@@ -28,7 +28,7 @@ def test_colours_by_name_and_by_number(text, color):
 
 @pytest.mark.parametrize("text", ["", "grey", "#fff", "#gggggg", "1,1", "1,1,2", "nan,0,0", "1.5,0,0", "-0.1,0,0", "1e-1,0,0"])
 def test_what_is_no_colour_is_refused(text):
-    with pytest.raises(UsageError, match=r"is no colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
+    with pytest.raises(UsageError, match=r"is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b"):
         FitConfig(background=text)
 
 

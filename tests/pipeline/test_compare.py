@@ -325,7 +325,7 @@ def test_requests_that_make_no_sense(scene, tmp_path):
         StudyRequest((), {"a": A, "b": B}, 2, tmp_path)
     with pytest.raises(UsageError, match="preset 'x' is not one of"):
         preset_variants(["x"], None)
-    with pytest.raises(UsageError, match="named twice"):
+    with pytest.raises(UsageError, match="appears twice"):
         preset_variants([next(iter(PRESETS))] * 2, None)
     with pytest.raises(DataError, match="no view is held out"):
         run_study(StudyRequest((dataclasses.replace(scene, split="all"),), {"a": A, "b": B}, 1, tmp_path / "x", "cpu"))

@@ -38,7 +38,7 @@ def test_every_confirmed_pixel_becomes_a_point():
     assert np.allclose(z, depths[0].depth[rows, columns])
     assert np.array_equal(cloud.colors[first], views[0].image[rows, columns])
     assert notes[0] == f"000.png: {100 * depths[0].coverage:.0f} % of pixels by flow"
-    assert notes[-1] == f"{len(cloud):,} points of {len(cloud):,} pixels by flow, and 0 filled"
+    assert notes[-1] == f"{len(cloud):,} points from {len(cloud):,} pixels by flow, 0 filled in"
 
 
 def test_views_whose_depth_was_not_searched_for_neither_fill_nor_hide():
@@ -65,7 +65,7 @@ def test_points_of_the_reconstruction_fill_what_no_depth_confirms():
     bare, _ = coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep")
     more, notes = coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep", known=cloud)
     added = more.points[len(bare) :]
-    assert 0 < len(added) <= sum(seen) and f"{len(added)} of the reconstruction where there were none" in notes[-1]
+    assert 0 < len(added) <= sum(seen) and f"{len(added)} from the reconstruction" in notes[-1]
     assert np.abs(added[:, None] - inside[None]).sum(2).min(1).max() < 1e-9
     unknown = PointCloud(points, cloud.colors)
     assert len(coarse_points(views, depths, merge_px=4, fill_px=0, source="sweep", known=unknown)[0]) == len(bare)
@@ -107,7 +107,7 @@ def test_filled_points_come_last_and_hide_nothing():
     assert (
         "75 % of pixels by sweep, " in notes[0]
         and "filled" in notes[0]
-        and notes[-1].endswith(f"{len(cloud) - len(bare)} filled")
+        and notes[-1].endswith(f"{len(cloud) - len(bare)} filled in")
     )
     filled = cloud.points[len(bare) :]
     assert not any(in_free_space(filled, views[j : j + 1], [0.93 * depths[j].depth], -1).any() for j in range(3))

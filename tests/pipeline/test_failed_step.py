@@ -84,8 +84,8 @@ def test_what_is_not_finite_is_counted(tmp_path, capsys):
     assert any("photometric: nan" in line for line in lines)
     (tmp_path / "other").write_bytes(b"12345678")
     for name in ("other", "none"):
-        with pytest.raises(DataError, match="is no step that failed"):
+        with pytest.raises(DataError, match="not a failed step"):
             read_failed_step(tmp_path / name, CPU)
     del bundle[0]["K"]
-    with pytest.raises(DataError, match="not whole"):
+    with pytest.raises(DataError, match="incomplete"):
         findings(bundle)

@@ -304,7 +304,7 @@ def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, 
     assert "<b>b &amp; c</b>" in page and 'src="a/thumbnail.jpg"' in page and "Failures" in page
     assert json.loads((tmp_path / "out" / "a" / "run" / "config.json").read_text())["config"]["seed"] == 3
     assert main(["farm", str(jobs), "--out", str(tmp_path / "out"), "--resume"]) == 2
-    assert "--resume is of one fit alone" in capsys.readouterr().err
+    assert "--resume is not supported by farm" in capsys.readouterr().err
 
 
 @pytest.mark.slow

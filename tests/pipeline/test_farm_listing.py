@@ -13,7 +13,7 @@ def test_folders_and_globs(tmp_path):
         (tmp_path / name).mkdir(parents=True)
     assert [(j.name, j.scene) for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
     assert [j.name for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
-    with pytest.raises(UsageError, match="there is no scene"):
+    with pytest.raises(UsageError, match="no scene found"):
         list_jobs(f"{tmp_path}/*/nothing")
 
 
@@ -35,7 +35,7 @@ def test_lines_are_flags_of_fit(tmp_path):
 @pytest.mark.parametrize(
     ("line", "word"),
     [
-        ("{", "is no JSON"),
+        ("{", "not valid JSON"),
         ("[]", "must be an object"),
         ('{"name": "a"}', "scene is missing"),
         ('{"scene": 3}', "scene must be text"),
@@ -51,7 +51,7 @@ def test_lines_are_flags_of_fit(tmp_path):
         ('{"scene": "a", "name": ".b"}', "cannot be the name"),
         ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, and the name of a job at most 200"),
         ('{"scene": "a", "name": "%s"}' % (101 * "x"), "cannot be the name"),
-        ("[" * 60 + "]" * 60, "in each other"),
+        ("[" * 60 + "]" * 60, "nested deeper"),
     ],
 )
 def test_lines_that_are_no_jobs(tmp_path, line, word):

@@ -63,10 +63,10 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
     [
         (lambda k: {}, "a list"),
         (lambda k: [], "holds 0 keyframes"),
-        (lambda k: [{**k, "c2w": np.diag([1.0, 1, 2, 1]).tolist()}], "keyframe 0 is no rigid"),
-        (lambda k: [{**k, "c2w": np.diag([1.0, 1, -1, 1]).tolist()}], "keyframe 0 is no rigid"),
-        (lambda k: [{**k, "c2w": np.zeros((4, 4)).tolist()}], "keyframe 0 is no rigid"),
-        (lambda k: [{**k, "c2w": (1e200 * np.ones((4, 4))).tolist()}], "keyframe 0 is no rigid"),
+        (lambda k: [{**k, "c2w": np.diag([1.0, 1, 2, 1]).tolist()}], "keyframe 0 must be a rigid"),
+        (lambda k: [{**k, "c2w": np.diag([1.0, 1, -1, 1]).tolist()}], "keyframe 0 must be a rigid"),
+        (lambda k: [{**k, "c2w": np.zeros((4, 4)).tolist()}], "keyframe 0 must be a rigid"),
+        (lambda k: [{**k, "c2w": (1e200 * np.ones((4, 4))).tolist()}], "keyframe 0 must be a rigid"),
         (lambda k: [{**k, "c2w": [[1, 0], [0, 1]]}], "c2w"),
         (lambda k: [{**k, "c2w": [[math.nan] * 4] * 4}], "c2w"),
         (lambda k: [{**k, "fov_y": 50}], "give radians"),
@@ -125,7 +125,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     )
     assert 0.02 < plan.coverage < 0.9
     done = render_film(model, plan, tmp_path / "a.webp", FilmSettings())
-    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing, numbers 3 to 4: the path leaves what the photographs")
+    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing, numbers 3 to 4: the path leaves the captured area")
     assert "--path interpolate" in done.notes[-1] and done.files == [tmp_path / "a.webp"]
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
     done = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())

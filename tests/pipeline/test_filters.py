@@ -78,7 +78,7 @@ def test_boxes():
         ("1,2,3", "takes 6 finite"), ("a", "six numbers"), ("[" * 9000, "six numbers"),
         ('{"size": [1, 1, 1]}', "center takes 3"),
         ("0,0,0,1,1,0", "longer than 0"), ("0,0,0,1,1,NaN", "finite"),
-        ('{"center": [0,0,0], "size": [1,1,1], "rotation": [[2,0,0],[0,1,0],[0,0,1]]}', "no rotation"),
+        ('{"center": [0,0,0], "size": [1,1,1], "rotation": [[2,0,0],[0,1,0],[0,0,1]]}', "must be a rotation matrix"),
     ],
 )  # fmt: skip
 def test_boxes_that_are_none(text, match):
@@ -122,7 +122,7 @@ def test_convert_says_what_it_did(tmp_path):
     assert float(read_gaussians(tmp_path / "c.ply").means[:, :2].abs().max()) <= 1
     convert(tmp_path / "a.ply", tmp_path / "d.ply")
     assert (tmp_path / "d.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
-    assert any(".splat files hold none" in line for line in convert(tmp_path / "a.ply", tmp_path / "e.splat"))
+    assert any(".splat files cannot hold them" in line for line in convert(tmp_path / "a.ply", tmp_path / "e.splat"))
     with pytest.raises(DataError, match="no Gaussian is left"):
         convert(tmp_path / "a.ply", tmp_path / "f.glb", Filters(crop="90,90,90,91,91,91"))
     assert not (tmp_path / "f.glb").exists()
@@ -138,7 +138,7 @@ def test_boxes_of_files(tmp_path):
     assert f"{int((made.means[:, 0] < 0).sum())} Gaussians lie outside" in lines[0]
     assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
     for text, match in (
-        ("[1, 2]", "no JSON object"),
+        ("[1, 2]", "expected a JSON object"),
         ('{"center": 1}', "center takes 3"),
         (" " * 70000, "larger than 65,536 bytes"),
     ):

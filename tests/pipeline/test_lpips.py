@@ -166,7 +166,7 @@ def test_bad_sources_are_named(files, tmp_path):
         torch.save(value, tmp_path / "bad.pth")
         return tmp_path / "bad.pth"
 
-    refused("there is no such file", heads=tmp_path / "nowhere.pth")
+    refused("no such file", heads=tmp_path / "nowhere.pth")
     (tmp_path / "text.pth").write_bytes(b"<html>not found</html>")
     refused("cannot be read as a torch state dict", heads=tmp_path / "text.pth")
     (tmp_path / "cut.pth").write_bytes(backbone.read_bytes()[:5000])

@@ -104,8 +104,9 @@ def test_a_path_that_is_too_long_for_any_system(run, capsys):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('{"format": 2, "config": ', "no JSON"), ("[]", "no record of a fit"), ("", "no JSON"), ("9" * 5000, "no JSON"),
-        ("[" * 100_000, "in each other"), ('{"a":' * 100_000, "in each other"), ("\xff", "no JSON"),
+        ('{"format": 2, "config": ', "not valid JSON"), ("[]", "not a record of a fit"), ("", "not valid JSON"),
+        ("9" * 5000, "not valid JSON"),
+        ("[" * 100_000, "nested deeper"), ('{"a":' * 100_000, "nested deeper"), ("\xff", "not valid JSON"),
     ],
 )  # fmt: skip
 def test_a_record_that_is_no_json_object(run, text, words):
@@ -167,7 +168,7 @@ def test_a_record_with_a_value_that_cannot_be(made, run, path, value, words):
     """Both who opens the run and who continues it read it through the same schema; the place is named."""
     (run / "config.json").write_text(json.dumps(replaced(made[1], path, value)))
     for read in (read_record, open_run):
-        with pytest.raises(DataError, match=rf"config\.json: is not whole, .*{words}"):
+        with pytest.raises(DataError, match=rf"config\.json: incomplete or damaged: .*{words}"):
             read(run)
 
 
@@ -211,7 +212,7 @@ def test_no_command_fails_on_what_the_schema_allows(made, run, tmp_path, capsys)
 
 
 STATES = [
-    ("[]", "an object"), ("{", "no JSON"), ("[" * 100_000, "in each other"), ("{}", "step is missing"),
+    ("[]", "an object"), ("{", "not valid JSON"), ("[" * 100_000, "nested deeper"), ("{}", "step is missing"),
     ({"step": -1}, "step must be"), ({"step": "1"}, "step must be"), ({"step": True}, "step must be"),
     ({"step": 1e400}, "step must"),
 ]  # fmt: skip

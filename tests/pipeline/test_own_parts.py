@@ -65,16 +65,16 @@ def test_a_term_that_is_not_active_changes_no_bit():
 
 def test_a_term_without_a_name_of_its_own_is_refused():
     """A run folder could not tell it: never registered, or only by the name of the class that it derives from."""
-    with pytest.raises(UsageError, match=r"the loss term Gray has no name of its own.*register"):
+    with pytest.raises(UsageError, match=r"the loss term Gray has no registered name.*register"):
         dataclasses.replace(PLAIN, loss_terms=(Gray(),))
     LOSS_TERMS.register("gray")(Gray)
 
     class Stronger(Gray):
         """Another class, which inherits the name."""
 
-    with pytest.raises(UsageError, match="Stronger has no name of its own"):
+    with pytest.raises(UsageError, match="Stronger has no registered name"):
         dataclasses.replace(PLAIN, loss_terms=(Stronger(),))
-    with pytest.raises(UsageError, match=r"0\.5 is no loss term"):
+    with pytest.raises(UsageError, match=r"0\.5 is not a loss term"):
         dataclasses.replace(PLAIN, loss_terms=(0.5,))
     config = dataclasses.replace(PLAIN, loss_terms=(Gray(3.0),))
     assert FitConfig.from_json(config.to_json()) == config

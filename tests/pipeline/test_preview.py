@@ -67,13 +67,13 @@ def failure(capsys, code, *arguments):
 def test_mistakes_get_one_line(scene, tmp_path, capsys):
     """2 usage, 3 data, 4 resources."""
     out = tmp_path / "out"
-    assert "say show or export" in failure(capsys, 2, "priors")
-    assert "say show or export" in failure(capsys, 2, "priors", "draw")
+    assert "give show or export" in failure(capsys, 2, "priors")
+    assert "give show or export" in failure(capsys, 2, "priors", "draw")
     assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
     assert "--threads must be a number from 0" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
     assert "name it by --depth-model" in failure(capsys, 2, *show(scene, "--out", out, "--depth-size", 64))
     (tmp_path / "x.onnx").write_text("no network")
-    assert "no ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
+    assert "not an ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
     assert "cannot be read" in failure(capsys, 3, *show(scene, "--out", out, "--segmentation-model", tmp_path / "none.onnx"))
     below = scene / "images" / "000.png" / "sheets"
     assert "choose another folder" in failure(capsys, 4, *show(scene, "--out", below))

@@ -120,7 +120,7 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     shutil.copy(tmp_path / "foreign" / TENSORS, tmp_path / "run" / TENSORS)
     before = contents(tmp_path / "run")
     word = "seed" if key == "config" else "fingerprint"
-    with pytest.raises(DataError, match=f"of another fit than config.json beside it: {word} differs"):
+    with pytest.raises(DataError, match=f"and config.json beside it belong to different fits: {word} differs"):
         fit(folder, tmp_path / "run", resume=True)
     assert contents(tmp_path / "run") == before
 
@@ -131,7 +131,7 @@ def test_a_fit_that_was_killed_before_it_had_a_record_can_be_begun_again(folder,
     out.mkdir()
     (out / LOCK).write_text("")
     (out / LEFT).write_text('{"format": 2,')
-    with pytest.raises(UsageError, match="no run to continue"):
+    with pytest.raises(UsageError, match=r"holds no config\.json; give the folder"):
         fit(folder, out, resume=True)
     assert fit(folder, out).step == 2
     assert not (out / LEFT).exists() and not (out / LOCK).exists()

@@ -48,7 +48,7 @@ def test_runs_of_version_0_1_0_are_refused_by_name(run, tmp_path, capsys, comman
     }
     assert main(arguments.get(command, [command, str(old)])) == 3
     error = capsys.readouterr().err
-    assert "config.json: this run is of warpgs 0.1.0" in error and "warpgs 0.2.0 does not read" in error
+    assert "config.json: warpgs 0.1.0 wrote this run" in error and "warpgs 0.2.0 does not read" in error
     assert "fit the scene again into a new --out" in error and "Traceback" not in error
     assert [p.name for p in old.iterdir()] == ["config.json"] and not (tmp_path / "a.ply").exists()
 
@@ -66,8 +66,8 @@ def test_the_format_is_a_number_in_both_files(run, tmp_path):
         (copy / TENSORS).read_bytes()[:-32].replace(b'"format": "2", "version": "0.2.0"', b'"format": "9", "version": "7.0.0"')
     )
     (copy / TENSORS).write_bytes(body + hashlib.sha256(body).digest())
-    with pytest.raises(DataError, match=r"checkpoint is of warpgs 7\.0\.0, in a format that warpgs 0\.2\.0 does not read"):
+    with pytest.raises(DataError, match=r"warpgs 7\.0\.0 wrote this checkpoint, in a format that warpgs 0\.2\.0 does not read"):
         load_checkpoint(copy)
-    with pytest.raises(DataError, match="is no record of a fit"):
+    with pytest.raises(DataError, match="not a record of a fit"):
         (copy / "config.json").write_text("[1]")
         open_run(copy)

@@ -121,7 +121,7 @@ def test_a_run_folder_that_is_replaced_in_mid_fit_is_left_alone(folder, tmp_path
             out.rename(tmp_path / "moved")
             shutil.copytree(folder / "run", out)
 
-    with pytest.raises(ResourceError, match="run: is no longer the folder that this command began to write into"):
+    with pytest.raises(ResourceError, match="run: the folder was moved, removed or replaced while this command wrote into it"):
         warpgs.fit(
             folder / "scene", dataclasses.replace(CONFIG, seed=3), split=split_spec(8), out=out, device="cpu", verbose=False,
             on_step=replace,

@@ -85,7 +85,7 @@ def test_a_fit_that_gains_takes_its_planned_steps(strategy):
     """With next to nothing asked for, growth ends by schedule, and the last set is what the schedule has it be."""
     config = CONFIGS[strategy]
     fit = advanced(dataclasses.replace(config, stopping=dataclasses.replace(AT_ONCE, min_gain_db=1e-9, noise=1e3)))
-    assert fit.step == 60 and fit.stopping.ended == fit.stopping.marks[-1] and "its time was up" in fit.stopping.why
+    assert fit.step == 60 and fit.stopping.ended == fit.stopping.marks[-1] and "its planned steps are done" in fit.stopping.why
     assert len(fit.stopping.measurements) >= 2 and all(v.mask is None for v in fit.views)
 
 

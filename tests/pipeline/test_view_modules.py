@@ -193,9 +193,9 @@ def test_modules_that_cannot_be_are_refused(own):
 
     vignetting = VIEW_MODULES.load(f"{own}:Vignetting")()
     for modules, message in [
-        ((Unnamed(),), "Unnamed has no name of its own"),
+        ((Unnamed(),), "Unnamed has no registered name"),
         ((Exposure(), Exposure(lr=1.0)), "'exposure' is given twice"),
-        ((0.5,), r"0\.5 is no view module"),
+        ((0.5,), r"0\.5 is not a view module"),
     ]:
         with pytest.raises(UsageError, match=message):
             FitConfig(view_modules=modules)

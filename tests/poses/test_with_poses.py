@@ -32,7 +32,7 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
         assert posed.path == str(run / "scene") and any(n.startswith("poses found for 6 of 6") for n in notes)
     assert calls == [tmp_path / "in"] and "holds no cameras: finding poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
-    with pytest.raises(UsageError, match="does not hold the photographs"):
+    with pytest.raises(UsageError, match="holds the poses of other photographs"):
         with_poses(request, run, said.append)
     for resume in (False, True):  # a fit that ended before its first step begins again either way
         with run_folder(run, resume):

@@ -76,7 +76,7 @@ def test_a_damaged_entry_is_made_again_with_a_note(tmp_path, how):
     store = MapCache(tmp_path)
     maps = store.maps(IMAGE, NAMES, {}, make_maps())
     assert (maps[0] == 0.25).all() and (maps[1] == 1).all() and store.made == 1
-    assert len(store.notes) == 1 and "made again" in store.notes[0] and str(path) in store.notes[0]
+    assert len(store.notes) == 1 and "computed again" in store.notes[0] and str(path) in store.notes[0]
     mended = MapCache(tmp_path)
     mended.maps(IMAGE, NAMES, {}, make_maps())
     assert mended.found == 1 and mended.notes == []

@@ -93,7 +93,7 @@ def test_flags_come_before_the_side_file_and_that_before_what_is_usual(tmp_path)
     assert how == DEFAULTS
     assert notes == [
         "d.onnx: assumed size 384, multiple 32, mean 0.5 0.5 0.5, std 0.5 0.5 0.5, output disparity; "
-        "flags --depth-... or d.onnx.json say otherwise"
+        "change it with --depth-... or d.onnx.json"
     ]
     side = {"size": 518, "multiple": 14, "mean": IMAGENET[0], "std": IMAGENET[1], "output": "depth"}
     (tmp_path / "d.onnx.json").write_text(json.dumps(side))

@@ -84,9 +84,7 @@ def test_what_cannot_be_compared_is_said(sharp):
     """An even image matches nothing: no figure is made up for it, nor lost for the others."""
     checks = check_photos(_with(sharp, 4, np.full_like(sharp[4].image, 0.5)))
     assert (checks[4].compared_with, checks[4].sharpness, checks[4].brightness, checks[4].channels) == (0, None, None, None)
-    assert photo_notes(checks) == [
-        f"blur and exposure are unknown where too little matches the photographs beside it: {sharp[4].name}"
-    ]
+    assert photo_notes(checks) == [f"blur and exposure not checked, too few matches: {sharp[4].name}"]
 
 
 def test_photographs_that_stand_close_together_are_compared():

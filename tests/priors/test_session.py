@@ -34,10 +34,10 @@ def test_an_image_goes_in_with_its_axes_in_order(tmp_path, layout):
 
 GOOD = nw.linear(EYE, ZERO)
 REFUSED = {
-    "empty": (b"", "no ONNX model"),
-    "text": (b"an image, not a network", "no ONNX model"),
-    "png": (b"\x89PNG\r\n\x1a\n" + bytes(64), "no ONNX model"),
-    "cut off": (GOOD[: len(GOOD) // 2], "no ONNX model"),
+    "empty": (b"", "not an ONNX model"),
+    "text": (b"an image, not a network", "not an ONNX model"),
+    "png": (b"\x89PNG\r\n\x1a\n" + bytes(64), "not an ONNX model"),
+    "cut off": (GOOD[: len(GOOD) // 2], "not an ONNX model"),
     "no graph": (nw.field(1, 8) + nw.field(8, nw.field(2, 17)), "it has no graph"),
     "two inputs": (nw.linear(EYE, ZERO, inputs=2), r"2 inputs \(x, in1\)"),
     "two outputs": (nw.linear(EYE, ZERO, outputs=2), r"2 outputs \(y, more1\)"),

@@ -168,7 +168,7 @@ def test_a_network_of_the_other_kind_is_refused(tmp_path):
         view_priors([view(shapes()[0])], PriorConfig(segmentation_model=depth))
     for path, flag, output in ((depth, "depth_model", "classes"), (labels, "segmentation_model", "depth")):
         (tmp_path / f"{path}.json").write_text(json.dumps({"output": output}))
-        with pytest.raises(DataError, match=f"described as giving {output}"):
+        with pytest.raises(DataError, match=f"its output is {output}"):
             view_priors([view(shapes()[0])], PriorConfig(**{flag: path}))
 
 

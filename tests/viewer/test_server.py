@@ -196,7 +196,7 @@ def test_a_callback_that_fails_is_one_line(capfd):
         raise KeyError("no\nsuch thing")
 
     guarded(wrong)(None)
-    assert capfd.readouterr().err == "the viewer could not do what a browser asked for (KeyError: 'no\\nsuch thing')\n"
+    assert capfd.readouterr().err == "the viewer could not serve a request of a browser (KeyError: 'no\\nsuch thing')\n"
 
 
 def test_numbers_are_bounded(monkeypatch, capfd):

@@ -22,10 +22,10 @@ COMMANDS = {
     "demo": "write a synthetic scene to try things with",
     "poses": "find the poses of photographs or a video; gives a scene folder",
     "fit": "fit Gaussians to a scene folder and fill a run folder",
-    "view": "look at a run, a PLY file or a fit that goes on, in a browser",
+    "view": "show a run, a PLY file or a running fit in a browser",
     "render": "render a run as a film: along a path, its views, or keyframes",
     "plot": "show a run's cameras and Gaussians in one image",
-    "priors": "look at what is known before a fit, or write networks as ONNX",
+    "priors": "show depth and saliency before a fit, or write networks as ONNX",
     "export": "write a run's Gaussians to a file, or to a page",
     "convert": "write a file of Gaussians or cameras in another format",
     "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
@@ -35,7 +35,7 @@ COMMANDS = {
     "ablate": "fit a preset with its parts off one at a time; the same tables",
     "convert-lpips": "join LPIPS weights into the file that --lpips-weights takes",
     "farm": "fit many scenes, on all GPUs, with Ray or on Slurm",
-    "doctor": "say what this machine has, what is missing, and how to get it",
+    "doctor": "check this machine: devices, optional packages, remedies",
 }
 """Commands by name, in the order of the help, each with a line about it."""
 
@@ -51,7 +51,7 @@ GROUPS = {
 
 
 PRINTING = ("doctor", "compare", "ablate")
-"""Commands whose product is what they print."""
+"""Commands with their result on the terminal."""
 ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
 """Words that ask for text alone."""
 
@@ -105,13 +105,13 @@ def _run(arguments: list[str]) -> int:
     name = arguments[0]
     try:
         if name not in COMMANDS:
-            raise UsageError(f"there is no command {name!r}; choose one of {', '.join(COMMANDS)}")
+            raise UsageError(f"unknown command {name!r}; choose one of {', '.join(COMMANDS)}")
         if name == "fit" and wants_help(arguments[1:]):  # before the import, which costs seconds
             for line in help_lines(COMMANDS[name]):
                 say(line)
             return 0
         with waiting() as wait:
-            if not {"-h", "--help"} & {*arguments}:  # until the command tells of what it does
+            if not ASKING & {*arguments}:  # until the command reports its own progress
                 wait(f"starting {name}")
             with fast_imports():
                 command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")

@@ -80,7 +80,7 @@ EXTRAS = {
     "view": ("viser", "the viewer and pages to send"),
     "formats": ("zstandard", "SPZ of version 4"),
 }
-"""Extras that someone with photographs may want: the module that shows that one is there, and what it is for."""
+"""Optional dependencies for users with photographs: the module that shows that one is installed, and its purpose."""
 
 
 def _reason(error: BaseException) -> str:
@@ -151,7 +151,7 @@ def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
     memory = machine_memory()
     if memory is None:
-        assumed = f"the system does not say how much there is; {format_bytes(ASSUMED_BYTES)} are assumed"
+        assumed = f"the system does not report it;{format_bytes(ASSUMED_BYTES)} are assumed"
         yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory
@@ -193,7 +193,7 @@ def _cuda() -> Iterable[Finding]:
 
 
 def _quiet_warp():
-    """Warp, initialised without its banner and warnings: what they say is said by the report."""
+    """Warp, initialised without its banner and warnings; the report covers them."""
     import warp
 
     prepare_kernel_cache()
@@ -242,7 +242,7 @@ def _prior_cache() -> Iterable[Finding]:
             pass
     except OSError as e:
         remedy = "set WARPGS_CACHE to a folder that you may write to"
-        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run anew each time", remedy)
+        yield Finding("Prior cache", NOTE, f"{folder} is not writable ({e.strerror}); networks run again each time", remedy)
         return
     yield Finding("Prior cache", OK, f"{folder}, {format_bytes(_size(folder))}, writable")
 
@@ -260,7 +260,7 @@ def _kernel_cache() -> Iterable[Finding]:
         yield Finding(topic, MISSING, _reason(e), "fix warp-lang first", True)
         return
     if refused:
-        remedy = "set WARP_CACHE_PATH to a folder that you, and nobody else, may write to"
+        remedy = "set WARP_CACHE_PATH to a folder that only you may write to"
         yield Finding(topic, NOTE, f"{refused}; every run compiles its kernels for a minute or two", remedy, True)
         return
     size = _size(folder)
@@ -341,7 +341,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
     with ThreadPoolExecutor(len(APART)) as pool:
         apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
         checks = [check for check in CHECKS if check not in APART]
-        here = {check: _findings(check) for check in counted(checks, tell, "looking at this machine", "parts")}
+        here = {check: _findings(check) for check in counted(checks, tell, "checking this machine", "parts")}
         return [f for check in CHECKS for f in (here[check] if check in here else apart[check].result())]
 
 

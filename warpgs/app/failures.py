@@ -14,7 +14,7 @@ def report_no_memory(error: Exception) -> int:
 
 
 def missing_package(error: Exception) -> str:
-    """Return the package that an import of warpgs's own code did not find; empty where it is no such error."""
+    """Return the package that an import of warpgs's own code did not find; empty for other errors."""
     name = error.name or "" if isinstance(error, ModuleNotFoundError) and not own_frame(error) else ""
     package = name.partition(".")[0]
     return "" if package == "warpgs" else package

@@ -36,7 +36,7 @@ EXAMPLES = (
 
 SCENE = (
     "folder with cameras, in a format that --help-all lists;",
-    "or photographs or a video, whose poses are then found",
+    "or photographs or a video; fit then finds the poses",
 )
 """Words about the positional argument."""
 

@@ -8,6 +8,7 @@ import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
+from warpgs.app.command_help import help_text
 from warpgs.errors import UsageError
 from warpgs.field_docs import field_docs
 from warpgs.runtime.terminal import say
@@ -80,7 +81,7 @@ MAX_NUMBER = 3e38
 def _whole(words: list[str]) -> int:
     """Return the whole number that a word stands for; ValueError where it is none, or none of 64 bits."""
     if not re.fullmatch(r"[+-]?[0-9][0-9_]{0,40}", words[0]) or abs(number := int(words[0])) > MAX_WHOLE:
-        raise ValueError(f"{words[0][:40]!r} is no whole number of digits 0 to 9, at most 2^63 - 1")
+        raise ValueError(f"expected an integer of at most 2^63 - 1, got {words[0][:40]!r}")
     return number
 
 
@@ -88,12 +89,12 @@ def _number(words: list[str]) -> float:
     """Return the number that a word stands for; ValueError where it is none, not finite, or beyond float32."""
     plain = re.fullmatch(r"[+-]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][+-]?[0-9]+)?", words[0])
     if not plain or not abs(number := float(words[0])) <= MAX_NUMBER:
-        raise ValueError(f"{words[0][:40]!r} is no finite number of digits 0 to 9, at most {MAX_NUMBER:g}")
+        raise ValueError(f"expected a finite number of at most {MAX_NUMBER:g}, got {words[0][:40]!r}")
     return number
 
 
 def _number_rule(info: Any) -> Any:
-    """Return how a number is parsed; None for what is no number."""
+    """Return the parser of a number; None for other types."""
     import tyro
 
     parsers: dict[Any, Any] = {int: _whole, float: _number}
@@ -107,7 +108,7 @@ def _number_rule(info: Any) -> Any:
 
 
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
-    """Return an instance of a dataclass of flags from the words of a command line.
+    """Return an instance of a dataclass of flags from the words of a command line; ``--help`` prints one screen.
 
     Numbers are finite and written in the digits 0 to 9. Where a word is wrong, tyro says which, and the process ends with exit
     code 2.
@@ -123,6 +124,11 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
     """
     import tyro
 
+    if {"-h", "--help"} & {*arguments}:
+        for line in help_text(kind, program, description).splitlines():
+            say(line)
+        raise SystemExit(0)
+    arguments = ["--help" if word == "--help-all" else word for word in arguments]  # tyro's help, with every flag
     registry = tyro.constructors.ConstructorRegistry()
     registry.primitive_rule(_number_rule)
     complaint = io.StringIO()

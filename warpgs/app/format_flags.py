@@ -15,7 +15,7 @@ from warpgs.plugins import flag_group
 
 
 def format_lines() -> str:
-    """Return the formats by suffix and what they are, for people."""
+    """Return the formats by suffix, each with a description, for people."""
     return listed("formats", {f.suffix: f.description for f in all_formats()})
 
 
@@ -26,16 +26,16 @@ def format_flags(arguments: list[str]) -> type:
     @dataclass(frozen=True, kw_only=True)
     class Shared:
         format: str | None = None
-        """Format of your own, as module:Class or path/to/file.py:Class; without it the suffix says the format."""
+        """Format of your own, as module:Class or path/to/file.py:Class. Default: chosen by the suffix."""
         crop: str | None = None
         """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
         clean: tyro.conf.FlagCreatePairsOff[bool] = False
         """Remove floaters and needles: Gaussians that no training view of a run sees, larger than the scene, or long and thin.
         Done unless the file is a .ply."""
         no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
-        """Keep these, too."""
+        """Keep them."""
         sh_degree: int | None = None
-        """Highest degree of harmonics; 0 for colours that are the same from all sides. All where not given."""
+        """Highest degree of harmonics; 0 for colours without view dependence. Default: all."""
         rotate: str | None = None
         """Turn the model about the origin: x,y,z,degrees; of a run also level (up as the cameras say)."""
 
@@ -75,7 +75,7 @@ def chosen_formats(a: Any, target: Path) -> list[Format]:
     for group, config in _with_options(a.format).items():
         if settings_of(config, getattr(a, group)) != config() and config is not written.Config:
             flag = group.replace("_", "-")
-            raise UsageError(f"--{flag}.* are options of another format than that of {target}; leave them out")
+            raise UsageError(f"--{flag}.* are not options of the format of {target}; leave them out")
     if written.Config is None:
         return named
     made = written(settings_of(written.Config, getattr(a, flag_group(written.name))))

@@ -19,7 +19,7 @@ SH_SIZES = (1, 4, 9, 16)
 """Numbers of spherical-harmonics coefficients of degrees 0 to 3."""
 SQRT2 = 1.4142135623730951
 _AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
-"""Axes whose signs each harmonic changes with, in the order of docs/sh.md."""
+"""Axes that flip the sign of each harmonic, in the order of docs/sh.md."""
 
 
 def malformed(path: Path, what: str) -> DataError:

@@ -17,7 +17,7 @@ from warpgs.scene import Camera
 NAMES = ("cameras.json", "transforms.json", "sparse")
 """Names of files, and of a folder, that say their format."""
 MAX_OFF_CENTER = 0.01
-"""Distance of a principal point from the middle of the image from which on its loss is said [px]."""
+"""Least distance of a principal point from the image's middle for a note that the file drops it [px]."""
 
 
 def holds_cameras(path: Path) -> bool:
@@ -78,7 +78,7 @@ def _inria(number: int, camera: Camera) -> dict[str, object]:
 
 
 def _frame(number: int, camera: Camera) -> dict[str, object]:
-    """Return the frame of a camera, whose axes are those of OpenGL."""
+    """Return the frame of a camera, with the axes of OpenGL."""
     pose = _world_from_camera(camera)
     pose[:3, 1:3] *= -1
     return {

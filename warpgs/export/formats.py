@@ -31,7 +31,9 @@ def find_format(choice: str | type[Format] | Format) -> Format:
         UsageError: There is no such format, it does not derive from `Format`, or it has no suffix.
     """
     if not isinstance(choice, (str, type, Format)):
-        raise UsageError(f"{choice!r} is no format; give a name, module:Class, or a class or object derived from warpgs.Format")
+        raise UsageError(
+            f"{choice!r} is not a format; give a name, module:Class, or a class or object derived from warpgs.Format"
+        )
     found = (
         choice if isinstance(choice, Format) else FORMATS.load(choice)() if isinstance(choice, str) else FORMATS.find(choice)()
     )

@@ -57,7 +57,7 @@ def encode_glb(arrays: Arrays) -> list[bytes]:
 
 
 def encode_gltf(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of a .gltf file, whose numbers are base64 inside it."""
+    """Return the bytes of a .gltf file, with its numbers inside as base64."""
     document, body = _document(arrays)
     document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
     return [json.dumps(document, separators=(",", ":")).encode()]
@@ -187,7 +187,7 @@ class _Table:
 
 
 def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]:
-    """Return the document and the binary chunk (empty where there is none) of a file."""
+    """Return the document and the binary chunk (maybe empty) of a file."""
     body: bytes | memoryview = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
@@ -212,7 +212,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
     except (ValueError, RecursionError) as e:
         raise malformed(path, "its JSON cannot be read") from e
     if not isinstance(document, dict):
-        raise malformed(path, "its JSON is no object")
+        raise malformed(path, "its JSON is not an object")
     return document, body
 
 
@@ -271,7 +271,7 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     view = item("bufferViews", accessor.get("bufferView"))
     kind, width = _KINDS.get(accessor.get("componentType")), _WIDTHS.get(accessor.get("type"))
     if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
-        raise malformed(path, f"accessor {index} is of a kind that this does not read")
+        raise malformed(path, f"accessor {index} has an unsupported type")
     if kind != "<f4" and accessor.get("normalized") is not True:
         raise malformed(path, f"accessor {index} holds integers that are no fractions")
     dtype = np.dtype(kind)

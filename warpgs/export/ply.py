@@ -29,7 +29,7 @@ from warpgs.scene import Gaussians, Normalization
 CHUNK_ROWS = 65536
 """Number of Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
 OPAQUE = 30.0
-"""Logit of an opacity that is 1 in float32, and whose negative is one that nobody sees: it stands for infinity."""
+"""Logit of an opacity that is 1 in float32, its negative that of an invisible one: it replaces infinity."""
 FLAT = math.log(1e-37)
 """Logarithm of an axis without length, as short as float32 holds; it stands for minus infinity."""
 

@@ -257,27 +257,27 @@ def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> by
 
 
 def _pixels(path: Path, name: str, content: bytes, n: int) -> np.ndarray:
-    """Return the RGBA pixels [P, 4] of an image of at least ``n``, whose size is checked before it is decoded."""
+    """Return the RGBA pixels [P, 4] of an image of at least ``n``; its size is checked before it is decoded."""
     import cv2
 
     width, height = _webp_size(content)
     if not width * height:
-        raise malformed(path, f"{name[:40]!r} is no lossless WebP image")
+        raise malformed(path, f"{name[:40]!r} is not a lossless WebP image")
     if not n <= width * height <= MAX_PIXELS * n + SMALL:
         raise malformed(path, f"{name[:40]!r} has {width} x {height} pixels for {n} values")
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as e:
-        raise malformed(path, f"{name[:40]!r} is no WebP image that can be read") from e
+        raise malformed(path, f"{name[:40]!r} is not a readable WebP image") from e
     if image is None or image.shape[:2] != (height, width) or image.dtype != np.uint8 or image.ndim != 3:
-        raise malformed(path, f"{name[:40]!r} is no WebP image that can be read")
+        raise malformed(path, f"{name[:40]!r} is not a readable WebP image")
     if image.shape[2] == 4:
         return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA, image).reshape(-1, 4)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGBA).reshape(-1, 4)
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
-    """Return width and height [px] of a lossless WebP image that is no animation; zeros for any other file."""
+    """Return width and height [px] of a lossless, still WebP image; zeros for any other file."""
     at = 12 if data[:4] == b"RIFF" and data[8:12] == b"WEBP" else len(data)
     while at + 13 <= len(data):
         kind, length = struct.unpack_from("<4sI", data, at)

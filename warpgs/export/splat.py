@@ -15,7 +15,7 @@ from warpgs.export.base import Format, register
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _TINY = 1e-37
-"""Least axis length that is written and read: the logarithm of 0 is no number."""
+"""Least axis length that is written and read: the logarithm of 0 is not finite."""
 
 
 def encode(arrays: Arrays) -> list[bytes]:

@@ -41,7 +41,7 @@ from warpgs.export.base import Format, register
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are asked for."""
 VERSION = 3
-"""Version that is written where none is asked for: programs of any age read gzip."""
+"""Version that is written by default: programs of any age read gzip."""
 VERSIONS = (2, 3, 4)
 """Versions that are read and written."""
 MAGIC = 0x5053474E
@@ -220,11 +220,11 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
 
 
 def _decompressed(path: Path, reader: BinaryIO, i: int, whole: int, size: int, *, end: bool = False) -> bytes:
-    """Return the next ``size`` bytes of the i-th stream, whose content has ``whole`` of them; at its end maybe fewer."""
+    """Return the next ``size`` of ``whole`` bytes of the i-th stream; at its end maybe fewer."""
     try:
         data = reader.read(size)
     except _zstandard().ZstdError as e:
-        raise malformed(path, f"stream {i} is no zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
+        raise malformed(path, f"stream {i} is not a zstd stream, or asks for more than {MAX_WINDOW >> 20} MiB") from e
     if len(data) != size and not end:
         raise malformed(path, f"stream {i} does not hold its {whole} bytes")
     return data

@@ -75,13 +75,13 @@ def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
-    """Return pose and lens of each frame, whose image size the file must give."""
+    """Return pose and lens of each frame; the file must give its image size."""
     shared = transforms.read_json(path)
     found = _Names()
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
-            raise DataError(f"{where}: is no object with file_path and transform_matrix. Write it again")
+            raise DataError(f"{where}: expected an object with file_path and transform_matrix. Write it again")
         if any(frame.get(key, shared.get(key)) is None for key in ("w", "h")):
             raise DataError(f"{where}: gives no w and h, so its size is unknown. Add them, or give the scene's folder")
         lens = transforms.lens_of(frame, shared, 0, 0, where)

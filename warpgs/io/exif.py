@@ -47,7 +47,7 @@ class Exif:
 
 
 def read_exif(data: bytes) -> Exif:
-    """Return what EXIF says in an image file; what is damaged there counts as not said."""
+    """Return the EXIF values of an image file; damaged ones count as missing."""
     try:
         return parse_exif(_block(data))
     except ValueError:
@@ -55,7 +55,7 @@ def read_exif(data: bytes) -> Exif:
 
 
 def parse_exif(block: bytes) -> Exif:
-    """Return what a block of EXIF says, which begins as a TIFF file does; what is damaged there counts as not said."""
+    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged ones count as missing."""
     block = block.removeprefix(PREFIX)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
     if order is None:
@@ -73,7 +73,7 @@ def parse_exif(block: bytes) -> Exif:
 
 
 def _block(data: bytes) -> bytes:
-    """Return the bytes of EXIF in an image file, which begin as a TIFF file does; empty where there are none."""
+    """Return the bytes of EXIF in an image file, which begin as a TIFF file does; maybe empty."""
     name, _ = format_of(data)
     found: bytes | memoryview = b""
     if name == "TIFF":
@@ -110,7 +110,7 @@ class _Directory:
             self.entries[tag] = kind, length, place + 8
 
     def number(self, tag: int) -> int | None:
-        """Return a single whole number; None where there is none."""
+        """Return a single whole number, or None."""
         kind, length, place = self.entries.get(tag, (0, 0, 0))
         if kind not in NUMBERS or length != 1:
             return None
@@ -118,7 +118,7 @@ class _Directory:
         return value
 
     def text(self, tag: int) -> str:
-        """Return the text of a tag, without the zero bytes and spaces around it; empty where there is none."""
+        """Return the text of a tag, maybe empty, without the zero bytes and spaces around it."""
         kind, length, place = self.entries.get(tag, (0, 0, 0))
         if kind != ASCII:
             return ""

@@ -49,7 +49,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
         except UnicodeEncodeError:
             usable = False
     if not usable:
-        raise DataError(f"{where}: {str(name)[:80]!r} is no file name; name an image file")
+        raise DataError(f"{where}: {str(name)[:80]!r} is not a file name; name an image file")
     path = folder / name
     if "\\" in name and not path.is_file():
         path = folder / name.replace("\\", "/")  # written on Windows
@@ -209,21 +209,19 @@ def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str
     others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
     if not others:
         unread = unread_note(full)
-        raise DataError(
-            f"{full}: {unread}" if unread else f"{root}: there is no folder '{base}' with images; put the images there"
-        )
+        raise DataError(f"{full}: {unread}" if unread else f"{root}: no folder '{base}' with images; put the images there")
     largest = others[min(others)]
     how = f", area-resampled by {downscale}" if downscale > 1 else ""
-    return largest, downscale, f"there is no full-size folder '{base}': images taken from {largest.name}{how}"
+    return largest, downscale, f"no full-size folder '{base}': images taken from {largest.name}{how}"
 
 
 def resampling_note(downscale: int) -> list[str]:
-    """Return the note of a format whose images are always resampled; an empty list for a factor of 1."""
+    """Return the note of a format that always resamples its images; an empty list for a factor of 1."""
     return [f"images area-resampled by {downscale}"] if downscale > 1 else []
 
 
 class ViewList:
-    """Views of a scene in the order they are read, and a count of what was done to their pixels."""
+    """Views of a scene in the order they are read, and counts of the changes to their pixels."""
 
     def __init__(self) -> None:
         self.views: list[View] = []
@@ -252,7 +250,7 @@ class ViewList:
             self._kept[name] = loaded.kept
 
     def notes(self, options: ReadOptions | None = None) -> list[str]:
-        """Return what was done to the pixels, a sentence each; with ``options`` also what was assumed of masks."""
+        """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
         done = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
         return done + ([] if options is None else self._mask_notes(options))
 

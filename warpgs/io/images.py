@@ -16,7 +16,7 @@ from warpgs.io.exif import read_exif
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
-"""First words of what is noted of an image that `load_image` brought to its longest side."""
+"""First words of the note on an image that `load_image` brought to its longest side."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".hif")
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
@@ -186,7 +186,7 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
     factor, flags, done = float(downscale), f"--downscale {downscale}", loaded.done
     if max_side and round(max(width, height) / downscale) > max_side:
         factor, flags = max(width, height) / max_side, f"--max-side {max_side}"
-        done = (*done, f"{REDUCED}{max_side} px on the longer side; --max-side names another, 0 keeps the size")
+        done = (*done, f"{REDUCED}{max_side} px on the longer side; change it with --max-side, 0 for full size")
     if factor == 1:
         return loaded
     small_w, small_h = round(width / factor), round(height / factor)
@@ -252,13 +252,13 @@ def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
         alpha = None
     if mask is not None and not mask.any():
         raise DataError(
-            f"{path}: its mask leaves no pixel; --mask-keeps says which of its colours, white or black, keeps a pixel"
+            f"{path}: its mask leaves no pixel; set --mask-keeps to the mask's colour of kept pixels, white or black"
         )
     return LoadedImage(image, mask, loaded.K, tuple(done), alpha, kept)
 
 
 def _over_background(loaded: LoadedImage, background: tuple[float, float, float]) -> LoadedImage:
-    """Return an image whose colours, multiplied by their opacity until now, lie over a background."""
+    """Return an image with colours, premultiplied by their opacity, over a background."""
     image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha
     if alpha is not None:
         alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more
@@ -323,5 +323,5 @@ def load_image(
     if native and (lens.fisheye or any(lens.distortion)):
         loaded = _native(loaded, lens)
     if loaded.mask is not None and not loaded.mask.any():
-        raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
+        raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; check all three")
     return _over_background(loaded, background)

@@ -54,7 +54,7 @@ def load_scene(
             them. None for 1600 where ``downscale`` is None too, else for no limit.
         strict: A frame without an image file is an error instead of a note.
         allow_outside: Let names and links of the scene lead to files outside its folder.
-        masks: Fate of pixels that a mask file does not keep: ignore (they do not count, in fit and score) or cutout
+        masks: Treatment of masked-out pixels: ignore (they do not count, in fit and score) or cutout
             (they are transparent, gray ones in part: `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
         black_is_empty: Dark pixels around an object and in its holes are transparent, where every image shows one on black and
@@ -111,7 +111,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     complete = [r for r, p in found if not p.missing]
     broken = [f"{p.found} lacks {p.missing}" for _, p in found if p.missing]
     if not complete and broken:
-        raise DataError(f"{root}: {broken[0]}, and there is no other format. Copy the whole reconstruction")
+        raise DataError(f"{root}: {broken[0]}, and no other format was found. Copy the whole reconstruction")
     if not complete:
         images = ". It holds images without cameras: `warpgs poses` finds those" if list_images(root) else ""
         if not images and (unread := unread_note(root)):
@@ -130,7 +130,7 @@ def _check_folder(root: Path) -> None:
     if root.is_file():
         raise DataError(f"{root}: is a file; give the folder that holds the images and their cameras")
     if not root.is_dir():
-        raise DataError(f"{root}: there is no such folder; give the folder that holds the images and their cameras")
+        raise DataError(f"{root}: no such folder; give the folder that holds the images and their cameras")
 
 
 def _accepted(root: Path, reader: Reader) -> Reader:

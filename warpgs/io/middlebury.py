@@ -59,11 +59,11 @@ def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
 
 
 def _intrinsics(K: np.ndarray, where: str) -> np.ndarray:
-    """Return K [3, 3] of a file for pixel centres at +0.5; DataError where it is no matrix of intrinsics or skewed."""
+    """Return K [3, 3] of a file for pixel centres at +0.5; DataError if it is not a matrix of intrinsics, or skewed."""
     if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
         raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
     if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-        raise DataError(f"{where}: K is no matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
+        raise DataError(f"{where}: K is not a matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
     K[0, 1] = 0.0
     K[:2, 2] += 0.5  # the file counts pixels from the centre of the first one
     return K

@@ -1,4 +1,4 @@
-"""Change from file coordinates to scene coordinates, and the fingerprint of what was read."""
+"""Change from file coordinates to scene coordinates, and the fingerprint of a scene."""
 
 from __future__ import annotations
 

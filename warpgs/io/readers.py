@@ -39,7 +39,7 @@ class ReadOptions:
     allow_outside: bool = False
     """Names and links of the scene may lead to files outside its folder."""
     masks: str = "ignore"
-    """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    """Treatment of masked-out pixels: ignore (they do not count) or cutout (they are transparent)."""
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
@@ -142,7 +142,7 @@ def find_reader(choice: str | type[Reader] | Reader) -> Reader:
     if isinstance(choice, Reader):
         return choice
     if not isinstance(choice, (str, type)):
-        raise UsageError(f"{choice!r} is no reader; give a name, module:Class, or a class or object derived from Reader")
+        raise UsageError(f"{choice!r} is not a reader; give a name, module:Class, or a class or object derived from Reader")
     if isinstance(choice, type) or ":" not in choice:
         return READERS.find(choice)()
     cls = READERS.load(choice)

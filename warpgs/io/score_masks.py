@@ -22,7 +22,7 @@ ASPECT_TOLERANCE = 0.02
 def _by_id(files: list[Path], folder: Path) -> dict[int, Path]:
     ids = image_ids([f.name for f in files])
     if ids is None:
-        raise DataError(f"{folder}: the masks have no numbers that tell them apart; name them 000.png, 001.png, ... by id")
+        raise DataError(f"{folder}: the masks have no distinct numbers; name them 000.png, 001.png, ... by id")
     return dict(zip(ids, files))
 
 
@@ -76,7 +76,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         raise DataError(
-            f"{folder}: there is no mask for image id {shown} (ids are counted from 0; an image rect_001_... is id 0); the "
+            f"{folder}: no mask for image id {shown} (ids are counted from 0; an image rect_001_... is id 0); the "
             f"masks run from {files[0].name} to {files[-1].name}. Restore the missing ones"
         )
     if min(ids) == 1 and 0 in masks and not named_by_dtu([v.name for v in views]):

@@ -105,7 +105,7 @@ class _Names:
         short = [f for f in forms if len(f) <= MAX_COMPARED]  # the comparison takes the product of both lengths
         near = list(dict.fromkeys(forms[f] for f in difflib.get_close_matches(wanted[:MAX_COMPARED], short, 4, 0.3)))[:3]
         some = ", ".join(near or self.names[:3])
-        raise DataError(f"split {self.spec}: there is no view {wanted!r}; the nearest names are {some}")
+        raise DataError(f"split {self.spec}: no view {wanted!r}; the nearest names are {some}")
 
     def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
         """Return the names by their last ``count`` parts, for those that have more; by the whole name for 0."""

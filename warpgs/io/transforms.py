@@ -62,14 +62,14 @@ def read_json(path: Path) -> dict:
     try:
         check_depth(values, MAX_DEPTH)
     except SchemaError as e:  # or the text of an error could not name its values
-        raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels, so it is no transforms file; write it again") from e
+        raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels; write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
-        raise DataError(f"{path}: has no list 'frames', so it is no transforms file; write it again")
+        raise DataError(f"{path}: has no list 'frames'; write it again")
     return values
 
 
 def _number(frame: dict, shared: dict, key: str) -> float | None:
-    """Return a number of the frame, else of the file; None where neither has it, ValueError where it is no finite number."""
+    """Return a number of the frame, else of the file; None if both lack it, ValueError if it is not finite."""
     value = frame.get(key, shared.get(key))
     if value is None:
         return None
@@ -184,7 +184,7 @@ class _Reading:
     def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
         where = f"{file}, frame {number}"
         if not isinstance(frame, dict):
-            raise DataError(f"{where}: is no object with file_path and transform_matrix; write the file again")
+            raise DataError(f"{where}: expected an object with file_path and transform_matrix; write the file again")
         path = self.image_path(file.parent, frame.get("file_path"), where)
         self.total += 1
         if not path.is_file():

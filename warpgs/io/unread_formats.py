@@ -11,7 +11,7 @@ from pathlib import Path
 from warpgs.io.image_formats.avif import kind
 
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
-"""Suffixes of RAW files of cameras; many of them begin like a TIFF, whose first image is a small preview."""
+"""Suffixes of RAW files of cameras; many begin like a TIFF, and their first image is a small preview."""
 HEIC = "a HEIC photograph, which is read only where cameras are found (warpgs poses): convert all of them to JPEG"
 RAW = "a camera's RAW file, which is not read: develop all of them alike to JPEG or 16-bit PNG, with one white balance"
 

@@ -27,7 +27,7 @@ class DistanceGrid:
     voxel: float
     """Distance from one point to the next [u]."""
     truncation: float
-    """Largest distance from a surface that is told apart [u]."""
+    """Largest distance from a surface that is stored [u]."""
     distances: torch.Tensor
     """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; of no meaning at weight 0."""
     weights: torch.Tensor

@@ -1,4 +1,4 @@
-"""Fusion of what all cameras see into a mesh: distances, then triangles, then their colours."""
+"""Fusion of the depth of all cameras into a mesh: distances, then triangles, then their colours."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class MeshOptions:
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
         if self.voxel is not None and self.resolution is not None:
-            raise UsageError("--voxel and --resolution say the same; give one of them")
+            raise UsageError("--voxel and --resolution exclude each other; give one of them")
         if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
             raise UsageError(f"--resolution must be {MIN_RESOLUTION} to {MAX_RESOLUTION} voxels, not {self.resolution}")
         if self.max_faces < MIN_FACES:
@@ -54,7 +54,7 @@ class MeshOptions:
 
 @dataclass(frozen=True)
 class FusedMesh:
-    """A mesh with what was found on the way."""
+    """A mesh with its statistics."""
 
     mesh: Mesh
     """The mesh, in the units of the cameras."""
@@ -112,7 +112,7 @@ def fuse(
         ResourceError: The grid does not fit into memory.
         UsageError: A camera is orthographic, or an option is out of range.
     """
-    views = surface_views(gaussians, cameras, render, options.depth, "looking where surfaces are", stage)
+    views = surface_views(gaussians, cameras, render, options.depth, "finding surfaces", stage)
     samples = [sample_surface(v, max(1, SAMPLES // len(cameras))) for v in views]
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
     planned(plan, check_memory(plan, gaussians.means.device))

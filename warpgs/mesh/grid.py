@@ -48,7 +48,7 @@ class GridPlan:
 
     @property
     def truncation(self) -> float:
-        """Largest distance from a surface that is told apart [u]."""
+        """Largest distance from a surface that is stored [u]."""
         return TRUNCATION * self.voxel
 
 
@@ -82,7 +82,7 @@ def plan_grid(
         UsageError: A number is out of range.
     """
     if not len(points):
-        raise DataError("no training view shows a surface: alpha is below 1/2 everywhere; fit again, with more steps")
+        raise DataError("no training view shows a surface: alpha is below 0.5 everywhere; fit again with more steps")
     low, high = find_box(points)
     longest = float((high - low).max())
     if voxel is None:

@@ -13,7 +13,7 @@ MAX_JUMP = 1.1
 With less, what is seen at a grazing angle is left out; with more, skirts hang behind the edges of what a view sees. Chosen, as
 the truncation was, on a demo scene of another seed than the one that is reported (docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
-    "the training views agree on no surface inside the grid; give another --voxel (larger; smaller where it is near the size "
+    "no surface inside the grid; give another --voxel (larger; smaller where it is near the size "
     "of the scene), or fit with more steps"
 )
 """Words where a grid holds no surface."""

@@ -33,13 +33,13 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
         return f"has {keypoints} keypoints, too few to find again: a blank wall, darkness or blur"
     best = partners(found, i)
     if not best:
-        return f"has {keypoints:,} keypoints and matches no other photograph: nothing that it shows is in another one"
+        return f"has {keypoints:,} keypoints and matches no other photograph"
     j, n = best[0]
     matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
     if j in found.views:
-        return f"{matched}, too few of them at places whose depth is known"
+        return f"{matched}, too few of them at places of known depth"
     group = next((g for g in found.groups[1:] if i in g), ())
-    together = f", in a group of {len(group)} by itself" if group else ""
+    together = f", in a separate group of {len(group)}" if group else ""
     return f"{matched}, which has no pose either{together}"
 
 

@@ -31,9 +31,9 @@ from warpgs.poses.video import is_video, write_frames
 MIN_PHOTOGRAPHS = 3
 """Fewest photographs: of two, nothing checks the focal length and the depths that they give each other."""
 FRAMES = 60
-"""Frames taken of a video where nobody says how many."""
+"""Default number of frames from a video."""
 LINKS = 6
-"""Pairs of photographs whose matches are told of where no poses are found, those with the fewest first."""
+"""Pairs of photographs to report if no poses are found, those with the fewest matches first."""
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 """Files of a COLMAP model; the first three make a scene."""
 
@@ -140,12 +140,12 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
     try:
         if not is_video(source) and not source.is_dir():
             there = NOT_REGULAR if source.exists() else "does not exist"
-            what = "is no video that is read (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
+            what = "is not a supported video (mp4, mov, m4v, avi, mkv, webm)" if source.is_file() else there
             raise DataError(f"{source}: {what}; give a folder of photographs, or a video")
         if not is_video(source) and (other := _something_else(source)):
             raise UsageError(f"{source}: {other}")
         if not is_video(source) and not photographs_inside(source, allow_outside):
-            none = "holds no image file that is read (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
+            none = "holds no supported image (JPEG, PNG, BMP, TIFF, WebP, AVIF or HEIC); give the folder of photographs"
             raise DataError(f"{source}: {unread_note(source) or none}")
         if out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
@@ -190,7 +190,7 @@ def _prepared(
 
 
 def _notes(photographs: list[Photograph]) -> list[str]:
-    """Return what was assumed of the photographs, a sentence each."""
+    """Return notes on assumptions about the photographs."""
     cameras = cameras_of(photographs, camera_groups(photographs))
     known = sum(c.focal is not None for c in cameras)
     source = "from EXIF" if known == len(cameras) else "unknown to EXIF" if not known else f"from EXIF for {known} of them"

@@ -1,4 +1,4 @@
-"""Structure from motion of prepared photographs: runs the worker process and holds what it found."""
+"""Structure from motion of prepared photographs: runs the worker process and holds its results."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 EXHAUSTIVE = 60
 """Most photographs of which all pairs are matched; of more, pairs are chosen."""
 JOB = "job.json"
-"""Name of the file with what the worker is told."""
+"""Name of the file with the worker's input."""
 LAST_WORDS = 500
 """Letters of pycolmap's last message that are shown where it fails."""
 
 
 @dataclass(frozen=True)
 class FoundView:
-    """A photograph whose pose was found."""
+    """A photograph with a pose."""
 
     rotation: np.ndarray
     """Rotation of camera_from_world, shape [3, 3]."""
@@ -116,7 +116,7 @@ def cameras_of(photographs: list[Photograph], groups: list[int]) -> list[Photogr
 
 
 def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int) -> dict[str, Any]:
-    """Return what the worker is told."""
+    """Return the worker's input."""
     of = camera_groups(photographs)
     cameras = []
     for p in cameras_of(photographs, of):
@@ -134,7 +134,7 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
 
 
 def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield what the worker says, and end it where nobody listens any more."""
+    """Yield the worker's messages, and end it when the reader stops."""
     write_json(folder / JOB, job)
     try:
         for line in python_lines("warpgs.poses.worker", JOB, folder=folder, environment={"GLOG_logtostderr": "1"}):

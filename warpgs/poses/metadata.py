@@ -1,4 +1,4 @@
-"""Image files without what they say of people and places: EXIF with its GPS position, XMP, comments, profiles."""
+"""Image files without personal metadata: EXIF with its GPS position, XMP, comments, profiles."""
 
 from __future__ import annotations
 

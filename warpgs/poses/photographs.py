@@ -1,4 +1,4 @@
-"""Photographs without cameras: which files they are, what EXIF says of them, and copies without anything personal."""
+"""Photographs without cameras: their files, their EXIF values, and copies without personal metadata."""
 
 from __future__ import annotations
 

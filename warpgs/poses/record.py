@@ -53,16 +53,16 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         })  # fmt: skip
     remarks = [summary(found, len(names))]
     if found.kept_focal:
-        remarks.append(f"the focal length is kept as EXIF tells it: {len(found.views)} photographs do not tell it better")
+        remarks.append(f"the focal length is that of EXIF: {len(found.views)} photographs do not determine it better")
     elif found.kept_focal is False:
         remarks.append(
-            f"the {len(found.views)} photographs contradict the focal length that EXIF tells, as cropped ones do: theirs is "
-            "taken, often 5 % off, at worst 20 % and more"
+            f"the focal length of EXIF does not fit the {len(found.views)} photographs, maybe cropped; it was estimated from "
+            "them instead, often 5 % off, at worst 20 % and more"
         )
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
-            f"a focal length found from {len(found.views)} photographs is often 5 % off, at worst 20 % and more, and depth "
-            "with it: EXIF does not tell it, and more photographs, from more directions, would"
+            f"EXIF holds no focal length; an estimate from {len(found.views)} photographs is often 5 % off, at worst 20 % and "
+            "more, and depth with it. Add photographs from more directions"
         )
     if found.method == "global":
         remarks.append(

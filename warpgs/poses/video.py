@@ -65,7 +65,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
 
 
 def _check_container(path: Path) -> None:
-    """Raise a DataError where a file is no video container: FFmpeg would follow a playlist to other files."""
+    """Raise a DataError if a file is not a video container: FFmpeg would follow a playlist to other files."""
     try:
         start = read_start(path, START)
     except OSError as e:

@@ -133,7 +133,7 @@ def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
 
 
 def finish(model: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Give a model the names and sizes of the scene's images and write it; return what is known of it."""
+    """Give a model the names and sizes of the scene's images and write it; return its description."""
     error, index = model.compute_mean_reprojection_error(), {name: i for i, name in enumerate(job["names"])}
     views = {}
     for number in model.reg_image_ids():

@@ -38,7 +38,7 @@ def cache_folder() -> Path:
         return asked
     home = cache_home()
     if home is None:
-        say("warpgs: there is no home folder, so maps are kept for this run alone; WARPGS_CACHE names one", error=True)
+        say("warpgs: no home folder: maps are kept for this run only; set WARPGS_CACHE to a folder", error=True)
         return private_folder() / "maps"
     return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
 
@@ -95,12 +95,12 @@ class MapCache:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
-            self.notes.append(f"{path}: a stored map could not be read ({e}) and was made again")
+            self.notes.append(f"{path}: a stored map could not be read ({e}) and was computed again")
             return None
         maps = tuple(stored.get(n) for n in names)
         if all(m is not None and m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps):
             return maps
-        self.notes.append(f"{path}: a stored map is not what it must be and was made again")
+        self.notes.append(f"{path}: a stored map was damaged and was computed again")
         return None
 
     def _write(self, path: Path, names: tuple[str, ...], maps: tuple[np.ndarray, ...]) -> None:
@@ -110,6 +110,6 @@ class MapCache:
             path.parent.mkdir(parents=True, exist_ok=True)
             write_bytes(path, save({n: np.ascontiguousarray(m) for n, m in zip(names, maps)}))
         except (OSError, ResourceError) as e:
-            note = f"maps are not kept for the next time ({e}); WARPGS_CACHE names another folder"
-            if not any(n.startswith("maps are not kept") for n in self.notes):
+            note = f"maps are not cached ({e}); set WARPGS_CACHE to another folder"
+            if not any(n.startswith("maps are not cached") for n in self.notes):
                 self.notes.append(note)

@@ -20,7 +20,7 @@ STEP = 0.5
 """Step along the epipolar line for the central difference of the sensitivity [px]."""
 
 FlowBetween = Callable[[int, int], np.ndarray | None]
-"""Flow [px], float32 [H, W, 2], from the pixels of view i to view j; None where there is none."""
+"""Flow [px], float32 [H, W, 2], from the pixels of view i to view j, or None."""
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ LINE_DISTANCE = 2.0
 MIN_SPARSE = 16
 """Smallest number of matches from which flow is interpolated."""
 NET_STRIDE = 8
-"""Side length [px] of whose multiples networks of the RAFT kind take images."""
+"""Multiple of both image sides [px] for networks of the RAFT kind."""
 RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
 """Factor and offset from colours in [0, 1] to a network's input: RAFT's original code takes 0..255, torchvision's -1..1."""
 
@@ -49,14 +49,14 @@ def read_flo(path: Path) -> np.ndarray:
     except OSError as e:
         raise DataError(f"{path}: flow cannot be read ({unread_reason(e)}); check the path and its permissions") from e
     if len(raw) < 12 or np.frombuffer(raw, "<f4", 1)[0] != FLO_MAGIC:
-        raise DataError(f"{path}: not a Middlebury .flo file (its first number must be 202021.25); write the flow anew")
+        raise DataError(f"{path}: not a Middlebury .flo file (its first number must be 202021.25); write the flow again")
     width, height = (int(v) for v in np.frombuffer(raw, "<i4", 2, 4))
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
-        raise DataError(f"{path}: says it is {width} x {height} px; sides must be 1 to {MAX_SIDE}. Write the flow anew")
+        raise DataError(f"{path}: its header gives {width} x {height} px; sides must be 1 to {MAX_SIDE}. Write the flow again")
     if len(raw) != 12 + 8 * width * height:
         raise DataError(
             f"{path}: {len(raw)} bytes, but {width} x {height} px take {12 + 8 * width * height}; it was cut or changed on the "
-            "way. Copy or write it anew"
+            "way. Copy or write it again"
         )
     flow = np.frombuffer(raw, "<f4", offset=12).reshape(height, width, 2)
     return np.where((np.abs(flow) < MIN_UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
@@ -195,7 +195,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
     try:
         session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
     except Exception as e:
-        raise DataError(f"{path}: onnxruntime cannot open it ({str(e).splitlines()[0]}); export the network anew") from e
+        raise DataError(f"{path}: onnxruntime cannot open it ({str(e).splitlines()[0]}); export the network again") from e
     inputs = session.get_inputs()
     if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
         shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)

@@ -42,7 +42,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def _message(data: memoryview) -> Message:
-    """Return field numbers and values, whole numbers or bytes; ValueError or IndexError where the data is no protobuf."""
+    """Return field numbers and values, whole numbers or bytes; ValueError or IndexError if the data is not protobuf."""
     fields, at = [], 0
     while at < len(data):
         key, at = _varint(data, at)
@@ -65,7 +65,7 @@ def _parts(message: Message, *numbers: int) -> Iterator[Message]:
 
 
 def _text(message: Message, number: int) -> str:
-    """Return the text of a field, the last where it stands there twice, as protobuf has it; empty where there is none."""
+    """Return the text of a field, maybe empty; of duplicates the last, as in protobuf."""
     texts = [v for n, v in message if n == number and isinstance(v, memoryview)]
     return bytes(texts[-1]).decode("utf-8", "replace") if texts else ""
 
@@ -145,6 +145,4 @@ def check_onnx(data: bytes, path: Path) -> None:
             for graph in _parts(training, *TRAINING_GRAPHS):
                 walk.graph(graph)
     except (ValueError, IndexError) as e:
-        raise DataError(
-            f"{path}: this is no ONNX model ({e}); give a file that `torch.onnx.export` or a like tool wrote"
-        ) from e
+        raise DataError(f"{path}: not an ONNX model ({e}); give a file written by `torch.onnx.export` or a similar tool") from e

@@ -1,4 +1,4 @@
-"""OpenCV on one thread and in its own code: what it then gives depends neither on the number of cores nor on Intel's IPP."""
+"""OpenCV on one thread and in its own code: results then depend neither on the number of cores nor on Intel's IPP."""
 
 from __future__ import annotations
 

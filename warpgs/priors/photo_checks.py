@@ -40,11 +40,11 @@ FINE, COARSE = 1.0, 2.0
 PATCH = 15
 """Side of the square around a match in which detail and colour are measured [px]."""
 NOISE = 0.1 / 255**2
-"""Mean square that is added to both bands of detail: less than a level of an 8-bit image tells nothing."""
+"""Mean square that is added to both bands of detail: less than a level of an 8-bit image is noise."""
 DARKEST, BRIGHTEST = 0.04, 0.94
 """Colours in [0, 1] between which brightness is compared: outside, a photograph is black or clipped."""
 REMEDY = "fix it in the camera, or try --exposure"
-"""Remedy for photographs whose colours differ."""
+"""Remedy for photographs with different colours."""
 MAX_NAMED = 6
 """Photographs that one sentence names."""
 PROGRESS_INTERVAL = 5.0
@@ -195,20 +195,20 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
     blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
     if blurred:
         notes.append(
-            f"looks blurred, by the fine detail it has of what other photographs show in the same places: "
-            f"{_listed([f'{c.name} ({c.sharpness:.2f})' for c in blurred])}; take such photographs out, or expect soft places"
+            "blurred, relative to the detail of other photographs: "
+            f"{_listed([f'{c.name} ({c.sharpness:.2f})' for c in blurred])}; remove them, or expect soft regions"
         )
     exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
     if exposed:
         factors = [f"{c.name} ({c.brightness:.2f} x as bright)" for c in exposed]
-        notes.append(f"exposure differs from that of the photographs beside it: {_listed(factors)}; {REMEDY}")
+        notes.append(f"exposure differs from neighbouring photographs: {_listed(factors)}; {REMEDY}")
     tinted = [c for c in checks if c.tinted]
     if tinted:
         factors = [f"{c.name} (red {c.channels[0]:.2f}, green {c.channels[1]:.2f}, blue {c.channels[2]:.2f} x)" for c in tinted]
-        notes.append(f"white balance differs from that of the photographs beside it: {_listed(factors)}; {REMEDY}")
+        notes.append(f"white balance differs from neighbouring photographs: {_listed(factors)}; {REMEDY}")
     alone = [c.name for c in checks if not c.compared_with]
     if alone:
-        notes.append(f"blur and exposure are unknown where too little matches the photographs beside it: {_listed(alone)}")
+        notes.append(f"blur and exposure not checked, too few matches: {_listed(alone)}")
     return notes
 
 

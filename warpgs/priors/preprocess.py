@@ -151,6 +151,6 @@ def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) 
             f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in values.items() if k in assumed
         )
         notes.append(
-            f"{network.path.name}: assumed {assumed_text}; flags --{flag}-... or {side_file(network.path).name} say otherwise"
+            f"{network.path.name}: assumed {assumed_text}; change it with --{flag}-... or {side_file(network.path).name}"
         )
     return Preprocessing(**values), notes

@@ -90,7 +90,7 @@ def boundary_weight(labels: np.ndarray) -> np.ndarray:
 
 
 def _falloff(edge: np.ndarray) -> np.ndarray:
-    """Return exp(-d^2 / 2 s^2) of the distance d to the nearest True pixel, shape [H, W]; 0 where there is none."""
+    """Return exp(-d^2 / 2 s^2) of the distance d to the nearest True pixel, shape [H, W]; 0 without one."""
     import cv2
 
     if not edge.any():

@@ -95,7 +95,7 @@ def _start(data: bytes, path: Path, provider: str, threads: int) -> InferenceSes
     try:
         session = ort.InferenceSession(data, options, providers=[PROVIDERS[provider]])
     except Exception as e:
-        raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({_line(e)}); export it anew, perhaps with an "
+        raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({_line(e)}); export it again, perhaps with an "
                         "older operator set") from e  # fmt: skip
     # onnxruntime goes on without a provider whose libraries are missing
     if PROVIDERS[provider] not in session.get_providers():

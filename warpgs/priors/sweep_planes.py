@@ -23,7 +23,7 @@ goes there, and this is half of float32's."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16
-"""Planes whose costs the GPU computes together."""
+"""Planes per launch on the GPU."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Choice of views by what they see: neighbours to compare a view with, and few views that together see most."""
+"""Choice of views by their overlap: neighbours to compare a view with, and few views that together see most."""
 
 from __future__ import annotations
 

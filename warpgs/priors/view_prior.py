@@ -39,7 +39,7 @@ class PriorConfig:
     depth_model: str | None = None
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
     depth_output: str = "auto"
-    """Meaning of its output: disparity (inverse depth), depth, or auto: what FILE.json beside it says, else disparity."""
+    """Meaning of its output: disparity (inverse depth), depth, or auto: as in FILE.json beside it, else disparity."""
     depth_size: int = 0
     """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 384."""
     depth_multiple: int = 0
@@ -93,7 +93,7 @@ def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cac
     output = None if config.depth_output == "auto" else config.depth_output
     how, messages = describe(network, {**config.flags("depth"), "output": output}, depth.DEFAULTS, "depth")
     if how.output not in ("disparity", "depth"):
-        raise DataError(f"{network.path}: described as giving {how.output}, so it is no depth network; check --depth-model")
+        raise DataError(f"{network.path}: its output is {how.output}, not depth; check --depth-model")
     notes += [f"depth: {network.title} gives {how.output}", *messages]
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
 
@@ -111,7 +111,7 @@ def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cac
 
 def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
     if depths is None:
-        notes.append("depth: none, since there is neither a network nor a depth from other views; geometry does not count")
+        notes.append("depth: none, without a network and depth from other views; geometry is not scored")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
     fractions = [float(d.valid.mean()) for d in depths]
     span = f"{min(fractions):.1%} to {max(fractions):.1%}"
@@ -138,7 +138,7 @@ def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: i
     network = open_network(config.segmentation_model, provider=config.onnx_provider, threads=threads)
     how, messages = describe(network, config.flags("segmentation"), semantics.DEFAULTS, "segmentation")
     if how.output != "classes":
-        raise DataError(f"{network.path}: described as giving {how.output}, so it is no segmentation network; check the flags")
+        raise DataError(f"{network.path}: its output is {how.output}, not a segmentation; check the flags")
     notes += [f"semantics: {network.title}, {semantics.CLASSES} classes", *messages]
     decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
 

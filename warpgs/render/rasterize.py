@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from warpgs.constants import Rule
+from warpgs.constants import K_TOLERANCE, Rule
 from warpgs.errors import ResourceError, UsageError
 from warpgs.field_docs import document_fields
 from warpgs.kernels.blend_records import WIDTHS
@@ -104,8 +104,6 @@ class RasterizeOptions:
         return self.record and self.deterministic and not extra and all(o is None for o in others)
 
 
-K_TOLERANCE = 1e-5
-"""Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""
 ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 

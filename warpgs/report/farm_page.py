@@ -39,9 +39,9 @@ class JobCard:
     ply_bytes: int = 0
     """Size of the PLY file."""
     thumbnail: str = ""
-    """Path of its image from the page; empty where there is none."""
+    """Path of its image from the page, or empty."""
     report: str = ""
-    """Path of its report from the page; empty where there is none."""
+    """Path of its report from the page, or empty."""
 
 
 def _address(path: str) -> str:

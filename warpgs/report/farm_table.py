@@ -31,7 +31,7 @@ class JobRow:
     state: str
     """waiting, running, elsewhere, done or failed."""
     step: int = 0
-    """Steps done, 0 where nobody knows."""
+    """Steps done; 0 if unknown."""
     seconds: float = 0.0
     """Time that it has taken [s]."""
     psnr: float | None = None

@@ -46,7 +46,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
         if found != sizes:
             raise ResourceError(
                 f"{path}: cannot be written; read back, {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames are "
-                "whole. The disk is full, or the encoder failed; what was there before is untouched. Free some disk space, or "
+                "whole. The disk is full, or the encoder failed; the old file is untouched. Free some disk space, or "
                 "write elsewhere"
             )
 

@@ -44,7 +44,7 @@ def image_names(views: Iterable[str]) -> dict[str, str]:
 
 
 def renaming_notes(names: dict[str, str]) -> list[str]:
-    """Return a note for the user on views whose images have other names than their own; none where there are none."""
+    """Return notes on views with other names for their images."""
     changed = [f"{view} is {name}.png" for view, name in names.items() if name != _own_name(view)]
     if not changed:
         return []
@@ -58,7 +58,7 @@ def _own_name(view: str) -> str:
 
 
 def _folded(name: str) -> str:
-    """Return what is equal for names that some file system takes for one: macOS and Windows ignore capitals."""
+    """Return a key that is equal for names that a file system may confuse: macOS and Windows ignore capitals."""
     return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
 
 

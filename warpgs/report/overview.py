@@ -49,7 +49,7 @@ def probe_rendering() -> tuple[bool, str]:
 
 
 def frusta(cameras: list[Camera], size: float) -> np.ndarray:
-    """Return line segments [S, 2, 3] of camera pyramids whose image planes lie ``size`` [u] away."""
+    """Return line segments [S, 2, 3] of camera pyramids, with image planes at distance ``size`` [u]."""
     lines = []
     for c in cameras:
         corners = np.array([[0, 0, 1], [c.width, 0, 1], [c.width, c.height, 1], [0, c.height, 1]], float)

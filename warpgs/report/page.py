@@ -83,7 +83,7 @@ class SamplingReport:
 
 @dataclass(frozen=True)
 class CoverageReport:
-    """Section of the page on what no training view saw."""
+    """Section of the page on coverage."""
 
     words: str
     """Sentences on how much that is."""
@@ -152,7 +152,7 @@ def _document(title: str, body: str) -> str:
 
 
 def _without_folders(value: object) -> object:
-    """Return JSON values whose absolute paths are cut to their last names, since a report is sent to others."""
+    """Return JSON values with absolute paths cut to their last names, since a report is sent to others."""
     if isinstance(value, dict):
         return {k: _without_folders(v) for k, v in value.items()}
     if isinstance(value, list | tuple):

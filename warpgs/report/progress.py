@@ -1,4 +1,4 @@
-"""Progress for people: what is being done now, with a bar; in a terminal in place, elsewhere as plain lines."""
+"""Progress for people: the current stage, with a bar; in a terminal in place, elsewhere as plain lines."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class _StatusLine:
         self.lock, self.display, self.task, self.stage = threading.RLock(), None, None, ""
 
     def show(self, line: str) -> None:
-        """Show a line, such as ``finding depth: view 7 of 24``; what stands before the colon names the stage."""
+        """Show a line, such as ``finding depth: view 7 of 24``; the words before the colon name the stage."""
         stage, _, detail = printable(line).rpartition(": ")
         stage, detail = (stage, detail) if stage else (detail, "")
         counted = COUNTED.search(detail)
@@ -131,7 +131,7 @@ class Stages:
             self.show(line)
 
     def clear(self) -> None:
-        """Take the line away, for as long as nothing more is told."""
+        """Remove the line until the next message."""
         if self.live:
             _STATUS.clear()
 

@@ -83,7 +83,7 @@ class Arena(Allocator):
         self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
         """Output tensors, in the order in which the function asks for them."""
         self.block = byte.new_empty(sizes.saved_bytes) if sizes.saved_bytes else None
-        """Block of the saved tensors; None where there are none."""
+        """Block of the saved tensors, or None."""
         self._workspace = byte.new_empty(sizes.workspace_bytes) if workspace is None else workspace
         self.begin()
 

@@ -19,7 +19,9 @@ def parse_bytes(text: str) -> int:
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
-        raise UsageError(f"memory limit {text[:40]!r} is no size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB")
+        raise UsageError(
+            f"memory limit {text[:40]!r} is not a size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB"
+        )
     size = float(found[1]) * units[found[2].lower()]
     if not 1 <= size < 2**63:
         raise UsageError(f"memory limit {text[:40]!r} must be at least one byte and less than 2^63")

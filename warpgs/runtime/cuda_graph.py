@@ -176,7 +176,7 @@ class GraphedFunction:
         self._places: list[tuple] = []
 
     def __call__(self, *inputs: torch.Tensor | None) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-        """Return the function's output tensors, and the block with its saved tensors (None where there are none)."""
+        """Return the function's output tensors, and the block with its saved tensors (or None)."""
         with self.graphs.lock:
             if self._sizes is None:  # a first run, which also loads kernels: that is not possible during a capture
                 sizes = SizingAllocator()

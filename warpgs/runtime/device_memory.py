@@ -104,7 +104,7 @@ def container_memory(own: Path | None = None, mount: Path | None = None) -> Memo
 
 
 def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
-    """Yield folders of memory groups with the names of what they hold: limit, use, and file pages in ``memory.stat``."""
+    """Yield folders of memory groups with the names of their files: limit, use, and file pages in ``memory.stat``."""
     rows = [row.split(":", 2) for row in _text(own).splitlines()]
     paths = {"": "/", "memory": "/"} | {c: p for _, names, p in (r for r in rows if len(r) == 3) for c in names.split(",")}
     versions = {
@@ -140,7 +140,7 @@ def _machine_or_assumed() -> Memory:
 @functools.cache
 def _say_assumed() -> None:
     say(
-        f"warpgs: this system does not say how much memory it has (psutil finds none, nor does a container set a limit); "
+        f"warpgs: the memory of this system is unknown (neither psutil nor a container reports it); "
         f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
         error=True,
     )
@@ -154,7 +154,7 @@ def _text(path: Path) -> str:
 
 
 def _number(path: Path) -> int | None:
-    """Return the number in a file; None for `max`, and where there is no such file."""
+    """Return the number in a file; None for `max` or a missing file."""
     text = _text(path).strip()
     return int(text) if text.isdecimal() else None
 

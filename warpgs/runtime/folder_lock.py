@@ -1,4 +1,4 @@
-"""Locks on folders: one process at a time writes into a run folder, and a second one is told whose it is."""
+"""Locks on folders: one process at a time writes into a run folder; a second one gets an error with the owner."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
 
 
 def _sign(file: BinaryIO) -> None:
-    """Write into a lock file who holds it; its first byte is what is locked on Windows, where no other may read that."""
+    """Write the owner into a lock file; Windows locks its first byte, and no other process may read that."""
     program = Path(sys.argv[0])
     name = program.parent.name if program.name == "__main__.py" else program.name  # of `python -m warpgs`
     command = shlex.join([name, *sys.argv[1:]])
@@ -146,7 +146,7 @@ def _holder(file: BinaryIO) -> str:
 
 
 def _signed(file: BinaryIO) -> str | None:
-    """Return who signed a lock file; None where nobody did, or not to the end."""
+    """Return who signed a lock file; None if the signature is missing or incomplete."""
     try:
         file.seek(1)
         found = schema.parse(file.read(schema.MAX_BYTES))

@@ -167,7 +167,7 @@ def _copied(struct):
 
 
 class _Recorded:
-    """A CUDA kernel whose launch is recorded once and then only patched.
+    """A CUDA kernel with a launch that is recorded once and then only patched.
 
     ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
     here take. The recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.

@@ -82,7 +82,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
         return folder.resolve(), ""
     home = cache_home()
     if home is None:
-        return None, "there is no home folder for a kernel cache"
+        return None, "no home folder for a kernel cache"
     # where Warp's appdirs would put it; Warp adds its version
     return home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",))).resolve(), ""
 

@@ -136,7 +136,7 @@ class Allowance:
         self._left, self._last = most, clock()
 
     def take(self) -> bool:
-        """Take one message; returns False where there is none left."""
+        """Take one message; returns False at the end."""
         now = self._clock()
         self._left = min(self._most, self._left + self._per_second * (now - self._last))
         self._last = now

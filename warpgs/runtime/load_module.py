@@ -18,7 +18,7 @@ _LOADED: set[tuple[wp.Module, object, int]] = set()
 """Modules that this process has loaded, with the context of the device and the threads of a block."""
 
 _LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
-"""Functions that are told of each module that has to be compiled, with the seconds that modules took."""
+"""Functions to call for each module that has to be compiled, with the seconds that modules took."""
 
 
 @contextlib.contextmanager

@@ -45,7 +45,7 @@ def _send_to_null(number: int) -> None:
 
 
 def is_gone_reader(error: BaseException | None) -> bool:
-    """Return whether a write failed because nobody reads the pipe any more, as with ``| head``."""
+    """Return whether a write failed because the pipe's reader has gone, as with ``| head``."""
     return isinstance(error, BrokenPipeError) or (
         sys.platform == "win32" and isinstance(error, OSError) and error.errno == errno.EINVAL
     )
@@ -57,7 +57,7 @@ def reason(error: BaseException) -> str:
 
 
 class CarefulStream:
-    """A text stream whose writes do not fail: the first error is kept, and what follows goes nowhere."""
+    """A text stream that never raises: the first error is kept, and later writes are dropped."""
 
     def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
         """Wrap a stream.
@@ -84,7 +84,7 @@ class CarefulStream:
         return len(text)
 
     def flush(self) -> None:
-        """Write what is buffered, if the stream takes it."""
+        """Flush the buffer, if the stream takes it."""
         try:
             if self.failure is None:
                 self.stream.flush()
@@ -127,7 +127,7 @@ def _to_stderr(line: str) -> None:
 
 
 class CarefulOutput:
-    """Streams of a command, and what became of them."""
+    """Streams of a command, and their state."""
 
     def __init__(self, stdout: CarefulStream, stderr: CarefulStream, is_product: bool):
         """Keep both, and whether what goes to stdout is all that the command is called for."""

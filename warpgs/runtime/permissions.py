@@ -1,4 +1,4 @@
-"""Permissions of folders: whether other users can change what is in them."""
+"""Permissions of folders: whether other users can change their contents."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def open_to_others(folder: Path, depth: int = 0) -> Path | None:
-    """Return the first path through which another user can change what is in a folder; None where nobody can.
+    """Return the first path through which another user can change a folder's contents, or None.
 
     On Windows nothing is checked: mode bits have no meaning there, and the folder of a user's caches is private. Root is
     trusted, as root may do anything, and so is the owner of the whole file system.

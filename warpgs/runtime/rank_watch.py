@@ -1,4 +1,4 @@
-"""Watch of each process of a fit over the others: whoever is lost ends all, with one sentence."""
+"""Watch of each process of a fit over the others: a lost rank stops all ranks with one error."""
 
 from __future__ import annotations
 

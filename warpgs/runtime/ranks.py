@@ -203,7 +203,7 @@ def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool
 
 
 def _take_gpu(rank: int, local: int) -> None:
-    """Take the GPU of a local rank; ResourceError where there is none."""
+    """Take the GPU of a local rank; ResourceError without one."""
     import torch
 
     if torch.cuda.device_count() <= local:

@@ -32,7 +32,7 @@ class StepSizes:
     masked: bool = False
     """True where a view has a mask."""
     cutout: bool = False
-    """True where views know their opacity."""
+    """True if the images have an alpha channel."""
     depth: bool = False
     """True where a loss term reads depth."""
     cuda: bool = False

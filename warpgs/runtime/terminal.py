@@ -19,7 +19,7 @@ JOINERS = "\u200c\u200d"
 
 
 class Detail(str):
-    """A note that nobody acts on: it stands in the files of a run and in its report's last section, not on the terminal."""
+    """A note without need for action: for the files of a run and its report's last section, not the terminal."""
 
     __slots__ = ()
 

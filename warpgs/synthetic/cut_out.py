@@ -42,7 +42,7 @@ Surface = Callable[..., raycast.Texture]
 
 
 def _frame(axis: np.ndarray, near: tuple[float, float, float] = (0.31, 0.23, 0.92)) -> np.ndarray:
-    """Return a rotation world_from_local [3, 3] whose local y axis points along ``axis`` [3]."""
+    """Return a rotation world_from_local [3, 3] with its local y axis along ``axis`` [3]."""
     y = np.asarray(axis, float) / np.linalg.norm(axis)
     z = np.cross(np.asarray(near), y)
     z /= np.linalg.norm(z)

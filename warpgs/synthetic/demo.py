@@ -91,7 +91,7 @@ def still_life(seed: int = 0) -> list[raycast.Shape]:
 
 
 def camera_path(views: int, width: int, height: int) -> list[Camera]:
-    """Return cameras along a wave from left to right whose crests and troughs are the training views.
+    """Return cameras along a wave from left to right; its crests and troughs are the training views.
 
     Args:
         views: Number of cameras.

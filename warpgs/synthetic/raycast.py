@@ -76,7 +76,7 @@ class Shape(abc.ABC):
 
     @property
     def radius(self) -> float:
-        """Radius of the bounding sphere around ``center`` [u]; infinite where there is none."""
+        """Radius of the bounding sphere around ``center`` [u]; infinite without one."""
         return np.inf
 
     def local(self, x: np.ndarray) -> np.ndarray:

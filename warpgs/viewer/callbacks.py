@@ -24,6 +24,6 @@ def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
         try:
             callback(*args)
         except Exception as e:  # of whatever a browser asked for; the viewer goes on
-            say(f"the viewer could not do what a browser asked for ({said(e)})", error=True)
+            say(f"the viewer could not serve a request of a browser ({said(e)})", error=True)
 
     return call

@@ -27,7 +27,7 @@ MAX_CONNECTIONS = 64
 MESSAGES_PER_SECOND = 200.0
 """Rate of messages of one browser; moving a camera sends 50 a second."""
 MAX_BURST = 2000.0
-"""Largest number of messages at once: a page that was held up sends what it has."""
+"""Largest number of messages at once: a delayed page sends a burst."""
 REFUSED = "Open the address that the viewer printed.\n"
 _HOOK = threading.Lock()
 
@@ -102,7 +102,7 @@ def connection_class(rules: Rules) -> type:
     from websockets.asyncio.server import ServerConnection
 
     class Connection(ServerConnection):
-        """A connection whose messages are checked before viser reads them."""
+        """A connection that checks messages before viser reads them."""
 
         def __init__(self, *args: Any, **named: Any):
             super().__init__(*args, **named)

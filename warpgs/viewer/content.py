@@ -24,7 +24,7 @@ from warpgs.scene import Normalization, View
 
 @dataclass(frozen=True)
 class Content:
-    """A model and what is known of it."""
+    """A model and its description."""
 
     title: str
     """Name for people: that of the folder or the file."""
@@ -37,7 +37,7 @@ class Content:
     views: Mapping[str, View] = field(default_factory=dict)
     """Views by name, with their photographs; none where the scene cannot be read."""
     sheet: Path | None = None
-    """PNG that shows where importance placed Gaussians; None where there is none."""
+    """PNG that shows where importance placed Gaussians, or None."""
 
     def saved(self, name: str) -> Path:
         """Return the path of a file that is saved from the viewer."""
@@ -96,7 +96,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
 
 
 def modified(folder: Path) -> float | None:
-    """Return when the last checkpoint of a run was written [s]; None where there is none yet."""
+    """Return when the last checkpoint of a run was written [s]; None without one."""
     try:
         return (folder / TENSORS).stat().st_mtime
     except OSError:

@@ -112,7 +112,7 @@ def read_frame(frame: bytes | str) -> dict[str, Any]:
 
 
 def write_frame(message: Mapping[str, Any]) -> bytes:
-    """Return a message as a frame: viser reads what was checked, and nothing else."""
+    """Return a message as a frame: viser reads checked messages only."""
     import msgspec
 
     return bytes(msgspec.msgpack.encode(message))

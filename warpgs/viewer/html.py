@@ -32,7 +32,7 @@ POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "
     "img-src data: blob:; font-src data:; worker-src blob: data:; connect-src data: blob:; base-uri 'none'; form-action 'none'"
 )
-"""Content security policy of the page: it may use what is in it, and ask nobody for anything."""
+"""Content security policy of the page: it may use its own contents, and request nothing."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
@@ -95,7 +95,7 @@ def page_of(
     head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
     head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
-    notes = ["the page shows colours of degree 0: those that change with the direction stay in the run and in its PLY"]
+    notes = ["the page shows colours without view dependence; the run and its PLY keep them"]
     if gaussians.sh_degree == 0:
         notes.clear()
     if stored.shortened:

@@ -25,7 +25,7 @@ MAPS = {
     COVERAGE: "striped magenta: no training view saw it; amber: one did",
     ERROR: "difference from the photograph, at a camera that you stepped into; brightest from 0.3",
 }
-"""Images by name, with what they show."""
+"""Images by name, with their descriptions."""
 NEAR = 1e-3
 """Distance from a camera within which a view stands at it, as a fraction of the cameras' extent."""
 

@@ -1,4 +1,4 @@
-"""The panel of the viewer: what is shown, stepping into cameras, the crop box, and keyframes of a path."""
+"""The panel of the viewer: the image shown, stepping into cameras, the crop box, and keyframes of a path."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Shown(Protocol):
     """The window, as the panel uses it."""
 
     def redraw(self) -> None:
-        """Send what is to be seen now."""
+        """Send the current image."""
 
     def step_into(self, name: str, client: Any) -> None:
         """Move a browser's camera to one of the model."""
@@ -68,7 +68,7 @@ class Panel:
         self.tell(content)
 
     def kind(self) -> str:
-        """Return what is to be shown: `GAUSSIANS` or one of `MAPS`."""
+        """Return the choice of image: `GAUSSIANS` or one of `MAPS`."""
         return str(self._kind.value)
 
     def sh_degree(self) -> int:
@@ -91,7 +91,7 @@ class Panel:
         return CropBox(np.asarray(self._gizmo.position, np.float64), size, rotation_matrices(np.asarray(self._gizmo.wxyz)))
 
     def tell(self, content: Content) -> None:
-        """Write what is shown now."""
+        """Write the current image."""
         self.content = content
         model = content.model
         parts = [f"{len(model.gaussians()):,} Gaussians"]
@@ -156,7 +156,7 @@ class Panel:
         def store(_: Any) -> None:
             box = self.crop_box()
             if box is None:
-                return self.explain("there is no crop box yet: tick crop, and move the box")
+                return self.explain("no crop box yet: tick crop, and move the box")
             self._save(CROP, box.to_json(self.content.model.normalization))
 
         save.on_click(guarded(store))
@@ -193,7 +193,7 @@ class Panel:
         )
 
     def _save(self, name: str, values: Any) -> None:
-        """Write a file beside what is shown, and say where it is."""
+        """Write a file beside the model, and show its path."""
         path = self.content.saved(name)
         remove_leftovers(path.parent)
         try:

@@ -1,4 +1,4 @@
-"""The viewer's server: viser's, bound to this machine alone, without tunnels, and open to whoever knows its address."""
+"""The viewer's server: viser's, bound to this machine alone, without tunnels, and open to all who know its address."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import viser
 
 PORT = 8080
-"""Port where none is asked for."""
+"""Default port."""
 REMEDY = 'install the extra: pip install "warpgs[view]"'
 OTHER_PORT = "give another with --port (fit: --view-port), or 0 for any free one"
 
@@ -64,7 +64,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
         rules: Rules
 
         def request_share_url(self, verbose: bool = True) -> None:
-            """Refuse to open a tunnel to the world, whoever asks."""
+            """Refuse to open a tunnel to the world."""
 
     rules, bound = Rules(), loopback_socket(port, OTHER_PORT)
     port = bound.getsockname()[1]

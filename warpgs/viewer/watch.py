@@ -94,7 +94,7 @@ def _pause() -> None:
 
 
 def _update(window: Window, path: Path, device: str) -> None:
-    """Show the newest checkpoint; one that cannot be read is said, and the one before stays."""
+    """Show the newest checkpoint; report an unreadable one and keep the one before."""
     try:
         window.show(content_of_run(path, device, window.content.views))
     except WarpgsError as e:
@@ -171,7 +171,7 @@ def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
     """
     server = open_server(port)
     try:
-        say(f"the fit can be seen at {address(server)} while it goes on; `warpgs view {folder}` shows it afterwards")
+        say(f"watch the fit at {address(server)}; afterwards run `warpgs view {folder}`")
         live = LiveView(server, folder.resolve().name, folder)
         try:
             yield live

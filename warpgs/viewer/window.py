@@ -78,7 +78,7 @@ class Window:
             self.redraw()
 
     def close(self) -> None:
-        """End the rendering of images; the server is stopped by whoever started it."""
+        """End the rendering of images; its owner stops the server."""
         self._open = False
         self._wake.set()
         self._thread.join(timeout=10)
@@ -95,7 +95,7 @@ class Window:
         return Gaussians(**{n: t.detach()[keep] for n, t in gaussians.tensors().items()})
 
     def redraw(self) -> None:
-        """Send what is to be seen now to the browsers: the Gaussians, or images at each browser's camera."""
+        """Send the current view to the browsers: the Gaussians, or images at each browser's camera."""
         with self._lock, self.server.atomic():
             if self.panel.kind() == GAUSSIANS:
                 s = packed(self.shown())
@@ -125,7 +125,7 @@ class Window:
             self._frusta[name] = frustum
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or all of them where none is given, to a camera of the model, with its field of view."""
+        """Move a browser's camera, or by default all, to a camera of the model, with its field of view."""
         camera = self.content.model.scene_cameras[name]
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = distance_ahead(camera, self.content.model.gaussians())
@@ -159,7 +159,7 @@ class Window:
                 frustum.visible = not frustum.visible
 
     def _render_maps(self) -> None:
-        """Render an image for each browser whose camera or wishes changed, until the window is closed."""
+        """Render an image for each browser after a change of its camera or choices, until the window is closed."""
         while self._open:
             self._wake.wait()
             self._wake.clear()

@@ -42,7 +42,7 @@ def run(arguments: list[str], about: str) -> int:
     if a.format not in ("transforms", "colmap"):
         raise UsageError(f"--format must be transforms or colmap, not {a.format!r}")
     if a.format != "colmap" and not a.object and word_after(arguments, "--format") is not None:
-        raise UsageError("--format is of --object: the still life is written as COLMAP; add --object, or leave it out")
+        raise UsageError("--format requires --object: the still life is always written as COLMAP")
     size = {"views": a.views, "width": a.width, "height": a.height, "seed": a.seed}
     if a.object:
         from warpgs.synthetic.cut_out import write_object

@@ -1,4 +1,4 @@
-"""`warpgs doctor`: say what this machine has. Parses, calls, prints; no logic."""
+"""`warpgs doctor`: check this machine. Parses, calls, prints; no logic."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,15 +20,15 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Doctor:
         warm: bool = False
-        """Instead, compile all kernels that a fit uses on this machine's devices, so that none waits for it."""
+        """Instead, compile all kernels of a fit for this machine's devices."""
         repeat: Path | None = None
-        """Instead, compute a step again whose loss was not finite, and say what is not: not_finite.safetensors of a run."""
+        """Instead, repeat a step with a non-finite loss and name the values: not_finite.safetensors of a run."""
         device: str = "auto"
         """Device for --repeat: auto, cpu or cuda."""
 
     a = parse_flags(Doctor, arguments, "warpgs doctor", about)
     if a.repeat is None and a.device != "auto":
-        raise UsageError("--device is of --repeat: leave it out, or name the step to compute again")
+        raise UsageError("--device requires --repeat")
     if a.repeat is not None:
         from warpgs.pipeline.runs.commands import repeat_failed_step
 
@@ -43,7 +43,7 @@ def run(arguments: list[str], about: str) -> int:
     from warpgs.app.doctor import diagnose, print_report
 
     stages = Stages()
-    stages("looking at this machine")
+    stages("checking this machine")
     with fast_imports():
         findings = diagnose(waiting())
     stages.clear()

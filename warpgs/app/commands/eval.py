@@ -22,7 +22,7 @@ def run(arguments: list[str], about: str) -> int:
         reader: str | None = None
         """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
         by_coverage: bool = False
-        """Split the scores by how many training views saw what a pixel shows: none, one, two or more."""
+        """Split the scores by the number of training views that saw each pixel's surface: none, one, two or more."""
 
     a = parse_flags(Eval, arguments, "warpgs eval", about)
     from warpgs.pipeline.runs.commands import evaluate

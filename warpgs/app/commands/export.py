@@ -20,8 +20,8 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`."""
         to: Path
-        """File to write; its suffix says the format, or it is .html for a page that shows the model in any browser. Its cameras
-        instead: cameras.json, transforms.json, or sparse (COLMAP)."""
+        """File to write; its suffix chooses the format, or .html: a page that shows the model in any browser. For cameras:
+        cameras.json, transforms.json, or sparse (COLMAP)."""
 
     a = parse_flags(Export, arguments, "warpgs export", f"{about}\n\n{format_lines()}")
     formats, filters = chosen_formats(a, a.to), filters_of(a)

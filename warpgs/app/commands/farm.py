@@ -9,9 +9,9 @@ from warpgs.app.flags import parse_flags
 from warpgs.errors import UsageError
 from warpgs.pipeline.farm.listing import FARM_FLAGS, ListedJob
 
-OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-folder", "out", "help")
+OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-folder", "out", "help", "help-all")
 """Flags of the farm itself; all others are those of `warpgs fit`."""
-SWITCHES = ("help",)
+SWITCHES = ("help", "help-all")
 """Flags of these that take no value."""
 
 
@@ -26,14 +26,14 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True, kw_only=True)
     class Farm:
         jobs: tyro.conf.Positional[str]
-        """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} a line, with any flags of
-        `warpgs fit`. Named before switches of `warpgs fit`, such as --strict."""
+        """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} per line, with any flags of
+        `warpgs fit`. Place it before switches of `warpgs fit`, such as --strict."""
         out: Path
-        """Folder of the results; the same command on it goes on where it stopped, several at once share the work."""
+        """Folder of the results. Repeat the command to continue; several at once share the work."""
         engine: str = "local"
         """local (processes of this machine), ray or slurm."""
         slots: int | None = None
-        """Jobs at a time; where not given, one for each GPU times --per-gpu, one on a CPU, or what the cluster has."""
+        """Jobs at a time. Default: one for each GPU times --per-gpu; one on a CPU; all of a cluster."""
         per_gpu: int = 1
         """Jobs that share a GPU."""
         threads: int = 1
@@ -43,9 +43,9 @@ def run(arguments: list[str], about: str) -> int:
         partition: str | None = None
         """Slurm's partition."""
         slurm_folder: Path | None = None
-        """Folder for slurm's job files, private and seen by all nodes; where not given, ~/.cache/warpgs/slurm."""
+        """Folder for slurm's job files, private and visible to all nodes. Default: ~/.cache/warpgs/slurm."""
 
-    more = "All flags of `warpgs fit` but those of one run hold for every job: --preset, --split, --steps, --device, ..."
+    more = "Flags of `warpgs fit` apply to every job: --preset, --split, --steps, --device, ..."
     a = parse_flags(Farm, own, "warpgs farm", f"{about}\n\n{more}")
     from warpgs.pipeline.farm.listing import list_jobs
 
@@ -69,7 +69,7 @@ def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
             target = own
             continue
         if name in FARM_FLAGS and name not in (*OWN, "device", "allow-outside"):
-            raise UsageError(f"--{name} is of one fit alone: leave it out of a farm")
+            raise UsageError(f"--{name} is not supported by farm; leave it out")
         group = own if name in OWN else shared
         group.append(word)
         target = own if given or name in SWITCHES else group

@@ -160,7 +160,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     taken = {f.name for kind in kinds for f in dataclasses.fields(kind)} | {"config", "reading"}
     for name, settings in [*own.items(), *terms.items(), *modules.items()]:
         if name in taken:
-            raise UsageError(f"a plug-in has the name {name}, whose flags --{name} there are already; call it something else")
+            raise UsageError(f"the plug-in name {name} is taken by a flag of warpgs; rename the plug-in")
         taken.add(name)
         group, default = flags_of(type(settings), settings)
         fields.append((f"{name}_settings", Annotated[group, tyro.conf.arg(name=name)], field(default=default)))
@@ -232,7 +232,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
     if a.threads:
         set_threads(a.threads)
     request = stored_request(a.out)
-    say(f"continued as it was started: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    say(f"continuing as before: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
     device, view_port = a.device or request.device, a.view_port if a.view else None
     return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 
@@ -245,7 +245,6 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     """
     if _names_a_run_alone(arguments):
         return _continued(arguments, about)
-    arguments = ["--help" if word == "--help-all" else word for word in arguments]  # tyro has one help, that of all flags
     base, origin = _preset(arguments)
     parts = _parts(LOSS_TERMS, "--loss-terms", arguments, base.loss_terms), _view_modules(arguments, base)
     a: Any = parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")

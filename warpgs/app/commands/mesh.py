@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
         voxel: float | None = None
         """Side of a voxel, in units of the scene's files; smaller ones show more detail and more noise."""
         resolution: int | None = None
-        """Voxels along the longest side, instead; 256 where neither is given, or fewer where the images show no more."""
+        """Voxels along the longest side, instead of --voxel. Default: 256, or fewer for small images."""
         max_faces: int = 200_000
         """Most triangles; a mesh of more is simplified."""
         depth: str = "median"

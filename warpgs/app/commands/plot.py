@@ -16,7 +16,7 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`."""
         out: Path | None = None
-        """PNG file to write; plot.png in the run folder where not given."""
+        """PNG file to write. Default: plot.png in the run folder."""
         points: str = "gaussians"
         """gaussians, or start (the points of the scene's reconstruction)."""
         color: str = "own"

@@ -21,7 +21,7 @@ def run(arguments: list[str], about: str) -> int:
         out: Path
         """Scene folder to make; must not exist yet."""
         frames: int = FRAMES
-        """Frames that are taken of a video, evenly spaced and sharp."""
+        """Frames to take from a video, evenly spaced and sharp."""
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         max_pixels: int = MAX_PIXELS
@@ -42,6 +42,6 @@ def run(arguments: list[str], about: str) -> int:
     )  # fmt: skip
     for line in report_lines(record):
         say(line)
-    say(f"{a.out}: a COLMAP scene; what is above also stands in {a.out / TEXT}")
+    say(f"{a.out}: a COLMAP scene; the lines above are also in {a.out / TEXT}")
     say(f"next: warpgs fit {a.out} --out run")
     return 0

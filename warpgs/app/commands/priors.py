@@ -1,4 +1,4 @@
-"""`warpgs priors`: look at what is known before a fit, or write networks as ONNX. Parses, calls, prints; no logic."""
+"""`warpgs priors`: show depth and saliency before a fit, or write networks as ONNX. Parses, calls, prints; no logic."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
             say("usage: warpgs priors show SCENE --out DIR [flags]")
             say("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
             return 0
-        raise UsageError("priors: say show or export; `warpgs priors show --help` lists flags")
+        raise UsageError("priors: give show or export; `warpgs priors show --help` lists flags")
     return kinds[arguments[0]](arguments[1:], about)
 
 
@@ -39,7 +39,7 @@ def _show(arguments: list[str], about: str) -> int:
         split: str | None = None
         """As for `warpgs fit`."""
         downscale: int | None = None
-        """Factor by which both image sides shrink; with it, images keep what it leaves of them."""
+        """Factor by which both image sides shrink; without --max-side there is then no limit."""
         max_side: int | None = None
         """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
         allow_outside: bool = False
@@ -49,7 +49,7 @@ def _show(arguments: list[str], about: str) -> int:
         threads: int = 0
         """CPU threads of the networks; 0 for as many as there are cores."""
         source: str = "sweep"
-        """How depth is found in the other views where no depth network is named: sweep or flow, as --init.source of a fit."""
+        """Method that finds depth without a network: sweep or flow, as --init.source of a fit."""
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
     a = parse_flags(Show, arguments, "warpgs priors show", about)
@@ -74,7 +74,7 @@ def _export(arguments: list[str], about: str) -> int:
     class Export:
         request: tyro.conf.OmitArgPrefixes[ExportRequest]
         out: Path
-        """ONNX file to write; FILE.onnx.json beside it says how to feed it."""
+        """ONNX file to write; FILE.onnx.json beside it describes its input."""
 
     a = parse_flags(Export, arguments, "warpgs priors export", about)
     from warpgs.priors.export import export_network

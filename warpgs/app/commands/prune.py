@@ -18,7 +18,7 @@ def run(arguments: list[str], about: str) -> int:
         keep_psnr: float = 0.1
         """PSNR that the mean over the training views may fall by [dB]."""
         out: Path | None = None
-        """Run folder to write; RUN-pruned where not given; must not exist yet."""
+        """Run folder to write; must not exist yet. Default: RUN-pruned."""
         device: str = "auto"
         """auto, cpu or cuda."""
         reader: str | None = None

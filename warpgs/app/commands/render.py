@@ -21,32 +21,32 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`, or a file of Gaussians trained anywhere, in a format of `warpgs convert`."""
         cameras: Path | None = None
-        """Cameras that a file of Gaussians is seen through: cameras.json, transforms.json, COLMAP's folder, or a scene."""
+        """Cameras for a file of Gaussians: cameras.json, transforms.json, COLMAP's folder, or a scene."""
         rule: str | None = None
-        """Cut-offs that a file of Gaussians was trained with: inria, gsplat-1.6, gsplat-1.5 or exact. inria where not given."""
+        """Cut-offs that a file of Gaussians was trained with: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         path: str = "auto"
-        """auto (what suits how the photographs were taken), turntable, spiral, interpolate (through the training views), views
+        """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
-        """Folder for the images and film.mp4; or a film alone: .mp4, .webm, .webp or .gif. RUN/path-PATH where not given."""
+        """Folder for the images and film.mp4; or a film alone: .mp4, .webm, .webp or .gif. Default: RUN/path-PATH."""
         seconds: float | None = None
-        """Duration of the film [s]; what suits the path where not given."""
+        """Duration of the film [s]. Default: chosen by the path."""
         fps: int = 30
         """Frames per second of the film."""
         frames: int | None = None
-        """Number of frames; seconds times fps where not given."""
+        """Number of frames. Default: seconds times fps."""
         size: tuple[int, int] | None = None
-        """Width and height of the frames [px]; those of the photographs where not given."""
+        """Width and height of the frames [px]. Default: those of the photographs."""
         fov: float | None = None
-        """Vertical field of view [deg]; that of the photographs where not given."""
+        """Vertical field of view [deg]. Default: that of the photographs."""
         background: str = "auto"
         """auto (that of the fit; images of objects cut out are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
         sheet: bool = False
-        """Write six frames in one image, too: sheet.png."""
+        """Also write six frames in one image: sheet.png."""
         device: str = "auto"
         """auto, cpu or cuda."""
         coverage: bool = False
-        """Write images of what no training view saw, too, into the subfolder coverage."""
+        """Also write images of the coverage by training views, into the subfolder coverage."""
 
     a = parse_flags(Render, arguments, "warpgs render", about)
     check_range("--fps", a.fps, 1, 1000)

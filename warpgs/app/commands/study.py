@@ -1,4 +1,4 @@
-"""`warpgs compare` and `warpgs ablate`: what they share. Parses, calls, prints; no logic."""
+"""`warpgs compare` and `warpgs ablate`: their common part. Parses, calls, prints; no logic."""
 
 from dataclasses import dataclass, field, make_dataclass
 from pathlib import Path
@@ -20,16 +20,15 @@ def study_flags() -> type:
         scenes: tyro.conf.Positional[tuple[Path, ...]]
         """Scene folders."""
         out: Path
-        """Folder of the study; the same command on it goes on where it stopped."""
+        """Folder of the study; repeat the command to continue a study that stopped."""
         seeds: int = 5
         """Runs of each setting on each scene, seeds 0, 1, ..."""
         steps: int | None = None
-        """Optimisation steps of every run; as in `warpgs fit` where not given."""
+        """Optimisation steps of every run. Default: as in `warpgs fit`."""
         device: str = "auto"
         """auto, cpu or cuda."""
         slots: int | None = None
-        """Runs at a time, each in a process of its own as `warpgs farm` has it; where neither this nor --per-gpu is given, they
-        run one after another in this one."""
+        """Runs at a time, each in a process of its own. Without this and --per-gpu, runs follow each other in one process."""
         per_gpu: int | None = None
         """Runs that share a GPU."""
         lpips_weights: Path | None = None

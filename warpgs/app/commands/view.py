@@ -12,12 +12,12 @@ def run(arguments: list[str], about: str) -> int:
 
     @dataclass(frozen=True)
     class View:
-        what: tyro.conf.Positional[Path]
+        run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`, also while it goes on; or a file of Gaussians, in a format of `warpgs convert`."""
         port: int = 8080
-        """Port that this machine's browser finds the viewer at; 0 for any free one."""
+        """Port of the viewer on this machine; 0 for any free one."""
         device: str = "auto"
-        """auto, cpu or cuda: what renders depth, coverage and error."""
+        """Device that renders depth, coverage and error: auto, cpu or cuda."""
         reader: str | None = None
         """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
 
@@ -25,5 +25,5 @@ def run(arguments: list[str], about: str) -> int:
     check_range("--port", a.port, 0, 65535)
     from warpgs.viewer.watch import view
 
-    view(a.what, a.port, a.device, a.reader)
+    view(a.run, a.port, a.device, a.reader)
     return 0

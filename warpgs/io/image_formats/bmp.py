@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 OLD_HEADER = 12
-"""Bytes of the header of OS/2, whose sides have 16 bits."""
+"""Bytes of the header of OS/2, with sides of 16 bits."""
 RAW, MASKED = 0, (3, 6)
 """Ways to store pixels: as they are, and with masks that say which bits are which colour."""
 

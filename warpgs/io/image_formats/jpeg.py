@@ -35,7 +35,7 @@ def segments(data: bytes) -> Iterator[tuple[int, bytes]]:
     while True:
         found = MARKER.match(data, at)
         if found is None:
-            raise ValueError("it ends early" if at >= len(data) - 1 else f"there is no marker at byte {at}")
+            raise ValueError("it ends early" if at >= len(data) - 1 else f"no marker at byte {at}")
         marker, at = found[1][0], found.end()
         if marker == EOI:
             return

@@ -16,7 +16,7 @@ FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
     (b"MM\0+", "TIFF", tiff),
     (b"RIFF", "WEBP", webp),
 )
-"""First bytes, name as Pillow has it, and module of each format that is read; AVIF is told by its brand."""
+"""First bytes, Pillow's name, and module of each supported format; AVIF is recognised by its brand."""
 READ = "JPEG, PNG, BMP, TIFF, WebP or AVIF"
 """The formats that are read, for messages."""
 
@@ -32,4 +32,4 @@ def format_of(data: bytes) -> tuple[str, ModuleType]:
             return name, module
     if avif.kind(data) == "AVIF":
         return "AVIF", avif
-    raise ValueError(f"it is no {READ} file" if data else "it is empty")
+    raise ValueError(f"it is not a {READ} file" if data else "it is empty")

@@ -1,4 +1,4 @@
-"""PNG: the checksum of every chunk, and that of the compressed pixels, whose number must be what the header says."""
+"""PNG: the checksum of every chunk, and that of the compressed pixels; their number must match the header."""
 
 from __future__ import annotations
 
@@ -103,4 +103,4 @@ def check(data: bytes) -> None:
     parts = list(chunks(data))
     expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)
     if unpacked_size((body for kind, body in parts if kind == b"IDAT"), expected) != expected:
-        raise ValueError("it holds another number of pixels than its header says")
+        raise ValueError("it holds another number of pixels than its header gives")

@@ -24,7 +24,7 @@ READ = (
     WIDTH, HEIGHT, BITS, COMPRESSION, CHANNELS, PLANES, ROWS, OFFSETS, COUNTS, TILE_WIDTH, TILE_HEIGHT, TILE_OFFSETS,
     TILE_COUNTS, PHOTOMETRIC,
 )  # fmt: skip
-"""Tags whose values are read here."""
+"""Tags that are read here."""
 RAW, DEFLATE = 1, (8, 32946)
 MAX_ENTRIES = 4096
 """Largest number of tags in a directory."""

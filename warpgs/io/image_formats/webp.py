@@ -16,7 +16,7 @@ def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
         ValueError: It is no WebP file, or ends within a chunk.
     """
     if len(data) < 20 or data[8:12] != b"WEBP":
-        raise ValueError("it is no WebP file")
+        raise ValueError("it is not a WebP file")
     view = memoryview(data)
     end, at = 8 + struct.unpack_from("<I", data, 4)[0], 12
     if end > len(data):

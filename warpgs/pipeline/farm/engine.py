@@ -19,7 +19,7 @@ class Event:
     message: str = ""
     """Reason of a crash."""
     step: int = 0
-    """Steps done, 0 where nobody knows."""
+    """Steps done; 0 if unknown."""
 
 
 class Engine(Protocol):
@@ -34,7 +34,7 @@ class Engine(Protocol):
         """Start a job; called while fewer than `slots` run."""
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return news; waits so long where there is none."""
+        """Return news; waits up to this time."""
 
     def close(self) -> None:
         """End all that runs. A fit saves its state where it can, and is continued by the next farm."""

@@ -37,7 +37,7 @@ class Outcome:
 
 
 def _scores(path: Path) -> dict[str, Any] | None:
-    """Read metrics.json or eval.json; None where there is none or it is not whole."""
+    """Read metrics.json or eval.json; None if it is missing or incomplete."""
     try:
         value: dict[str, Any] = schema.read(path, path.parent)
         METRICS(value, "")
@@ -137,7 +137,7 @@ def _outcome(
         # the report is what a fit writes last
         metrics = _scores(folder / "metrics.json") if (folder / "report.html").is_file() else None
         if gap:
-            note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and done anew"
+            note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and fitted again"
             state = "redone"
         elif metrics is not None:
             if (folder / LOCK).exists():  # of a fit that was killed after its last file, with what else it left
@@ -151,7 +151,7 @@ def _outcome(
         else:
             resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
     elif os.path.exists(folder) and not is_empty(folder):
-        note = f"what was there {why}; moved to {_set_aside(folder).name} and done anew"
+        note = f"old results: {why}; moved to {_set_aside(folder).name} and fitted again"
         state = "redone"
 
     def fit(go_on: bool) -> dict[str, Any]:
@@ -163,7 +163,7 @@ def _outcome(
         except (DataError, UsageError) as e:
             if not resume:
                 raise
-            note = f"was half done and could not be continued ({e}); moved to {_set_aside(folder).name} and done anew"
+            note = f"could not be continued ({e}); moved to {_set_aside(folder).name} and fitted again"
             return Outcome("redone", fit(False), note)
     except WarpgsError as e:
         return Outcome("failed", None, f"{note + '; ' if note else ''}failed: {e}", e)

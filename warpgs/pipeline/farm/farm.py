@@ -1,4 +1,4 @@
-"""The farm: gives jobs to an engine, tries again what crashed, skips what is finished, and shares work with other farms."""
+"""The farm: gives jobs to an engine, retries crashed jobs, skips finished ones, and shares work with other farms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class JobStatus:
     state: str = "waiting"
     """waiting, running, elsewhere (another farm works on it), done or failed."""
     step: int = 0
-    """Steps done, 0 where nobody knows."""
+    """Steps done; 0 if unknown."""
     attempts: int = 0
     """Times that it was started here."""
     seconds: float = 0.0

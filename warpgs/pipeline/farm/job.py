@@ -28,7 +28,7 @@ class FarmJob:
     folder: Path
     """Folder of the job's record, log and thumbnail, which is locked while a farm works on it."""
     results: Path | None = None
-    """Folder of all results, above ``folder``: below it no link is followed; None where there is no other than ``folder``."""
+    """Folder of all results, above ``folder``: below it no link is followed; None if it is ``folder``."""
 
     def identity(self) -> str:
         """Return the first 16 hexadecimal digits of the SHA-256 of all that the result depends on but the images."""

@@ -50,14 +50,14 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     path = Path(jobs)
     if path.is_dir():
         if any(r.probe(path) is not None for r in all_readers()):
-            raise UsageError(f"{jobs} is one scene: fit it with `warpgs fit`, or give the folder above it")
+            raise UsageError(f"{jobs} is a single scene: fit it with `warpgs fit`, or give its parent folder")
         found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
     elif path.suffix == ".jsonl":
         found = _read(path)
     else:
         found = _named(sorted(Path(p) for p in glob.glob(jobs)))
     if not found:
-        raise UsageError(f"{jobs}: there is no scene; give a folder of scenes, a glob in quotes, or a .jsonl file")
+        raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
     taken: dict[str, ListedJob] = {}
     for job in found:
         if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:

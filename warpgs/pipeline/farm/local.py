@@ -121,7 +121,7 @@ class LocalEngine:
             code, errors = process.worker.end(0)
             raise ResourceError(
                 f"kernels could not be compiled: the process ended with {code}; {errors.splitlines()[-1:] or ['no word']}. "
-                "`warpgs doctor` says what this machine lacks"
+                "run `warpgs doctor` to check this machine"
             )
 
     def workers(self) -> dict[str, int]:

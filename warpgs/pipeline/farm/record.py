@@ -1,4 +1,4 @@
-"""The record of a job: job.json in its folder says what became of it, with checksums by which it is known to be whole."""
+"""The record of a job: job.json in its folder holds its state, and checksums that show that it is complete."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOG = "log.txt"
 THUMBNAIL = "thumbnail.jpg"
 PLY = "point_cloud.ply"
 CHECKED = (PLY, "metrics.json", CONFIG)
-"""Files of a run whose checksums the record holds."""
+"""Files of a run with a checksum in the record."""
 FORMAT = 1
 MOST_FILES = 100_000
 """Files, and folders, of a scene that are listed; one with more is read by the fit to know whether it is the same."""
@@ -56,7 +56,7 @@ class JobRecord:
     again: bool = False
     """True where a failed job may succeed when it is tried again."""
     source: str = ""
-    """SHA-256 of the scene's file names, sizes and times; empty where nobody knows them."""
+    """SHA-256 of the scene's file names, sizes and times; empty if unknown."""
     seconds: float = 0.0
     """Wall time of the job, reading and scores included [s]."""
     psnr: float | None = None
@@ -84,7 +84,7 @@ def write_record(folder: Path, record: JobRecord) -> None:
 
 
 def read_record(folder: Path) -> JobRecord | None:
-    """Read the record of a job; None where there is none, or it is not whole."""
+    """Read the record of a job; None if it is missing or incomplete."""
     try:
         values = schema.read(folder / RECORD, folder)
         _SCHEMA(values, "")

@@ -107,7 +107,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
             write_index(results, statuses, time.monotonic() - began)
             return statuses
     except KeyboardInterrupt:
-        say("the same command goes on from here: finished jobs are kept, half-finished ones are continued")
+        say("repeat the command to continue: finished jobs are kept, interrupted ones continue")
         raise
     finally:
         engine.close()

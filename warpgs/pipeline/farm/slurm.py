@@ -187,5 +187,5 @@ def _call(program: str, *options: str, script: str = "") -> ProgramResult:
 
 
 def _last_line(text: str) -> str:
-    """Return the last line that is not empty; empty where there is none."""
+    """Return the last line that is not empty, or an empty text."""
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")

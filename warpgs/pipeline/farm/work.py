@@ -142,7 +142,7 @@ def _wanted(request: FitRequest, device: str) -> tuple[str, Split | None, FitCon
 
 
 def _with_results(job: FarmJob, record: JobRecord, metrics: dict[str, Any]) -> JobRecord:
-    """Return a record with the figures and checksums of a finished run, whose thumbnail is written."""
+    """Write the thumbnail of a finished run; return a record with its figures and checksums."""
     out, test = job.request.out, metrics["test"]
     write_thumbnail(out / "renders", job.folder / THUMBNAIL)
     return replace(
@@ -152,7 +152,7 @@ def _with_results(job: FarmJob, record: JobRecord, metrics: dict[str, Any]) -> J
 
 
 def write_thumbnail(renders: Path, path: Path) -> None:
-    """Write the first render of a run beside its photograph, as a small JPEG; nothing where there is no render."""
+    """Write the first render of a run, if any, beside its photograph, as a small JPEG."""
     import cv2
 
     first = min(renders.glob("*.png"), default=None)

@@ -1,1 +1,1 @@
-"""Films: paths of cameras, what they show, and the files they become."""
+"""Films: paths of cameras, their contents, and their files."""

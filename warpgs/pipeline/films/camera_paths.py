@@ -15,7 +15,7 @@ from warpgs.scene import Camera
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
 """Path of each kind of rig where none was asked for."""
 SWING = 0.9
-"""Fraction of the cameras' range that a film swings through: at its ends fewer views saw what comes into the frame."""
+"""Fraction of the cameras' range that a film swings through: coverage is lower at its ends."""
 MAX_ELEVATION = math.radians(80)
 """Largest elevation of a film: above it, the upward direction is lost."""
 LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
@@ -53,7 +53,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
 
 
 def upright(rig: Rig, camera: Camera) -> Camera:
-    """Return a camera with its centre and axis turned upright, for a rig whose photographs lie on their side."""
+    """Return a camera with its centre and axis turned upright, for photographs that lie on their side."""
     if not rig.turned:
         return camera
     pose = look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)

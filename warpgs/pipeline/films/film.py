@@ -43,7 +43,7 @@ def _training_depths(model: FittedModel, views: bool | Sequence[View], options: 
 
 
 def _covered(image: np.ndarray, render: Render, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
-    """Return the PNG of an image [H, W, 3] that shows what no training view saw, and what one saw."""
+    """Return the PNG of an image [H, W, 3] that marks regions seen by no training view, and by one."""
     seen = coverage_map(torch.where(render.alpha >= MIN_ALPHA, render.depth, 0), camera, training)
     classes = classes_of(seen, cut_out)
     return png(coverage_image(image, classes["0"], classes["1"]))
@@ -56,7 +56,7 @@ class RenderedPath:
     files: list[Path]
     """A PNG for each camera in order, unless only a film was asked for; then the film, if any."""
     notes: list[str]
-    """Lines for the user on what was chosen, and on frames that show nothing."""
+    """Lines for the user: choices made, and frames that show nothing."""
 
 
 def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple[bool, bool]:
@@ -66,10 +66,10 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
         UsageError: There is no camera, or something was asked for that cannot be made of these frames or put into that place.
     """
     if not plan.cameras:
-        raise UsageError("there is no camera to render; give at least one")
+        raise UsageError("no camera to render; give at least one")
     alone = out.suffix.lower() in SUFFIXES
     if not alone and out.suffix and not out.is_dir():
-        raise UsageError(f"{out}: a film is one of {', '.join(SUFFIXES)}; for images give a folder, whose name has no suffix")
+        raise UsageError(f"{out}: unknown film suffix; use {', '.join(SUFFIXES)}, or a folder without a suffix for images")
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
         raise UsageError(f"{out}: the views differ in size, and a film or a sheet has one; give a size for all, or a folder")
@@ -97,7 +97,7 @@ def _renders(
 
 
 def _older_images(folder: Path, files: list[Path]) -> list[str]:
-    """Return a note on images of an earlier film that lie between those of this one; an empty list where there are none."""
+    """Return notes on images of an earlier film that lie between those of this one."""
     older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
     return [f"{len(older)} older images lie in {folder}, too: remove them, or give a new folder"] if older else []
 
@@ -212,7 +212,7 @@ def render_path(
         plan = plan_film(model, path, settings)
     else:
         own = [(f"{i:04d}", convert_camera(c, model.normalization, units, "scene")) for i, c in enumerate(path)]
-        plan = FilmPlan(own, 0.0, "look at the poses and the units of the cameras", [])
+        plan = FilmPlan(own, 0.0, "check the poses and the units of the cameras", [])
     done = render_film(model, plan, Path(out), settings, coverage=coverage)
     for note in done.notes:
         say(f"warpgs: {note}", error=True)

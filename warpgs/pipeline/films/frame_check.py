@@ -54,8 +54,8 @@ class FrameCheck:
         return [
             f"{len(numbers)} of {self.count} frames {words}, numbers {_ranges(numbers)}: {advice}"
             for numbers, words, advice in (
-                (self.empty, "show nearly nothing", f"the path leaves what the photographs saw; {remedy}"),
-                (self.black, "are black", f"something black stands before the camera, or nothing is lit there; {remedy}"),
+                (self.empty, "show nearly nothing", f"the path leaves the captured area; {remedy}"),
+                (self.black, "are black", f"the camera is inside geometry, or the scene is unlit; {remedy}"),
             )
             if numbers
         ]

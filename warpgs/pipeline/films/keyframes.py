@@ -157,7 +157,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         rigid = np.abs(square - np.eye(3)).max() <= MAX_SKEW and right_handed and (matrix[3] == (0, 0, 0, 1)).all()
         if not rigid or np.abs(matrix[:3, 3]).max() > MAX_REACH:
             raise DataError(
-                f"{path}: c2w of keyframe {i} is no rigid camera-to-world matrix; its upper left 3 x 3 must be a rotation, "
+                f"{path}: c2w of keyframe {i} must be a rigid camera-to-world matrix: its upper left 3 x 3 a rotation, "
                 f"its last column within {MAX_REACH:g}, and its last row 0 0 0 1"
             )
         if value["fov_y"] > 3.1:

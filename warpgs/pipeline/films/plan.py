@@ -1,4 +1,4 @@
-"""Plans of films: which cameras a path has for a model, and what was chosen for the user."""
+"""Plans of films: the cameras of a path for a model, and notes on the choices made."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from warpgs.scene import Camera, Gaussians
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
 """Names of paths; the name of a JSON file of keyframes is one, too."""
 SECONDS = 3.0
-"""Duration of a film where none is given."""
+"""Default duration of a film."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 """Duration of a film through training views: for each view, and at most."""
 MIN_FRAMES_PER_VIEW = 4
@@ -84,7 +84,7 @@ class FilmPlan:
     remedy: str
     """Advice for frames that show nothing."""
     notes: list[str]
-    """Lines for the user on what was chosen."""
+    """Lines for the user on the choices made."""
 
 
 @torch.no_grad()
@@ -141,7 +141,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         UsageError: The path is unknown.
     """
     if path not in PATHS and not path.lower().endswith(".json"):
-        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)}, and no .json file of keyframes")
+        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)} or a .json file of keyframes")
     scene = model.cameras()
     train = [scene[n] for n in model.train]
     depth, coverage = depth_and_coverage(model.gaussians(), train, model.options())
@@ -158,14 +158,14 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         return FilmPlan(_numbered(cameras), coverage, remedy, [words])
     notes = [f"{len(train)} training cameras look {rig.describe()}"]
     if rig.turned:
-        notes.append("the photographs lie on their side; the film is upright, by the plane that the cameras stand in")
+        notes.append("the photographs lie on their side; the film is upright, by the plane of the cameras")
     kind = BY_KIND[rig.kind] if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)
         remedy = "the model shows nothing there: `warpgs eval` scores each view"
     else:
         cameras = camera_path(kind, rig, train, settings.count(SECONDS))
-        there_and_back = " there and back over what the cameras saw" if rig.span is not None and kind == "turntable" else ""
+        there_and_back = " there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
         words = f"path {kind}{there_and_back}"
         remedy = "--path interpolate stays at the training views"
     cameras = [framed(c, settings.size, settings.fov_y) for c in cameras]

@@ -1,4 +1,4 @@
-"""Rigs: how training cameras stand to what they photographed, from their poses alone."""
+"""Rigs: how training cameras stand to their subject, from their poses alone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = {
 MIN_AGREEMENT = 0.8
 """Fraction of the cameras that must look at one point, or away from it."""
 MIN_COSINE = 0.8
-"""Cosine of the largest angle between a camera's axis and what it looks at, 37 degrees: about a corner of a photograph."""
+"""Cosine of the largest angle between a camera's axis and its subject, 37 degrees: about a corner of a photograph."""
 MIN_RING = math.radians(100)
 """Range of azimuths about a point below which cameras photographed it from one side."""
 MAX_GAP = math.radians(150)
@@ -73,7 +73,7 @@ class Rig:
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
 
     def reach(self, camera: Camera) -> float:
-        """Return the distance along a camera's axis to what it looks at [u]; 0 where the rig has no such point."""
+        """Return the distance along a camera's axis to its subject [u]; 0 if the rig has no such point."""
         if self.kind not in ("ring", "forward"):
             return 0.0
         return max(0.0, float(((self.center - camera.center) * camera.viewmat[2, :3]).sum()))
@@ -217,7 +217,7 @@ def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
 
 
 def common_up(cameras: list[Camera]) -> np.ndarray | None:
-    """Return the upward direction that cameras agree on, as films have it: of length 1, shape [3]; None where there is none."""
+    """Return the upward unit vector [3] that cameras agree on, as films use it; None if they do not agree."""
     up, turned = _upward(cameras, focus_point(cameras))
     mean = np.mean([c.viewmat[1, :3] for c in cameras], axis=0)
     return up if turned or (mean * mean).sum() >= MIN_UP**2 else None

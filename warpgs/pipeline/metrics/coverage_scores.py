@@ -26,7 +26,7 @@ CLASSES = {
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
 """Upper ends of the classes of depth difference by which an error is expected; the last holds all that is beyond."""
 PROBED = 6
-"""Most training views whose photographs are compared with each other, evenly spaced: 30 pairs."""
+"""Most training views that are compared with each other, evenly spaced: 30 pairs."""
 
 
 @torch.no_grad()
@@ -157,13 +157,13 @@ def score_by_coverage(
     Raises:
         UsageError: A camera is orthographic. Views of lenses are scored as a pinhole would show them.
     """
-    tell("finding what no training view saw")
+    tell("checking coverage")
     train, test = ([pinhole_view(v) for v in views] for views in (train, test))
     training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
     errors = photo_errors(train, training)
     transparent = any(v.alpha is not None for v in (*train, *test))
     views, total = [], {c: np.zeros(4) for c in CLASSES}
-    for view in counted(test, tell, "finding what no training view saw", "views"):
+    for view in counted(test, tell, "checking coverage", "views"):
         image, depth, alpha = render_view(gaussians, view, options)
         surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
         found = coverage_map(surface, view.camera, training)
@@ -186,4 +186,4 @@ def _summary(rows: dict[str, dict[str, Any]]) -> str:
     if unseen is None:
         return "every held-out pixel was seen by a training view"
     pixels, error = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
-    return f"{pixels} of the held-out pixels were seen by no training view and hold {error} of the squared error"
+    return f"{pixels} of the held-out pixels were seen by no training view; they hold {error} of the squared error"

@@ -23,7 +23,7 @@ VARIANTS = {
 }
 """Definition of each score, for result files and reports. Every paper's table depends on these words."""
 ALPHA_VARIANTS = {
-    "psnr_whole": "of a view that knows its opacity: over all its pixels that its mask keeps, over the background of the fit",
+    "psnr_whole": "of a view with an alpha channel: over all unmasked pixels, over the background of the fit",
     "psnr_foreground": "the same over the pixels of an opacity above 0.5",
     "alpha_empty": "mean rendered alpha over the pixels of an opacity below 0.02: 0 is right",
     "alpha_object": "mean rendered alpha over the pixels of an opacity above 0.98: 1 is right",
@@ -54,7 +54,7 @@ class ViewMetrics:
     lpips: dict[str, float] = field(default_factory=dict)
     """LPIPS by variant (`lpips_vgg_legacy`); empty where no weights were given, NaN where the image is too small."""
     opacity: dict[str, float] = field(default_factory=dict)
-    """Scores by the names of `ALPHA_VARIANTS`, NaN where no pixel is of the kind; empty where the view is opaque."""
+    """Scores by the names of `ALPHA_VARIANTS`, NaN without such pixels; empty if the view is opaque."""
 
     def row(self) -> dict[str, Any]:
         """Return every score by name, flat, as result files have it."""
@@ -177,5 +177,5 @@ def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
 
 
 def variants(lpips: Lpips | None) -> dict[str, str]:
-    """Return the definition of each score, LPIPS included; where there are no weights it says that it was not measured."""
+    """Return the definition of each score; that of LPIPS states if it was not measured for lack of weights."""
     return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())

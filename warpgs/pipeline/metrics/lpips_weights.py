@@ -98,7 +98,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     try:
         file = open_input(path)
     except FileNotFoundError as e:
-        raise DataError(f"{path}: there is no such file; give a .pth file with a state dict") from e
+        raise DataError(f"{path}: no such file; give a .pth file with a state dict") from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
     with file:
@@ -215,20 +215,20 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     try:
         data = read_input(path)
     except FileNotFoundError as e:
-        raise DataError(f"{path}: there is no such file; `warpgs convert-lpips` makes one from published weights") from e
+        raise DataError(f"{path}: no such file; `warpgs convert-lpips` makes one from published weights") from e
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); `warpgs convert-lpips` makes such a file") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); write one with `warpgs convert-lpips`") from e
     try:
         tensors = load(data)
         metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
     except (SafetensorError, ValueError) as e:
-        raise DataError(f"{path}: is damaged or no safetensors file ({e}); make it anew with `warpgs convert-lpips`") from e
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with `warpgs convert-lpips`") from e
     if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
-        raise DataError(f"{path}: holds no LPIPS weights; `warpgs convert-lpips` makes such a file from published weights")
+        raise DataError(f"{path}: holds no LPIPS weights; `warpgs convert-lpips` writes one from published weights")
     net = NETS[metadata["net"]]
     for name, shape in net.shapes().items():
         if name not in tensors or tuple(tensors[name].shape) != shape:
-            raise DataError(f"{path}: lacks {name} of shape {list(shape)}; make it anew with `warpgs convert-lpips`")
+            raise DataError(f"{path}: lacks {name} of shape {list(shape)}; write it again with `warpgs convert-lpips`")
         if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
-            raise DataError(f"{path}: {name} holds no finite float32 numbers; make it anew with `warpgs convert-lpips`")
+            raise DataError(f"{path}: {name} is not finite float32; write it again with `warpgs convert-lpips`")
     return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}

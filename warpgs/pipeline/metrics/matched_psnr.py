@@ -1,4 +1,4 @@
-"""PSNR of a held-out view after its colours were matched, for fits whose training views have an exposure each."""
+"""PSNR of a held-out view after its colours were matched, for fits with an exposure for each training view."""
 
 from __future__ import annotations
 

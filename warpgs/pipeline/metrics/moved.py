@@ -24,7 +24,7 @@ FLOOR = 0.005
 MIN_VIEWS = 2
 """Fewest other views that must show a point."""
 MIN_TRAINING = 6
-"""Fewest training views of which anything is said: with fewer the model has room to fit what one of them shows alone."""
+"""Fewest training views for this check: with fewer, the model can fit objects that only one view shows."""
 NEIGHBORS = 8
 """Views taken nearest by in which a point is looked up."""
 MAX_DEPTH_ERROR = 0.1
@@ -139,12 +139,10 @@ def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[
 
 
 def moved_notes(fractions: dict[str, float]) -> list[str]:
-    """Return the sentence that names views with such regions, by the fraction of their pixels; none where there are none."""
+    """Return notes that name views with such regions, by the fraction of their pixels."""
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
     if not named:
         return []
     words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
     more = f" and {len(named) - 6} more" if len(named) > 6 else ""
-    return [
-        f"something moved, or looks otherwise than in the views beside it, in {words}{more}; a mask takes it out of the fit"
-    ]
+    return [f"moving or changing objects in {words}{more}; mask them out"]

@@ -1,1 +1,1 @@
-"""The Gaussians of a fit and what is known of each."""
+"""The Gaussians of a fit and their statistics."""

@@ -107,7 +107,7 @@ class KnownPoints:
 
     @staticmethod
     def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:
-        """Return those of the points whose tracks name two of the views; none where tracks are unknown."""
+        """Return the points with two of the views in their tracks; none if tracks are unknown."""
         names = {v.name for v in views}
         keep = [t is not None and len(names & t) >= 2 for t in points.tracks or ()] or [False] * len(points)
         chosen, tracks = np.nonzero(keep)[0], [t for t, k in zip(points.tracks or (), keep) if k]
@@ -183,8 +183,8 @@ def coarse_points(
         points, widths = np.concatenate([points, own[0][new]]), np.concatenate([widths, own[2][new]])
     if filled_in:
         filled, _ = _elsewhere(points, widths, *(np.concatenate(a) for a in zip(*filled_in)), fill_px)
-    more = f"{len(added):,} of the reconstruction where there were none, " if len(added) else ""
-    notes.append(f"{len(cloud):,} points of {pixels:,} pixels by {source}, {more}and {len(filled):,} filled")
+    more = f"{len(added):,} from the reconstruction, " if len(added) else ""
+    notes.append(f"{len(cloud):,} points from {pixels:,} pixels by {source}, {more}{len(filled):,} filled in")
     parts = (cloud, added, filled)
     return PointCloud(np.concatenate([c.points for c in parts]), np.concatenate([c.colors for c in parts])), notes
 

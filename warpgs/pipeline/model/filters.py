@@ -1,4 +1,4 @@
-"""Filters of a finished model: a box cut out, what only disturbs taken away, harmonics dropped, everything turned."""
+"""Filters of a finished model: crop to a box, remove floaters and needles, drop harmonics, rotate."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _AZIMUTHS = 8
 
 @dataclass(frozen=True)
 class Box:
-    """A box, whose axes may be turned."""
+    """A box with any orientation."""
 
     center: tuple[float, float, float]
     """Middle [file units]."""
@@ -79,7 +79,9 @@ def box_of(text: str) -> Box:
         center, size = (_numbers(value.get(key), (3,), key) for key in ("center", "size"))
         rotation = _numbers(value.get("rotation", np.eye(3).tolist()), (3, 3), "rotation")
         if np.abs(matmul(rotation, rotation.T) - np.eye(3)).max() > 1e-3:
-            raise UsageError("--crop: rotation is no rotation: its columns are not perpendicular, or not of length 1")
+            raise UsageError(
+                "--crop: rotation must be a rotation matrix: its columns are not perpendicular, or not of length 1"
+            )
     if not (size > 0).all():
         raise UsageError(f"--crop: the box has sides of {', '.join(f'{s:g}' for s in size)}; each must be longer than 0")
     a, b, c = (tuple(map(float, v)) for v in (center, size, rotation[0]))
@@ -95,7 +97,7 @@ def _box_of_file(path: Path) -> Box:
         raise DataError(f"{path}: cannot be read as a box ({why}); give a JSON file with center and size") from e
     try:
         if not text.lstrip().startswith("{"):
-            raise UsageError("it is no JSON object with center and size")
+            raise UsageError("expected a JSON object with center and size")
         return box_of(text)
     except UsageError as e:
         raise DataError(f"{path}: holds no box: {e}. Save it again in the viewer") from e

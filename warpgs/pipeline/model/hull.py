@@ -165,7 +165,7 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     shapes = silhouettes(views)
     nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
     if len(shapes) < 2:
-        return nothing, f"no hull: {len(shapes)} of {len(views)} views know their opacity, and two are the least"
+        return nothing, f"no hull: {len(shapes)} of {len(views)} views have an alpha channel; at least two are needed"
     cells, width = carve(shapes)
     if not len(cells):
         return nothing, "no hull: the silhouettes have no place in common; do the poses belong to the images?"

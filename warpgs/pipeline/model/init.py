@@ -153,7 +153,7 @@ class _Depths:
 
 
 def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
-    """Count the views that see each point [N, 3] before what is empty around an object, int [N]: the visual hull has none."""
+    """Count the views that see each point [N, 3] over the empty background, int [N]: 0 within the visual hull."""
     votes = np.zeros(len(points), int)
     for view, (region, name) in zip(views, regions):
         if name not in OBJECTS:

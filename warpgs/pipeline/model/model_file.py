@@ -56,10 +56,10 @@ class FittedModel(Model):
     step: int
     """Steps done."""
     transparent: bool = field(default=False, kw_only=True)
-    """True where views of the scene know their opacity, so that renders are to be transparent."""
+    """True if the scene's images have an alpha channel, so that renders are transparent."""
 
     def __repr__(self) -> str:
-        """Say in one line what it is."""
+        """Describe the model in one line."""
         sizes = f"{len(self.scene_gaussians):,} Gaussians, {len(self.scene_cameras)} cameras"
         return f"<{type(self).__name__}: {sizes}, step {self.step}>"
 
@@ -125,9 +125,9 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); check the path and its permissions") from e
     except (SafetensorError, ValueError) as e:
-        raise DataError(f"{path}: is damaged or no safetensors file ({e}); write it again with warpgs.save") from e
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with warpgs.save") from e
     if header.get("format") != FORMAT or tensors.keys() != Gaussians.__dataclass_fields__.keys():
-        raise DataError(f"{path}: is no model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
+        raise DataError(f"{path}: not a model of format {FORMAT}; write it with warpgs.save, or read PLY with warpgs.read_ply")
     try:
         offset = schema.parse(header["offset"])
         schema.items(schema.number(), 3)(offset, "offset")

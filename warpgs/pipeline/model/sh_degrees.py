@@ -1,4 +1,4 @@
-"""Degrees of each Gaussian's harmonics: coefficients without what is above them, packed, and the bytes of a model."""
+"""Degrees of each Gaussian's harmonics: packed coefficients up to that degree, and the bytes of a model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FLOAT = 4
 
 
 def model_bytes(degrees: torch.Tensor) -> int:
-    """Return the bytes of a model whose Gaussians have these degrees [N]: float32, no coefficient above, nothing compressed."""
+    """Return the bytes of a model with these degrees [N]: float32, no coefficient above them, nothing compressed."""
     return FLOAT * int((11 + 3 * (degrees.long() + 1) ** 2).sum())
 
 

@@ -1,4 +1,4 @@
-"""Fits whose steps several views and processes share: what they need before work starts, and what the user is told."""
+"""Fits with several views and processes per step: checks before work starts, and notes for the user."""
 
 from __future__ import annotations
 

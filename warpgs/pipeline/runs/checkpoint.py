@@ -67,9 +67,8 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
         # the extremes tell without a copy, since torch lets a NaN win
         if t.is_floating_point() and t.numel() and not all(math.isfinite(float(v)) for v in t.aminmax()):
             raise NotFiniteError(
-                f"{path} was not written: {name} holds numbers that are not finite, so nothing after the last checkpoint, if "
-                "there is one, can be trusted. A fit repeats exactly: continued with --resume, it comes to the same place; "
-                "other settings, lower learning rates above all, lead elsewhere"
+                f"{path} was not written: {name} holds non-finite values; results after the last checkpoint are invalid. "
+                "--resume repeats the same steps; fit again into a new --out with lower learning rates"
             )
     metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
     chunks = safetensors_chunks(tensors, metadata)
@@ -98,9 +97,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
             body = file.read(max(0, os.fstat(file.fileno()).st_size - 32))
             digest = file.read(33)
     except FileNotFoundError as e:
-        raise DataError(
-            f"{folder} holds no {TENSORS}: there is nothing to continue or to render from; run `warpgs fit` first"
-        ) from e
+        raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first") from e
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
     if hashlib.sha256(body).digest() != digest:
@@ -114,12 +111,12 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     if metadata.get("format") != str(FORMAT):
         version = metadata.get("version", "0.1.0")
         raise DataError(
-            f"{path}: this checkpoint is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it "
+            f"{path}: warpgs {version} wrote this checkpoint, in a format that warpgs {__version__} does not read. Open it "
             f"with warpgs {version}, or fit the scene again into a new --out"
         )
     try:
         state = schema.parse(metadata["state"])
         schema.mapping(schema.anything)(state, "")
     except (KeyError, schema.SchemaError) as e:
-        raise DataError(f"{path}: its state is not whole ({e}); fit again, or restore it") from e
+        raise DataError(f"{path}: its state is incomplete or damaged ({e}); fit again, or restore it") from e
     return tensors, state

@@ -79,7 +79,7 @@ def coverage_table(coverage: dict[str, Any]) -> list[list[str]]:
 
 
 def coverage_lines(coverage: dict[str, Any]) -> list[str]:
-    """Return the table as lines for people, then what it says in a sentence, and what the images show."""
+    """Return the table as lines for people, then a summary, and a legend of the images."""
     rows = coverage_table(coverage)
     widths = [max(map(len, column)) for column in zip(*rows)]
     lines = ["  ".join(c.ljust(w) if i < 2 else c.rjust(w) for i, (c, w) in enumerate(zip(r, widths))) for r in rows]

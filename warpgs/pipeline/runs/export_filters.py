@@ -21,12 +21,12 @@ from warpgs.scene import Camera, Gaussians
 
 @dataclass(frozen=True)
 class Filters:
-    """Choices of what is done to a model on its way into a file, in this order: crop and clean, rotate, sh_degree."""
+    """Filters of a model before it is written, in this order: crop and clean, rotate, sh_degree."""
 
     crop: str | None = None
     """Box to keep, as `box_of` takes it; None for everything."""
     clean: bool | None = None
-    """True to remove what only disturbs; None for what suits the format (`Format.cleaned`)."""
+    """True to remove floaters and needles; None for the format's default (`Format.cleaned`)."""
     sh_degree: int | None = None
     """Highest degree of harmonics; None for all that the format holds."""
     rotate: str | None = None

@@ -29,7 +29,7 @@ from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera, Gaussians
 
 ROUNDING = 1e-4
-"""Change of a log scale below which nothing is said: a hundredth of a percent."""
+"""Smallest change of a log scale that is reported: a hundredth of a percent."""
 
 
 def convert(
@@ -93,11 +93,11 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     if not len(gaussians):
         raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
-        lines.append(f"harmonics above degree {kind.max_degree} are left out, {kind.suffix} files hold none")
+        lines.append(f"harmonics above degree {kind.max_degree} are dropped: {kind.suffix} files cannot hold them")
         gaussians = limit_degree(gaussians, kind.max_degree)
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
-        lines.append(f"the file does not hold the colour behind the scene, which was #{color} in the fit")
+        lines.append(f"the file does not hold the background colour of the fit, #{color}")
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:
@@ -126,9 +126,9 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
         UsageError: Another filter is, which cameras do not have, or a format of Gaussians.
     """
     if formats:
-        raise UsageError("--format is for Gaussians, and cameras are written by the names of their files; leave it out")
+        raise UsageError("--format does not apply to cameras; leave it out")
     if any(v is not None for v in (filters.crop, filters.clean, filters.sh_degree)):
-        raise UsageError("--crop, --clean and --sh-degree are for Gaussians; cameras are turned by --rotate only")
+        raise UsageError("--crop, --clean and --sh-degree do not apply to cameras; use --rotate only")
 
 
 def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, filters: Filters) -> list[str]:

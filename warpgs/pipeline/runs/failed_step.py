@@ -1,4 +1,4 @@
-"""The step whose loss was not finite, in one small file: all that it takes to compute that loss again, without the scene."""
+"""The step with a non-finite loss, in one small file: enough to compute that loss again without the scene."""
 
 from __future__ import annotations
 
@@ -82,11 +82,11 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
         with safe_open(path, framework="pt", device=str(device)) as f:
             return {n: f.get_tensor(n) for n in f.keys()}, json.loads((f.metadata() or {})["step"])
     except (OSError, SafetensorError, KeyError, ValueError, RecursionError) as e:
-        raise DataError(f"{path}: is no step that failed ({e}); give the {FILE} of a run folder") from e
+        raise DataError(f"{path}: not a failed step ({e}); give the {FILE} of a run folder") from e
 
 
 def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
-    """Take the forward pass of a failed step again; returns the step's plan, and what was computed."""
+    """Repeat the forward pass of a failed step; returns the step's plan, and the results."""
     tensors, plain = bundle
     config = FitConfig.from_json(plain["config"])
     gaussians = Gaussians(**{n: tensors[f"params.{n}"].requires_grad_() for n in Gaussians.__dataclass_fields__})
@@ -136,7 +136,7 @@ def findings(bundle: Bundle) -> list[str]:
             lines += [f"    its gradient by {n} is not finite" for n in broken]
         lines += [f"  view module {n}: {float(t.detach()):g}" for n, t in found.of_views.items()]
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as e:
-        raise DataError(f"the failed step is not whole ({e!r}); fit again to have it written anew") from e
+        raise DataError(f"the failed step is incomplete ({e!r}); fit again to write it again") from e
     return lines
 
 

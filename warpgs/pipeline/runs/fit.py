@@ -161,7 +161,7 @@ def fit(
 def _opened(
     out: Path | None, resume: bool, verbose: bool | Literal["progress"]
 ) -> Iterator[tuple[list[str], Callable[[str], object], list[float]]]:
-    """Hold the run folder; yields notes on it, the function that shows what is being done, and seconds spent on compiling."""
+    """Hold the run folder; yields notes on it, the function that shows progress, and seconds spent on compiling."""
     nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     folder = nothing if out is None else run_folder(out, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
@@ -232,7 +232,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
     with background_warmup(c, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
-            job.notes.append(f"camera model {models}: photographs are not compared with each other; coverage is not measured")
+            job.notes.append(f"camera model {models}: photographs are not compared; coverage is not measured")
         else:
             job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background
@@ -288,7 +288,7 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
 
 
 def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera]) -> dict[str, Any]:
-    """Score the finished fit, whose views had ``given`` cameras before it; returns the contents of metrics.json."""
+    """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
     c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
@@ -297,7 +297,7 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     metrics = evaluate_run(*scored, job.lpips, trainer.context.max_instances, names=names, tell=tell)
     if test and not job.other_models:
         metrics["coverage"] = coverage_of_run(*scored, trainer.context.max_instances, names=names, tell=tell)
-    tell("comparing renders with float64")
+    tell("checking float32 accuracy")
     rule = rule_report_of(
         gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=trainer.half_resolution,
         max_instances=trainer.context.max_instances,
@@ -306,7 +306,7 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     options = options_for(c.rule, scene.background, gaussians, trainer.context.max_instances)
     moved = {}
     if not job.other_models:
-        shown = counted(train, job.progress, "looking for what moved", "views")
+        shown = counted(train, job.progress, "checking for moving objects", "views")
         fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
         moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
     complexity = complexity_figures(trainer)

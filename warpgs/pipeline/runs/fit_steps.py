@@ -52,7 +52,7 @@ class RunRecorder:
         save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(self, trainer: Trainer) -> bool:
-        """Load the last checkpoint, and cut the log back to it; returns False where there is none."""
+        """Load the last checkpoint, and cut the log back to it; returns False without one."""
         out = self.job.out
         if out is None or self.log is None or not (out / TENSORS).is_file():
             return False
@@ -117,14 +117,14 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
 
 
 def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
-    """Save the inputs of a step whose loss is not finite; returns the error for the user."""
+    """Save the inputs of a step with a non-finite loss; returns the error for the user."""
     assert error.view is not None
     name = job.split.train[error.view]
     save_failed_step(out / FAILED, failed_step(trainer, error.view, name, error.slot))
     return NotFiniteError(
-        f"{error}, on {name}. The state before is saved, and so is what that step computed with: `warpgs doctor --repeat "
-        f"{out / FAILED}` says what is not finite. A fit repeats exactly: continued with --resume, it comes to the "
-        "same place; other settings, lower learning rates above all, lead elsewhere"
+        f"{error}, on {name}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
+        f"{out / FAILED}` names the non-finite values. --resume repeats the same step; fit again into a new --out with "
+        "lower learning rates"
     )
 
 

@@ -72,11 +72,11 @@ def _check_folder(out: Path, resume: bool) -> None:
         if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
             return
         if resume and not (out / CONFIG).is_file():
-            raise UsageError(f"--resume: {out} holds no {CONFIG}, so there is no run to continue; give a run's folder")
+            raise UsageError(f"--resume: {out} holds no {CONFIG}; give the folder of a run")
         if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
     except OSError as e:
-        raise UsageError(f"{out}: cannot be looked into ({e.strerror or e}); choose another --out") from e
+        raise UsageError(f"{out}: cannot be read ({e.strerror or e}); choose another --out") from e
 
 
 def camera_values(camera: Camera) -> dict[str, Any]:
@@ -129,22 +129,22 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         record = schema.read(path, folder)
     except FileNotFoundError as e:
-        raise DataError(f"{folder}: holds no run (there is no {CONFIG}); give a folder that `warpgs fit --out` filled") from e
+        raise DataError(f"{folder}: holds no run ({CONFIG} is missing); give a folder that `warpgs fit --out` filled") from e
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     if not isinstance(record, dict) or "config" not in record:
-        raise DataError(f"{path}: is no record of a fit; give a folder that `warpgs fit --out` filled")
+        raise DataError(f"{path}: not a record of a fit; give a folder that `warpgs fit --out` wrote")
     if record.get("format") != FORMAT:  # version 0.1.0 stored no number
         stored = record.get("versions")
         version = stored.get("warpgs", "unknown") if isinstance(stored, dict) else "unknown"
         raise DataError(
-            f"{path}: this run is of warpgs {version}, in a format that warpgs {__version__} does not read. Open it with "
+            f"{path}: warpgs {version} wrote this run, in a format that warpgs {__version__} does not read. Open it with "
             f"warpgs {version}, or fit the scene again into a new --out; its point_cloud.ply stays readable"
         )
     try:
         check_record(record)
     except schema.SchemaError as e:
-        raise DataError(f"{path}: is not whole, {e}; restore it, or fit the scene again into a new --out") from e
+        raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again into a new --out") from e
     return record
 
 
@@ -187,8 +187,8 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
             if isinstance(found, dict) and isinstance(wanted, dict):
                 key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
             raise DataError(
-                f"--resume: {out / TENSORS} is of another fit than {CONFIG} beside it: {key} differs. Restore both from the "
-                "same run, or fit again into a new --out"
+                f"--resume: {out / TENSORS} and {CONFIG} beside it belong to different fits: {key} differs. Restore both "
+                "from the same run, or fit again into a new --out"
             )
 
 
@@ -235,8 +235,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
     """Return the scene of a run's record, as `StoredRun.scene_request` does."""
     if record["scene"]["path"] is None:
         raise DataError(
-            f"{folder}: its scene was passed from Python, so there is no folder to read it from; score the model there with "
-            "warpgs.evaluate"
+            f"{folder}: its scene was passed from Python and has no folder; score the model there with warpgs.evaluate"
         )
     request = SceneRequest(**record["scene"])
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
@@ -301,11 +300,11 @@ def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Pat
     try:
         MODEL_STATE(state, "")
     except schema.SchemaError as e:
-        raise DataError(f"{path}: its state is not whole, {e}; restore it, or fit the scene again") from e
+        raise DataError(f"{path}: its state is incomplete or damaged: {e}; restore it, or fit the scene again") from e
     found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
     if "sh_packed" in found and "degrees" in tensors:
         try:
             found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
         except ValueError as e:
-            raise DataError(f"{path}: is not whole, {e}; restore it, or fit the scene again") from e
+            raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again") from e
     return checked_gaussians(found, str(path)), state["step"]

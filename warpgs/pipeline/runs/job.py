@@ -1,4 +1,4 @@
-"""One fit in progress: its inputs, what is known of it so far, and what it tells the user."""
+"""One fit in progress: its inputs, its state, and its messages to the user."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from warpgs.scene import Scene, View
 
 @dataclass
 class FitJob:
-    """One fit in progress: its inputs, and what is known of it so far."""
+    """One fit in progress: its inputs and its state."""
 
     scene: Scene
     request: SceneRequest
@@ -72,7 +72,7 @@ class FitJob:
             self.say(f"  {line}")
 
     def announce(self, notes: list[str]) -> None:
-        """Print what is fitted, and every choice made for the user so far, ``notes`` last."""
+        """Print the scene, and every choice made for the user so far, ``notes`` last."""
         before, self.notes = self.notes, []
         camera = self.train[0].camera
         size = f"{camera.width} x {camera.height} px"

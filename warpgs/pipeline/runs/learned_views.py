@@ -24,7 +24,7 @@ def learned_cameras(scene: Scene, split: Split, learned: LearnedViews) -> Mappin
 
 
 def with_cameras(scene: Scene, cameras: Mapping[str, Camera]) -> Scene:
-    """Return a scene whose views have the cameras of a mapping by name, where it has them."""
+    """Return a scene with the cameras of a mapping by name, for the views in it."""
     return replace(scene, views=tuple(replace(v, camera=cameras.get(v.name, v.camera)) for v in scene.views))
 
 

@@ -45,7 +45,7 @@ def mesh(
     device, _ = choose_device(device_name)
     run = open_run(folder, device)
     if not run.train:
-        raise DataError(f"{folder}: it has no training views, so nobody knows what was seen; fit again")
+        raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
     cameras, scale = [run.scene_cameras[n] for n in run.train], run.normalization.scale
     if options.voxel is not None:
         options = replace(options, voxel=options.voxel * scale)
@@ -53,7 +53,7 @@ def mesh(
     def planned(plan: GridPlan, memory: str) -> None:
         say(
             f"grid of {' x '.join(map(str, plan.shape))} points {plan.voxel / scale:.4g} units of the scene's files apart, "
-            f"{memory}; {100 * (1 - plan.inside):.1f} % of what the training views see lies outside of it and is left out"
+            f"{memory}; {100 * (1 - plan.inside):.1f} % of the observed surface lies outside the grid and is left out"
         )
 
     with hold_folder(target.parent) as notes:
@@ -74,9 +74,8 @@ def _lines(found: FusedMesh, views: int) -> list[str]:
         f"{found.removed:,} small parts removed"
     )
     lines.append(
-        f"{100 * found.unseen:.1f} % of the grid, insides and backs of things among it, was seen by none of {views} training "
-        "views: the mesh is left open there"
+        f"{100 * found.unseen:.1f} % of the volume was not observed by the {views} training views; the mesh has holes there"
     )
     if found.uncolored:
-        lines.append(f"{found.uncolored:,} vertices lie where no view sees a surface and have their nearest neighbour's colour")
+        lines.append(f"{found.uncolored:,} vertices without an observed colour have that of their nearest neighbour")
     return lines

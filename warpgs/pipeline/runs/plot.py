@@ -26,7 +26,7 @@ POINTS, COLORS, BACKGROUNDS = ("gaussians", "start"), ("own", "coverage"), ("whi
 SIZES = (64, 8192)
 """Smallest and largest side of a plot [px]."""
 MIN_OPACITY = 0.1
-"""Least opacity of a Gaussian that is shown: fainter ones are seen by nobody."""
+"""Least opacity of a Gaussian that is shown: fainter ones are invisible."""
 MAX_POINTS = {"gaussians": 50_000, "start": 300_000}
 """Number of Gaussians and of points shown; of more, a sample."""
 CLASSES = (
@@ -89,7 +89,7 @@ def _start(stored: StoredRun) -> tuple[np.ndarray, np.ndarray, None]:
     """Return positions [N, 3] and colours [N, 3] of the points of the scene's reconstruction."""
     scene, _, _ = scene_of(stored)
     if scene.points is None or not len(scene.points):
-        raise DataError(f"{scene.path}: its format ({scene.format}) brings no points; leave out --points start")
+        raise DataError(f"{scene.path}: its format ({scene.format}) has no points; leave out --points start")
     return scene.points.points, scene.points.colors, None
 
 

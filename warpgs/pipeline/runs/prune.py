@@ -48,7 +48,7 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
     if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
     if not os.path.isdir(out.parent):
-        raise UsageError(f"{out.parent} is no folder; make it first, or choose another --out")
+        raise UsageError(f"{out.parent} is not a folder; create it, or choose another --out")
     return out
 
 
@@ -87,14 +87,14 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
         UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
     """
     if not 0 < keep_psnr < math.inf:
-        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; 0.1 is a loss that nobody sees")
+        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 is invisible")
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
     tell = waiting()
     _, train, test = scene_of(stored, reader, tell)
     before, options = stored.gaussians(), stored.options()
-    tell("finding what the training views can spare")
+    tell("ranking Gaussians")
     made = _pruned(stored, train, options, keep_psnr)
     tell("scoring")
 

@@ -41,7 +41,7 @@ class SceneRequest:
     allow_outside: bool = False
     """Names and links of the scene may lead to files outside its folder."""
     masks: str = "ignore"
-    """Fate of pixels that a mask file does not keep: ignore (they do not count) or cutout (they are transparent)."""
+    """Treatment of masked-out pixels: ignore (they do not count) or cutout (they are transparent)."""
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
@@ -95,7 +95,7 @@ def check_overrides(overrides: Mapping[str, object]) -> None:
         UsageError: One is.
     """
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
-        raise UsageError(f"warpgs.fit: {name} says how a scene is read; give it to warpgs.load_scene and fit its result")
+        raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to warpgs.load_scene and fit its result")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
@@ -116,7 +116,9 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     if device.type == "cpu":
         return device, f"on the CPU, {torch.get_num_threads()} thread{'s' if torch.get_num_threads() > 1 else ''}"
     if not torch.cuda.is_available():
-        raise ResourceError("--device cuda: torch sees no CUDA device here; `warpgs doctor` says why. Use --device cpu")
+        raise ResourceError(
+            "--device cuda: torch finds no CUDA device; run `warpgs doctor` for the reason, or use --device cpu"
+        )
     if device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())
     return device, f"on {torch.cuda.get_device_name(device)}"
@@ -144,7 +146,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
             "should see belong into a folder idrmasks, or behind --score-masks"
         )
     for test, train in coincident_views(scene, split):
-        notes.append(f"{test} is held out, but {train} was taken from the same place: its score says nothing of new views")
+        notes.append(f"{test} is held out, but {train} was taken from the same place: its score does not measure new views")
     return split, notes
 
 

@@ -91,7 +91,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     if metrics["test"]:
         best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
         lines = [
-            f"held-out {score_line(metrics['test'])} over {len(metrics['views'])} views",
+            f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views)",
             *([f"  for comparison, without a fit: {best}"] if best else []),
             *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),
         ]

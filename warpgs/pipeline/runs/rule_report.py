@@ -25,7 +25,7 @@ SIDE = 64
 
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
-    """Sample a part of an image, [left, top, width, height], whose edges are tile edges or the image's."""
+    """Sample a part of an image, [left, top, width, height], with edges at tile edges or the image's."""
     sides = []
     for length in (camera.width, camera.height):
         first = TILE_SIZE * int(generator.integers(max(0, length - SIDE) // TILE_SIZE + 1))
@@ -124,11 +124,11 @@ def _summary(r: dict[str, Any]) -> str:
     where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
     error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
     if r["rule"] == "exact":
-        words = f"no cut-off changes the images (rule exact); float32 is off float64 by {error}"
+        words = f"rule exact has no cut-offs; float32 differs from float64 by {error}"
     else:
         ratio = r["render_ms"] / r["exact_ms"]
         words = (
-            f"rule {r['rule']} is off exact, in float64, by {error}; a view took {r['render_ms']:.1f} ms instead of "
+            f"rule {r['rule']} differs from rule exact in float64 by {error}; a view took {r['render_ms']:.1f} ms instead of "
             f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
         )
     if r["half_resolution"] > 0:

@@ -45,8 +45,8 @@ def shown_steps(phases: Phases) -> set[int]:
 
 def _open_pixels(consistent: bool, quantile: float) -> str:
     """Describe the pixels that a gate leaves open."""
-    parts = ["whose depth other views confirm"] * consistent
-    parts += [f"whose S_geometry is above its {quantile:g} quantile"] * (quantile > 0)
+    parts = ["with a depth that other views confirm"] * consistent
+    parts += [f"with S_geometry above its {quantile:g} quantile"] * (quantile > 0)
     return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
 
 
@@ -101,7 +101,7 @@ def _shown(event: Event) -> list[SampledView]:
 
 
 def _on_host(sampled: SampledView) -> SampledView:
-    """Return a copy whose maps lie in host memory."""
+    """Return a copy with its maps in host memory."""
     maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "score", "gate", "at")}
     render, semantic, geometry = (s.cpu() for s in sampled.scores)
     return dataclasses.replace(sampled, scores=(render, semantic, geometry), **maps)
@@ -193,7 +193,7 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     words = (
         f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
         f"had capacity. These pixels are {how} among {_open_pixels(consistent and method.ra, _asked(method))} (the gate); "
-        "S_importance is the weighted sum of the three scores, and each score stands below what it comes from."
+        "S_importance is the weighted sum of the three scores; each score stands below its source."
     )
     if events["widened"]:
         words += (

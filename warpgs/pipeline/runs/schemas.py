@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 from typing import Any
 
-from warpgs.constants import RULES
+from warpgs.constants import K_TOLERANCE, RULES
 from warpgs.schema import (
     Schema,
     SchemaError,
@@ -37,8 +37,16 @@ def _matrix(rows: int) -> Schema:
     return items(items(number(), rows), rows)
 
 
+def _intrinsics(value: Any, place: str) -> None:
+    """Allow intrinsics without skew, which `rasterize` takes."""
+    _matrix(3)(value, place)
+    fixed = ((0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1))
+    if any(abs(value[i][j] - wanted) > K_TOLERANCE for i, j, wanted in fixed):
+        raise SchemaError(f"{place} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+
+
 _CAMERA = fields(
-    {"viewmat": _matrix(4), "K": _matrix(3), "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
+    {"viewmat": _matrix(4), "K": _intrinsics, "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
     {"model": text, "distortion": items(number())},
     others=False,
 )

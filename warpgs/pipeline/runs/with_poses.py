@@ -41,7 +41,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     if (scene / JSON).is_file():
         record = read_record(scene)
         if record["source_sha256"] != source_digest(source, request.allow_outside):
-            raise UsageError(f"{source} does not hold the photographs of {scene}, whose poses it keeps; give another --out")
+            raise UsageError(f"{source} holds the poses of other photographs than {scene}; give another --out")
     else:
         progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
         threads = torch.get_num_threads()
@@ -63,11 +63,15 @@ def lost_lines(out: Path | None) -> list[str]:
     rows = read_record(out / POSED_SCENE)["photographs"]
     lost = sum(not p["registered"] for p in rows)
     why = out / POSED_SCENE / TEXT
-    return [f"{lost} of {len(rows)} photographs have no pose and were not used: {why} says why, and what to do"] if lost else []
+    return (
+        [f"{lost} of {len(rows)} photographs have no pose and were not used: see {why} for reasons and remedies"]
+        if lost
+        else []
+    )
 
 
 def _notes(record: dict[str, Any]) -> list[str]:
     """Return what the report says of found poses: how they were found, and who has none."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    where = [f"what to photograph next stands in {POSED_SCENE}/{TEXT} of the run"] if record["advice"] else []
+    where = [f"see {POSED_SCENE}/{TEXT} of the run for photographs to add"] if record["advice"] else []
     return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]

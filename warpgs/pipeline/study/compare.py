@@ -50,7 +50,7 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
     words = [preset_word(n) for n in names]
     for word in words:
         if words.count(word) > 1:
-            raise UsageError(f"preset {word!r} is named twice; give each a name of its own")
+            raise UsageError(f"preset {word!r} appears twice; rename one")
     found = {word: preset_settings(n)[0] for word, n in zip(words, names, strict=True)}
     return found if steps is None else {n: dataclasses.replace(c, steps=steps) for n, c in found.items()}
 
@@ -179,7 +179,7 @@ def run_study(request: StudyRequest) -> list[str]:
         try:
             runs = _run_all(request, places, device, lpips)
         except KeyboardInterrupt:
-            say("the same command goes on from here: finished runs are kept, the half-finished one is continued")
+            say("repeat the command to continue: finished runs are kept, the interrupted one continues")
             raise
         for name in request.variants:
             failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]

@@ -172,10 +172,10 @@ def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) ->
 
 
 def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
-    """Return the figure (PNG) of the first seed for which every run is there, and a note; None where there is no such seed."""
+    """Return the figure (PNG) of the first seed with every run, or None, and a note."""
     whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
     if not whole:
-        return None, "no figure: there is no seed for which every run succeeded"
+        return None, "no figure: no seed has a successful run for every row"
     seed, rows, each = whole[0], [], {1: FIGURE_ROWS, 2: 2}.get(len(places), 1)
     for place in places:
         folders = {v: run_folder(request, place.name, v, seed) for v in request.variants}
@@ -193,7 +193,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
         if lost:
             notes.append(f"{v} lacks {', '.join(lost)}: these seeds are left out of its means and of its pairs")
     if request.seeds < 2:
-        notes.append("one seed: there is no deviation and no interval, so no difference here is worth a claim")
+        notes.append("one seed: no deviations and no intervals; run more seeds before you claim a difference")
     last = metrics[-1].key
     lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o.metrics)
     if last == "lpips":
@@ -201,7 +201,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
     elif lacking:
         notes.append(f"{lacking} runs lack {metrics[-1].label}: they are left out of its column")
     if len(request.scenes) > 1:
-        notes.append("deviations and intervals are over seeds, of the mean over these scenes: they say nothing of other scenes")
+        notes.append("deviations and intervals are over seeds, for the mean over these scenes; they do not cover other scenes")
     return notes
 
 

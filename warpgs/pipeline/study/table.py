@@ -81,7 +81,7 @@ INTERVALS = ("The t interval has 95 %", "The t intervals of a column hold togeth
 
 
 def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
-    """Return mean and deviation as text; a dash where nothing was measured, the mean alone where there is no deviation."""
+    """Return mean and deviation as text; a dash if not measured, the mean alone without a deviation."""
     if sample is None or not math.isfinite(sample.mean):
         return NONE
     spread = f"{plus_minus}{sample.sd:.{digits}f}" if math.isfinite(sample.sd) else ""
@@ -97,7 +97,7 @@ def interval(d: Difference | None, digits: int) -> str:
 
 
 def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
-    """Return the lines of a Markdown table whose first ``left`` columns are words, the rest figures."""
+    """Return the lines of a Markdown table; the first ``left`` columns are words, the rest figures."""
     rows = [[c.replace("|", "\\|") for c in r] for r in [head, *body]]
     widths = [max(len(r[i]) for r in rows) for i in range(len(head))]
     lines = [
@@ -146,7 +146,7 @@ def markdown(table: Table) -> str:
 
 
 def csv_text(table: Table) -> str:
-    """Return CSV: a line per row and metric, every digit, empty where there is no number."""
+    """Return CSV: a line per row and metric, every digit, empty for missing numbers."""
     out = io.StringIO()
     names = [_plain(s) for s in table.switches]
     writer = csv.writer(out, lineterminator="\n")

@@ -46,7 +46,7 @@ def color_of(text: str) -> Color | None:
         if max(red, green, blue) <= 1:
             return red, green, blue
     raise UsageError(
-        f"background {text[:60]!r} is no colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b with numbers in [0, 1]"
+        f"background {text[:60]!r} is not a colour: give auto, mean, scene, black, white, #rrggbb, or r,g,b in [0, 1]"
     )
 
 
@@ -81,10 +81,7 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
     cut_out = any(v.alpha is not None or counted_region(v)[1] == "foreground" for v in train)
     if wish == "auto" and not cut_out:
         color = mean_color(train)
-        return color, (
-            f"background: where no Gaussian lies, renders show the mean colour of the training views, {_words(color)}; "
-            "--background names another"
-        )
+        return color, f"background: the mean colour of the training views, {_words(color)}; change it with --background"
     if wish == "auto":
         return scene.background, f"background: {_words(scene.background)}, since the views show an object cut out"
     return scene.background, f"background: {_words(scene.background)}, that of the scene" if cut_out else ""

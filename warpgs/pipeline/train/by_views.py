@@ -9,6 +9,7 @@ import dataclasses
 import math
 
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS = 3000
@@ -73,14 +74,14 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         steps = min(steps_by_views(views), config.max_steps)
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
-        f"at most {steps:,} steps{each}": config.steps, f"colours of degree {degree}": config.sh_degree,
-        f"a learning rate of scales of {optimizer.scales_lr:g}": config.optimizer.scales_lr,
-        f"of opacities of {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
-        f"half size in the first {half:.0%} of the steps": config.half_resolution,
+        f"at most {steps:,} steps{each}": config.steps, f"SH degree {degree}": config.sh_degree,
+        f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
+        f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
+        f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
     open_ = [words for words, given in chosen.items() if given is None]
     if open_:
-        notes.append(f"by the number of views, {views}: {', '.join(open_)}")
+        notes.append(Detail(f"settings for {views} views: {', '.join(open_)}"))
     if config.steps is None:
         pixels = max(v.camera.width * v.camera.height for v in train)
         seconds = pixels_of_steps(config.batch * steps, half, pixels) / CPU_PIXELS

@@ -62,7 +62,7 @@ class FitConfig:
     dropout_views: int = 3
     """Number of training views up to which dropout has its full probability; with more it is lower in proportion."""
     checkpoint_every: int = 1000
-    """Number of steps at whose multiples a checkpoint may be written; one is written at the end in any case."""
+    """Number of steps between checkpoints; one is always written at the end."""
     checkpoint_seconds: float = 20.0
     """Least time from one checkpoint to the next [s], since writing takes time. No result depends on it."""
     memory_limit: int | None = None
@@ -160,7 +160,7 @@ class FitConfig:
             config: FitConfig = _compose(FitConfig, values | parts | {"strategy_config": own}, "config")
             return config
         except (TypeError, KeyError) as e:
-            raise UsageError(f"the stored configuration is of another version of warpgs ({e})") from e
+            raise UsageError(f"another version of warpgs stored the configuration ({e})") from e
 
     def fingerprint(self) -> str:
         """Return the first 12 hexadecimal digits of the SHA-256 of the settings."""

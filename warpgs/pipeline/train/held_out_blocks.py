@@ -112,7 +112,7 @@ def block_errors(
 
 
 def decibels(errors: torch.Tensor) -> float:
-    """Return the PSNR of the mean of block errors [B], with the floor [dB]; NaN where there is no block."""
+    """Return the PSNR of the mean of block errors [B], with the floor [dB]; NaN without blocks."""
     return psnr_of(float(errors.mean()) + FLOOR) if len(errors) else math.nan
 
 

@@ -1,4 +1,4 @@
-"""Loss terms: what a term is given in a training step, what it declares, and how it is found by name."""
+"""Loss terms: their inputs in a training step, their declarations, and their lookup by name."""
 
 from __future__ import annotations
 
@@ -149,10 +149,10 @@ def check_terms(terms: Sequence[LossTerm]) -> None:
     for term in terms:
         kind = type(term)
         if not isinstance(term, LossTerm):
-            raise UsageError(f"{term!r} is no loss term: give an instance of a class that derives from warpgs.LossTerm")
+            raise UsageError(f"{term!r} is not a loss term: give an instance of a class that derives from warpgs.LossTerm")
         if not LOSS_TERMS.has(kind):
             raise UsageError(
-                f"the loss term {kind.__qualname__} has no name of its own, by which a run folder could tell it; register it "
+                f"the loss term {kind.__qualname__} has no registered name; register it "
                 'with @register("name") of warpgs.pipeline.train.loss above the class, or name it as module:Class'
             )
         unknown = [n for n in term.needs_outputs if n not in OUTPUTS]

@@ -22,7 +22,7 @@ from warpgs.schema import SchemaError, of_type
 Path = tuple[str, ...]
 """Names of fields from a `FitConfig` to a setting; a number among them is the place of a loss term or a view module."""
 WITHOUT_PREFIX = "priors"
-"""Group whose flags do not begin with its name."""
+"""Group without a prefix in its flags."""
 PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
 """Fields that hold parts of a registry, each with settings of its own."""
 OTHERS = ("preset", "strategy", "strategy_config", *PARTS)
@@ -100,7 +100,7 @@ def _flat(values: Mapping[str, Any], place: str, prefix: str = "") -> Iterator[t
     """Yield values by their dotted names."""
     for name, value in values.items():
         if not isinstance(name, str):
-            raise UsageError(f"{place}: {name!r} is no name of a setting; write names as text")
+            raise UsageError(f"{place}: {name!r} is not a setting's name; write names as text")
         if isinstance(value, Mapping):
             yield from _flat(value, place, f"{prefix}{name}.")
         elif dataclasses.is_dataclass(value) and not isinstance(value, (type, LossTerm, ViewModule)):
@@ -141,7 +141,7 @@ def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> t
 
 def _found(registry: Registry[Any], name: Any, own_code: bool) -> type[Any]:
     if not isinstance(name, (str, type)):
-        raise UsageError(f"{name!r} is no {registry.kind}; give one of {', '.join(registry.names())}")
+        raise UsageError(f"{name!r} is not a {registry.kind}; give one of {', '.join(registry.names())}")
     return registry.load(name) if own_code and isinstance(name, str) else registry.find(name)
 
 
@@ -188,7 +188,7 @@ def _replaced(part: Any, changes: dict[str, Any]) -> Any:
 
 
 def _typed(value: Any, hint: Any, name: str) -> Any:
-    """Return a value as its field has it; SchemaError where it is of another type."""
+    """Return a value as its field has it; SchemaError if its type differs."""
     if name == "memory_limit" and isinstance(value, str) and value.lower() != "none":
         return parse_bytes(value)
     parts = typing.get_args(hint)
@@ -217,4 +217,4 @@ def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
     if name in groups:
         return f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or one of them by its name"
     hint = f"did you mean {near[0]}?" if near else "`warpgs fit --help-all` lists all"
-    return f"{place}: there is no setting {name[:60]!r}; {hint}"
+    return f"{place}: unknown setting {name[:60]!r}; {hint}"

@@ -61,7 +61,7 @@ class Presets(Mapping[str, "FitConfig"]):
             UsageError: One of ours has that name, or no flag could name it.
         """
         if name in self._files or ":" in name or name.endswith(SUFFIX) or not name.strip():
-            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without colon that is none of warpgs")
+            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without colon that warpgs does not use")
         self._made[name], self._about[name] = config, about
 
     def described(self) -> dict[str, str]:
@@ -114,7 +114,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
         return _config_of_file(Path(preset), Path(preset).name)
     name = DEFAULT_PRESET if preset is None else preset
     if not isinstance(name, str):
-        raise UsageError(f"{name!r} is no preset; give a name, a path, a FitConfig or a mapping")
+        raise UsageError(f"{name!r} is not a preset; give a name, a path, a FitConfig or a mapping")
     if ":" not in name:
         return _named(name)
     found = load_object("preset", name)
@@ -142,7 +142,7 @@ def chosen_settings(
 
 
 def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
-    """Return a note on where settings come from: ``origin``, and what was changed from there."""
+    """Return a note on the source of the settings: ``origin``, and the changes to it."""
     from warpgs.pipeline.train.overrides import changed_settings
 
     changed = changed_settings(start, config)
@@ -179,9 +179,9 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); {remedy}") from e
     except (SchemaError, RecursionError) as e:
-        raise DataError(f"{path}: has more than {MAX_DEPTH} tables and lists in each other; {remedy}") from e
+        raise DataError(f"{path}: nested deeper than {MAX_DEPTH} tables and lists; {remedy}") from e
     except ValueError as e:  # no TOML, or no UTF-8
-        raise DataError(f"{path}: is no TOML ({e}); {remedy}") from e
+        raise DataError(f"{path}: not valid TOML ({e}); {remedy}") from e
     return values, hashlib.sha256(data).hexdigest()[:12]
 
 
@@ -208,7 +208,7 @@ def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path |
     elif base.endswith(SUFFIX):
         path = (Path() if folder is None else folder) / base
         if above >= MAX_BASES:
-            raise UsageError(f"{place}: base {base!r} leads back here or through over {MAX_BASES} files; name another")
+            raise UsageError(f"{place}: base {base!r} is circular, or a chain of over {MAX_BASES} files; name another")
         start, origin = _config_of_file(path, path.name, above)
     elif ":" in base:
         raise UsageError(f"{place}: base {base!r} is code, which is never imported because a file names it; name a preset")

@@ -37,7 +37,7 @@ class Preparation:
     priors: list[Prior] | None
     """One a view; None where nothing asks for them."""
     notes: list[str]
-    """Sentences on what was chosen, assumed and missing."""
+    """Notes on choices, assumptions and missing inputs."""
 
 
 def prepare(
@@ -73,7 +73,7 @@ def prepare(
 
     @functools.cache
     def start() -> Start:
-        progress("finding the first points")
+        progress("finding start points")
         # what is searched for along lines is searched for in pinholes; given points need no search
         views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
         found = initial_points(views, points, config.init, generator, usable, progress)
@@ -116,7 +116,7 @@ def needs_priors(config: FitConfig) -> bool:
 
 
 def terms_of(config: FitConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
-    """Return all loss terms of a fit by its settings; ``cutout`` says that its views know their opacity."""
+    """Return all loss terms of a fit by its settings; ``cutout``: its images have an alpha channel."""
     return (*built_in_terms(config.loss, cutout), *config.loss_terms)
 
 

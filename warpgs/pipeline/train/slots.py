@@ -20,7 +20,7 @@ SUMMED = 2
 Node = tuple[int, int]
 """Slots of a subtree: the first, and the one behind the last."""
 ALIGNMENT = 16
-"""Floats to whose multiples the parts of a sum begin: Adam reads four at a time."""
+"""Alignment of the parts of a sum, in floats: Adam reads four at a time."""
 
 
 MAX_RENDERS = 2**24

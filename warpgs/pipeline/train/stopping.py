@@ -194,11 +194,11 @@ class Stopping:
         lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
         if lately.upper_bound_below(c.min_gain_db, c.noise):
             return (
-                f"the held-out blocks gained {lately.mean:+.3f} dB in the last {step - since:,} steps, which with "
-                f"{c.noise:g} x its noise of {lately.noise:.3f} dB is less than {c.min_gain_db:g} dB"
+                f"held-out pixels no longer improve ({lately.mean:+.3f} dB in the last {step - since:,} steps, noise "
+                f"{lately.noise:.3f} dB)"
             )
         if step == self.marks[-1]:
-            return f"its time was up, after {self.measurements[-1].gain:+.3f} dB since the measurement before"
+            return f"its planned steps are done ({self.measurements[-1].gain:+.3f} dB since the last measurement)"
         return ""
 
     def _is_early(self, step: int) -> bool:

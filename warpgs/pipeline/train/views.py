@@ -38,7 +38,7 @@ class TrainingView:
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
-    """Opacity of what was photographed, in [0, 1], shape [H, W]; None where no training view has one (`with_alpha`)."""
+    """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one (`with_alpha`)."""
     learned: LearnedView | None = None
     """Part of the view in the view modules of the fit; None without view modules."""
 
@@ -158,7 +158,7 @@ class ViewStack:
     numbers: torch.Tensor
     """Number of each view among all training views, int64, shape [V]."""
     alphas: Rows | None = None
-    """Opacity of what was photographed, shape [V, H, W]; None where no training view has one."""
+    """Opacity of the subject, shape [V, H, W]; None if no training view has one."""
 
     @property
     def size(self) -> tuple[int, int]:

@@ -34,6 +34,6 @@ class LossConfig:
 
 
 def built_in_terms(config: LossConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
-    """Return the terms that every fit has by its settings; ``cutout`` says that its views know their opacity."""
+    """Return the terms that every fit has by its settings; ``cutout``: its images have an alpha channel."""
     alpha = (AlphaDifference(config.alpha_weight),) if config.alpha_weight > 0 and cutout else ()
     return (Photometric(config.ssim_weight), *alpha)

@@ -1,4 +1,4 @@
-"""The opacity term, for views that know the opacity of what they show."""
+"""The opacity term, for images with an alpha channel."""
 
 from __future__ import annotations
 

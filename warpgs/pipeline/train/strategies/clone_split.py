@@ -35,7 +35,7 @@ class CloneSplit(Strategy):
         return self.gradients.gathers(step)
 
     def statistics(self, phase, v_projected, visible, size):
-        """Return what is gathered of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
+        """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
         return self.gradients.statistics(v_projected, visible, size) if phase else {}
 
     def due(self, step: int) -> bool:

@@ -18,7 +18,7 @@ from warpgs.pipeline.train.strategies.event_times import EventTimes
 from warpgs.scene import Gaussians
 
 RESET_FREE_STEPS = 500
-"""Steps before the last event in which no opacity is reset any more: what is transparent then stays so."""
+"""Steps before the last event without opacity resets: transparent Gaussians would stay transparent."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ NOT_SAMPLED = -(2**30)
 """``created_step`` of Gaussians that were not sampled: the coarse layer."""
 _COUNT = schema.whole(0)
 EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
-"""Schema of what is stored of an event."""
+"""Schema of a stored event."""
 
 
 @register("importance_sampling")
@@ -106,7 +106,7 @@ class ImportanceSampling(Strategy):
             logits.copy_(torch.where(held, logits.clamp_min(self.method.protect.logit), logits))
 
     def statistics(self, phase, v_projected, visible, size):
-        """Return what is gathered of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
+        """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
         return self.gradients.statistics(v_projected, visible, size) if phase[0] else {}
 
     def samples_after(self, step: int) -> bool:

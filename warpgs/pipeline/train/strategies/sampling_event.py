@@ -42,7 +42,7 @@ class ProtectConfig:
     steps: int = 500
     """Age [steps] up to which a sampled Gaussian is protected (T_protect, which the paper leaves open): five refinements."""
     opacity: float = 0.05
-    """Least opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times what is pruned."""
+    """Least opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times the pruning threshold."""
 
     def __post_init__(self):
         if self.steps < 0 or not 0 < self.opacity < 1:

@@ -134,7 +134,7 @@ class ViewModule:
         return given
 
     def figures(self, fitted: FittedViews) -> dict[str, Any]:
-        """Return what was learned, plain values for metrics.json; ``summary`` is a note for output and report."""
+        """Return the learned values, plain, for metrics.json; ``summary`` is a note for output and report."""
         return {"summary": f"view module {self.name}: {', '.join(fitted.params)} of {len(fitted.train)} training views learned"}
 
 
@@ -152,10 +152,12 @@ def check_modules(modules: Sequence[ViewModule]) -> None:
     for i, module in enumerate(modules):
         kind = type(module)
         if not isinstance(module, ViewModule):
-            raise UsageError(f"{module!r} is no view module: give an instance of a class that derives from warpgs.ViewModule")
+            raise UsageError(
+                f"{module!r} is not a view module: give an instance of a class that derives from warpgs.ViewModule"
+            )
         if not VIEW_MODULES.has(kind):
             raise UsageError(
-                f"the view module {kind.__qualname__} has no name of its own, by which a run folder could tell it; register it "
+                f"the view module {kind.__qualname__} has no registered name; register it "
                 'with @register("name") of warpgs.pipeline.train.view_modules.base above the class, or name it as module:Class'
             )
         if any(type(m) is kind for m in modules[:i]):

@@ -28,7 +28,7 @@ EXPOSURE = "exposure_affine"
 """Name of the parameters: rows of [A - 1 | b], shape [V, 12]."""
 CHANNELS = 3
 GRAY = 0.5
-"""Gray whose brightness under an exposure is told."""
+"""Gray for which the brightness under an exposure is reported."""
 
 
 def exposure_of(rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
@@ -99,8 +99,7 @@ class Exposure(ViewModule):
         for v in views:
             if v.alpha is not None:
                 raise UsageError(
-                    f"--exposure is for opaque photographs, and {v.name} knows its opacity: its background is no part of the "
-                    "photograph; leave --exposure out"
+                    f"--exposure does not support images with an alpha channel, as {v.name} has; leave --exposure out"
                 )
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
@@ -144,7 +143,7 @@ class Exposure(ViewModule):
         views = [{"name": n, "affine": m.tolist(), "gain": float(g)} for n, m, g in each]
         summary = (
             f"exposures learned: the training views show a middle gray {gains.min():.2f} to {gains.max():.2f} times as bright "
-            "as the model, whose colours are those of their mean exposure; every score is of renders without an exposure"
+            "as the model, with colours of their mean exposure; all scores use renders without an exposure"
         )
         renders = ((v, render_view(fitted.gaussians, v, fitted.options)[0]) for v in fitted.test)
         scores = [s for v, image in renders if np.isfinite(s := matched_psnr(v, image))]
