@@ -71,7 +71,9 @@ class Rule:
     """True to blend the Gaussian that crosses the stop, so that at most 1e-4 of the pixel is left for what lies behind, and
     accumulated alpha is monotone in every opacity within that. False to drop it, which leaves up to 1e-2."""
     near: float = NEAR
-    """Nearest depth rendered [u]."""
+    """Nearest depth rendered [u], at least 0."""
+    far: float = FAR
+    """Farthest depth rendered [u], at most 1e10."""
     low_pass: float = LOW_PASS
     """Variance added to both image axes [px^2]."""
     square_sigma: float = 0.0
