@@ -1,4 +1,4 @@
-"""Near and far plane: Gaussians outside are not there, on every way to render."""
+"""Near and far plane: Gaussians outside are not there, on every way to render (graphed calls: `test_graphed.py`)."""
 
 import dataclasses
 import math
@@ -8,7 +8,6 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import FAR, RULES
-from warpgs.render.graphed import MIN_CALLS
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 
 PLANES = {"near": 3.5, "far": 4.5}
@@ -65,20 +64,6 @@ def test_planes_are_inclusive(device, dtype):
     g.means[:] = torch.stack([torch.zeros(6, dtype=dtype), torch.zeros(6, dtype=dtype), torch.stack(depths)], 1)
     counts = rasterize(g, cam, RasterizeOptions(**PLANES)).tile_counts[0]
     assert (counts > 0).tolist() == [False, True, True, True, True, False]
-
-
-@pytest.mark.cuda
-def test_captured_calls_follow_a_change_of_planes():
-    """Other planes are another graph; the bits are those without a graph."""
-    device = torch.device("cuda", 0)
-    g, cam = leaves(cloud(200, device=device)), camera(64, 48, dtype=torch.float32, device=device)
-    for planes in ({}, PLANES, {"far": 4.0}):
-        for _ in range(MIN_CALLS + 2):
-            graphed = rasterize(g, cam, RasterizeOptions(**planes))
-        plain = rasterize(g, cam, RasterizeOptions(**planes, record=False))
-        assert torch.equal(graphed.rgb, plain.rgb)
-        found, expected = (torch.autograd.grad(r.rgb.sum(), list(g.tensors().values())) for r in (graphed, plain))
-        assert all(torch.equal(a, b) for a, b in zip(found, expected))
 
 
 @pytest.mark.parametrize(
