@@ -57,12 +57,15 @@ image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for 
 @document_fields
 @dataclass(frozen=True)
 class Rule:
-    """A consistent set of cut-offs for projection and blending."""
+    """A consistent set of cut-offs for projection and blending.
+
+    Lengths [u] are in the unit of the Gaussians.
+    """
 
     name: str
     """Name in options and reports."""
     alpha_cut: float = ALPHA_CUT
-    """Smallest alpha that is blended; 0 blends all, and every Gaussian then spans every tile."""
+    """Smallest alpha that is blended, 1/255 by default; 0 blends all, and every Gaussian then spans every tile."""
     alpha_max: float = ALPHA_MAX
     """Largest alpha; where alpha is clamped to it, its gradient is zero."""
     transmittance_stop: float = TRANSMITTANCE_STOP
