@@ -1,4 +1,4 @@
-"""Write the pages that show results: docs/performance.md with its charts, docs/measured.md, and the tables of docs/accuracy.md.
+"""Write the generated parts of docs/ and the charts of docs/performance.md from bench/results.
 
 usage: python -m bench.document
 The same results give the same bytes.
@@ -6,18 +6,15 @@ The same results give the same bytes.
 
 from __future__ import annotations
 
-from bench.lib import accuracy_page, measured_page, performance_page, result_file
+from bench.lib.pages import DOCS, files
 from warpgs.files import write_text
 
 
 def main() -> None:
     """Write the files."""
-    docs = result_file.ROOT / "docs"
-    files = performance_page.files(result_file.stored("ops")) | {"measured.md": measured_page.page()}
-    files["accuracy.md"] = accuracy_page.filled((docs / "accuracy.md").read_text("utf-8"))
-    for path, text in files.items():
-        (docs / path).parent.mkdir(parents=True, exist_ok=True)
-        write_text(docs / path, text)
+    for path, text in files().items():
+        (DOCS / path).parent.mkdir(parents=True, exist_ok=True)
+        write_text(DOCS / path, text)
 
 
 if __name__ == "__main__":

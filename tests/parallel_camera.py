@@ -54,6 +54,10 @@ def make_parallel(real):
         return position[2] >= near and wp.isfinite(position[2])
 
     @wp.func
+    def depth_of(position: vec3) -> real:
+        return position[2]
+
+    @wp.func
     def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
         u = K[0, 0] * bent(position[0], lens[0], lens[1]) + K[0, 2]
         v = K[1, 1] * bent(position[1], lens[2], lens[3]) + K[1, 2]
@@ -101,6 +105,6 @@ def make_parallel(real):
         return g
 
     return SimpleNamespace(
-        in_range=in_range, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
+        in_range=in_range, depth_of=depth_of, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
         axes_backward=axes_backward, position_backward=position_backward,
     )  # fmt: skip

@@ -8,9 +8,9 @@ from xml.etree import ElementTree
 import pytest
 import torch
 
-from bench.lib import accuracy_page, inputs, measured_page, ops, peers, performance_page, result_file, timing
+from bench.lib import inputs, ops, pages, peers, performance_page, timing
 from bench.lib.ops import OPS, Bench, run
-from bench.lib.points import Point, exponent, growth, points
+from bench.lib.points import Point, growth, points
 from warpgs import rasterize
 from warpgs.kernels.ssim import ssim
 
@@ -135,15 +135,6 @@ def test_peers_draw_and_score_the_same():
     assert (ssim(a, b) - peers.torch_ssim(a, b)).abs().max() < 1e-4
 
 
-def test_the_exponent_of_a_power_law_is_found():
-    """Exactly, from the last decade alone; None where there is nothing to fit."""
-    points = [(10.0**k, 3 * 10.0 ** (1.4 * k)) for k in range(3, 8)]
-    assert exponent(points) == pytest.approx(1.4)
-    assert exponent([(1e3, 5.0), (1e4, 5.0), (1e5, 5.0), (1e6, 50.0)]) == pytest.approx(1.0)
-    assert exponent([(504 * 378, 1.0), (1920 * 1080, 10.0)]) is not None
-    assert exponent([(1e3, 1.0)]) is None and exponent([(1e3, 1.0), (1e6, 2.0)]) is None
-
-
 def hand_made(device: str) -> dict:
     """A result as `run` makes it, small enough to read."""
     size = {"width": 504, "height": 378}
@@ -170,35 +161,30 @@ def hand_made(device: str) -> dict:
     }  # fmt: skip
 
 
-def test_the_document_says_what_the_results_say():
-    """Tables, ratios, exponents, reasons; charts are well-formed; the same results give the same bytes."""
-    results = {"b": hand_made("cuda"), "a": hand_made("cpu")}
-    files = performance_page.files(results)
-    assert files == performance_page.files(json.loads(json.dumps(dict(reversed(results.items())))))
-    text = files["performance.md"]
-    assert text.index("(a)\n") < text.index("(b)\n")
-    assert all(f"| render | warpgs | both | {cell} |  | 1.00 |  |" in text for cell in ("100", "100 / 1"))
-    assert "| ssim | warpgs | forward |  | 14.4 |  | 1.00 |" in text
-    assert "| 100,000 | 504 x 378 | gsplat | 200 | 100 | 2 |" in text
-    assert "predicted 9 s: 1 of render both (gsplat)" in text and "naive: not there" in text
-    svgs = {path: svg for path, svg in files.items() if path.endswith(".svg")}
-    assert {"plots/a_pixels.svg", "plots/a_whole.svg", "plots/b_whole.svg"} <= set(svgs)
-    for path, svg in svgs.items():
-        assert ElementTree.fromstring(svg).tag.endswith("svg") and path.removeprefix("plots/") in text
+def test_performance_tables_hold_the_results():
+    """Tables, ratios, memory, fractions of the roof; charts are well-formed; the same results give the same bytes."""
+    results = {"a": hand_made("cpu"), "b": hand_made("cuda")}
+    assert "| 100,000, 504 x 378 | 2 cores |  | 100 |  |" in performance_page.sizes_table(results)
+    assert "| render | both | 100 | 25 % | 100 | 1 | 25 % |" in performance_page.ops_table(results)
+    assert "| 2 cores | render | both | 100,000, 504 x 378 | gsplat | 200 | 100 | 2 |" in performance_page.peers_table(results)
+    svgs = performance_page.plots(results)
+    assert svgs == performance_page.plots(json.loads(json.dumps(dict(reversed(results.items())))))
+    assert set(svgs) == {"plots/a_pixels.svg", "plots/a_whole.svg", "plots/b_pixels.svg", "plots/b_whole.svg"}
+    assert all(ElementTree.fromstring(svg).tag.endswith("svg") for svg in svgs.values())
 
 
-def test_the_document_is_that_of_the_committed_results():
-    """docs/performance.md and its charts are what `python -m bench.document` writes, and nothing else lies there."""
-    files = performance_page.files(result_file.stored("ops"))
-    docs = result_file.ROOT / "docs"
-    for path, text in files.items():
-        assert (docs / path).read_text("utf-8") == text, f"{path} is stale: run python -m bench.document"
-    assert {f"plots/{p.name}" for p in (docs / "plots").glob("*.svg")} == set(files) - {"performance.md"}
+def test_generated_parts_of_a_page_are_replaced_by_name():
+    """Text outside the marks stays; a missing part, and marks without one, are errors."""
+    page = "a\n<!-- x y: written by bench.document -->\nold\n<!-- end of x y -->\nb\n"
+    assert pages.filled(page, {"x y": "new\n"}) == page.replace("old\n", "\nnew\n\n")
+    for parts in ({}, {"x y": "", "z": ""}):
+        with pytest.raises(ValueError, match="x y"):
+            pages.filled(page, parts)
 
 
-def test_the_other_pages_are_those_of_the_committed_results():
-    """docs/measured.md and the tables of docs/accuracy.md are what `python -m bench.document` writes."""
-    docs = result_file.ROOT / "docs"
-    assert (docs / "measured.md").read_text("utf-8") == measured_page.page(), "stale: run python -m bench.document"
-    page = (docs / "accuracy.md").read_text("utf-8")
-    assert accuracy_page.filled(page) == page, "stale: run python -m bench.document"
+def test_pages_and_charts_are_those_of_the_kept_results():
+    """The generated parts of docs/ are what `python -m bench.document` writes, and docs/plots holds nothing else."""
+    files = pages.files()
+    stale = [path for path, text in files.items() if (pages.DOCS / path).read_text("utf-8") != text]
+    assert not stale, f"{', '.join(stale)} differ from bench/results: run python -m bench.document"
+    assert {f"plots/{p.name}" for p in (pages.DOCS / "plots").glob("*.svg")} == {p for p in files if p.startswith("plots/")}

@@ -1,6 +1,7 @@
 """Whatever the documents name is there: files, tests and flags. Links and formulas are checked by `make docs`."""
 
 import ast
+import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -85,3 +86,39 @@ def test_every_line_of_the_security_page_names_a_test_that_is_there():
         assert named, row
         for path, name in named:
             assert re.search(rf"^def {name}\(", (ROOT / "tests" / path).read_text("utf-8"), re.M), f"{path}::{name}"
+
+
+def named_results(text: str) -> set[str]:
+    """Return the names of result files in a text; patterns such as ``ops_MACHINE.json`` are left out."""
+    kept, spelled = r"\b\w+_(?:h200|cpu\d*)\.(?:json|md|svg|csv)\b", r"(?<=bench/results/)\w+\.\w+"
+    return {name for name in re.findall(f"{kept}|{spelled}", text) if "MACHINE" not in name}
+
+
+def gone_presets(command: str) -> set[str]:
+    """Return the presets of a command that are gone; ``default:setting=value`` and ``pruned/default`` count as default."""
+    names, taking = set(), False
+    for word in command.split():
+        if word.startswith("--"):
+            taking = word in ("--preset", "--presets", "--trials")
+        elif taking:
+            names |= {part.split(":")[0].split("/")[-1] for part in word.split(",") if "=" not in part.split(":")[0]}
+    return names - set(PRESETS) - {"gsplat", ""}
+
+
+def test_pages_and_kept_results_agree():
+    """Named files are there; results of uncommitted code are called -dirty; no file is unnamed; gone presets are noted."""
+    pages = [*PAGES, ROOT / "bench/README.md", *sorted((ROOT / "docs/decisions").glob("*.md"))]
+    kept = {p.name: p for p in (ROOT / "bench/results").iterdir()}
+    results = {name: json.loads(p.read_text("utf-8")) for name, p in kept.items() if p.suffix == ".json"}
+    dirty = {name for name, values in results.items() if (values["commit"] or "").endswith("-dirty")}
+    texts = {page: page.read_text("utf-8") for page in pages}
+    broken = [f"{page.name}: no {name}" for page, text in texts.items() for name in sorted(named_results(text) - kept.keys())]
+    for page, text in texts.items():
+        paragraphs = [part for part in text.split("\n\n") if "-dirty" not in part]
+        broken += [f"{page.name}: {name} is -dirty" for part in paragraphs for name in sorted(named_results(part) & dirty)]
+    named = {Path(name).stem for text in texts.values() for name in named_results(text)}
+    broken += [f"{name}: no page names it" for name in sorted(kept) if Path(name).stem not in named]
+    for name, values in results.items():
+        gone = gone_presets(values["command"] or "")
+        broken += [f"{name}: preset {preset} is gone" for preset in sorted(gone) if preset not in values.get("note", "")]
+    assert not broken, "\n".join(broken)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import SMOOTH, camera, hand_placed
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed
+from tests.lens_cameras import LENSES, lens_camera
 from warpgs import geometry
 from warpgs.errors import UsageError
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -66,6 +67,8 @@ def test_normals_of_gaussians_are_their_shortest_axes():
         assert bool(((normals @ viewmat[:3, :3].T * in_camera).sum(1) < 0).all())
         one = Camera(viewmat.numpy(), cams.K[0].numpy(), cams.width, cams.height)
         assert torch.allclose(geometry.gaussian_normals(g, one), normals, atol=1e-15)
+        parallel = geometry.gaussian_normals(g, dataclasses.replace(one, model="orthographic"))
+        assert bool((parallel @ viewmat[2, :3] < 0).all()) and torch.equal(parallel.abs(), normals.abs())
 
 
 def test_gradient_of_the_normals_of_gaussians():
@@ -140,13 +143,31 @@ def test_gradient_of_normals():
     assert not bool(geometry.depth_normals(cam, depth[:2]).any())
 
 
+@pytest.mark.parametrize("model", LENSES)
+def test_points_come_back_from_lenses(model):
+    """Pixels and depths of the rasterizer, and back; behind a pinhole there is nothing to see."""
+    cam = lens_camera(model, width=40, height=30)
+    arrays = Camera(*(a if isinstance(a, int | str | None) else a.numpy() for a in vars(cam).values()))
+    points = np.random.default_rng(2).uniform(-1, 1, (50, 3)) + np.array([0, 0, 4])
+    pixels, depths = geometry.project_points(arrays, points)
+    gaussians = cloud(50, torch.float64)
+    drawn = rasterize(dataclasses.replace(gaussians, means=torch.from_numpy(points)), cam).projected[0]
+    shown = drawn[:, 5] > 0
+    assert shown.any() and np.allclose(drawn[shown][:, [0, 1, 9]], np.column_stack([pixels, depths])[shown], atol=1e-9)
+    assert np.allclose(geometry.back_project(arrays, pixels, depths), points, atol=1e-9)
+    found = geometry.back_project_tensors(cam, torch.from_numpy(pixels), torch.from_numpy(depths))
+    assert np.allclose(found.numpy(), points, atol=1e-9)
+    if model == "opencv":
+        assert geometry.project_points(arrays, -points)[1].tolist() == [0] * 50
+
+
 def test_other_camera_models_are_refused():
     """Their projection is known to the kernels alone: an error, not wrong points."""
     cam = camera()
-    arrays = Camera(cam.viewmat.numpy(), cam.K.numpy(), 18, 17, "orthographic")
-    with pytest.raises(UsageError, match="'orthographic'; undistort"):
+    arrays = Camera(cam.viewmat.numpy(), cam.K.numpy(), 18, 17, "own")
+    with pytest.raises(UsageError, match="'own'; undistort"):
         geometry.project_points(arrays, np.zeros((1, 3)))
     with pytest.raises(UsageError, match="undistort"):
         geometry.back_project(arrays, np.zeros((1, 2)), np.ones(1))
     with pytest.raises(UsageError, match="undistort"):
-        geometry.back_project_tensors(dataclasses.replace(cam, model="orthographic"), torch.zeros(1, 2), torch.ones(1))
+        geometry.back_project_tensors(dataclasses.replace(cam, model="own"), torch.zeros(1, 2), torch.ones(1))

@@ -106,7 +106,8 @@ def test_every_kernel_file_has_mutants_and_tests(candidates):
             ast.parse(c.edit.apply((ROOT / c.file).read_bytes()))
     small, large = sample(candidates, 200, 0), sample(candidates, 400, 0)
     assert sample(candidates, 200, 0) == small and set(small) < set(large) and set(sample(candidates, 200, 1)) != set(small)
-    assert 200 <= len(small) <= 240 and {c.file for c in small} == {c.file for c in candidates}
+    every = {c.file for c in candidates}  # each file has one at least
+    assert 200 <= len(small) <= 200 + len(every) and {c.file for c in small} == every
 
 
 def functions_of(file):

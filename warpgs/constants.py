@@ -53,6 +53,9 @@ FRUSTUM_MARGIN = 0.15
 """Margin around the image, as a fraction of its size on every side. The Jacobian is taken at the projected mean, clamped to the
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
+RIM_SAMPLES = 16
+"""Points between the axis and a position at which a lens must not fold back, the last of them the position itself."""
+
 
 @document_fields
 @dataclass(frozen=True)

@@ -6,10 +6,12 @@ Functions that take tensors import torch when they are called, so that readers o
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpgs import lenses
 from warpgs.errors import UsageError
 from warpgs.scene import ActivatedGaussians, Camera, Gaussians
 
@@ -57,16 +59,27 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def check_pinhole(camera: Camera) -> None:
-    """Check that a camera is a pinhole: other models are known to the kernels alone.
+    """Check that a camera is a pinhole, for code that takes lines for lines.
 
     Raises:
         UsageError: It is not.
     """
     if camera.model != "pinhole":
         raise UsageError(
-            f"points are projected outside of the rasterizer for pinhole cameras only, and this one is {camera.model!r}; "
-            "undistort the images first"
+            f"this works for pinhole cameras only, and this one is {camera.model!r}; read the scene with --lenses "
+            "undistort, or undistort the images first"
         )
+
+
+def pinhole_of(camera: Camera) -> Camera:
+    """Return the pinhole of the same pose, K and size, which renders without distortion; it sees less than a wide fisheye.
+
+    Raises:
+        UsageError: The camera is orthographic, or its model is known to the kernels alone.
+    """
+    if camera.model not in lenses.CENTRAL:
+        check_pinhole(camera)
+    return replace(camera, model="pinhole", distortion=None) if camera.model != "pinhole" else camera
 
 
 def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -107,54 +120,77 @@ def relative_pose(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray
 
 
 def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels [N, 2] (pixel centres at +0.5) and z-depths [N] [u] of world points [N, 3].
+    """Return pixels [N, 2] (pixel centres at +0.5) and depths [N] [u] of world points [N, 3].
+
+    Depths are those of a render: z, of a fisheye the distance. Where a lens other than a pinhole cannot see, depth is 0.
 
     Raises:
-        UsageError: The camera is no pinhole.
+        UsageError: The camera model is known to the kernels alone.
     """
-    check_pinhole(camera)
     in_camera = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = in_camera[:, 2]
+    if camera.model != "pinhole":
+        with np.errstate(all="ignore"):
+            plane = lenses.to_plane(camera.model, camera.distortion, in_camera)
+            seen = np.isfinite(plane).all(1) & lenses.on_lens(camera.model, camera.distortion, in_camera)
+        plane = np.where(seen[:, None], plane, 0) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
+        return plane, np.where(seen, lenses.depth_of(camera.model, in_camera), 0)
     safe = np.where(z == 0, np.finfo(float).tiny, z)
     pixels = matmul(in_camera / safe[:, None], camera.K.T)
     return pixels[:, :2], z
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and z-depths [N] [u].
+    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u] as `project_points` has them.
+
+    A pixel that a lens does not reach gives NaN.
 
     Raises:
-        UsageError: The camera is no pinhole.
+        UsageError: The camera model is known to the kernels alone.
     """
-    check_pinhole(camera)
-    homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
-    in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
+    if camera.model == "pinhole":
+        homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+        in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
+    else:
+        plane = (pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
+        in_camera = _at_depth(camera, lenses.from_plane(camera.model, camera.distortion, plane), depths)
     return matmul(in_camera - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
 
 
 def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
-    """Return what `back_project` returns for tensors, R^T (d K^-1 [x y 1] - t), without a product of matrices.
+    """Return what `back_project` returns for tensors, of a pinhole R^T (d K^-1 [x y 1] - t), without a product of matrices.
 
     Such a product would load another library on CUDA. Of K only focal lengths and principal point count, as in projection.
 
     Args:
         camera: Its tensors are float32 or float64, on the device of the others.
         pixels: Positions (x, y) with centres at +0.5 [px], shape [S, 2].
-        depths: z-depths [u], shape [S].
+        depths: Depths [u], shape [S].
 
     Returns:
         World points [u], shape [S, 3].
 
     Raises:
-        UsageError: The camera is no pinhole.
+        UsageError: The camera model is known to the kernels alone.
     """
     import torch
 
-    check_pinhole(camera)
     K, viewmat = camera.K, camera.viewmat
-    x, y = ((pixels[:, i] - K[i, 2]) / K[i, i] * depths for i in range(2))
-    moved = torch.stack([x, y, depths], 1) - viewmat[:3, 3]
-    return (moved[:, :, None] * viewmat[:3, :3]).sum(1)
+    if camera.model == "pinhole":
+        x, y = ((pixels[:, i] - K[i, 2]) / K[i, i] * depths for i in range(2))
+        in_camera = torch.stack([x, y, depths], 1)
+    else:
+        plane = torch.stack([(pixels[:, i] - K[i, 2]) / K[i, i] for i in range(2)], 1)
+        in_camera = _at_depth(camera, lenses.from_plane(camera.model, camera.distortion, plane), depths)
+    return ((in_camera - viewmat[:3, 3])[:, :, None] * viewmat[:3, :3]).sum(1)
+
+
+def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:
+    """Return the positions in the camera [S, 3] at depths [S], from those at depth 1 [S, 3]."""
+    scaled = rays * depths[:, None]
+    if camera.model == "orthographic":  # parallel rays
+        scaled[:, :2] = rays[:, :2]
+    return scaled
 
 
 def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
@@ -198,7 +234,7 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
 
 
 def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) -> torch.Tensor:
-    """Compute the normal of each Gaussian: its shortest axis, on the side of the camera's centre.
+    """Compute the normal of each Gaussian: its shortest axis, on the side of the camera.
 
     Differentiable in ``quats``. Which axis and which side has no gradient. A round Gaussian has no normal of meaning. As
     `RasterizeOptions.features` the normals render an image of normals.
@@ -217,7 +253,8 @@ def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) 
     normals = torch.take_along_dim(axes, scales.argmin(-1)[:, None, None], 2)[..., 0]
     viewmat = torch.as_tensor(camera.viewmat).detach().to(means)
     center = -(viewmat[..., :3, :3] * viewmat[..., :3, 3:]).sum(-2)
-    faces = (normals.detach() * (center[..., None, :] - means.detach())).sum(-1, keepdim=True) >= 0
+    away = viewmat[..., 2:3, :3] if camera.model == "orthographic" else means.detach() - center[..., None, :]
+    faces = (normals.detach() * away).sum(-1, keepdim=True) <= 0
     return torch.where(faces, normals, -normals)
 
 

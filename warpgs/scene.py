@@ -34,10 +34,10 @@ class Camera:
     height: int
     """Image height [px]."""
     model: str = "pinhole"
-    """Name of the camera model (`warpgs.kernels.cameras`)."""
+    """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/python.md), or one of your own."""
     distortion: Array | None = None
-    """Coefficients of the camera model, shape [P] or [C, P]; None for a model without, as pinhole is. No gradients flow into
-    them."""
+    """Coefficients of the camera model, shape [P] or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4, k1 to k4;
+    None for a model without. No gradients flow into them."""
 
     @property
     def center(self) -> np.ndarray:
@@ -275,7 +275,7 @@ class Render:
     alpha: torch.Tensor
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
-    """Expected z-depth [u], divided by alpha; 0 where nothing is blended. Shape [..., H, W]."""
+    """Expected z-depth [u], of a fisheye the distance, divided by alpha; 0 where nothing is blended. Shape [..., H, W]."""
     projected: torch.Tensor
     """Projected Gaussians in the layout of kernels/project.py, shape [C, N, 12]; keeps gradients after ``retain_grad()``."""
     tile_counts: torch.Tensor

@@ -85,15 +85,10 @@ def needles_text(results: dict[str, dict]) -> str:
     return "\n".join(parts)
 
 
-def filled(page: str) -> str:
-    """The page with the text between each pair of marks made anew."""
-    bits = same_bits.table(result_file.read(same_bits.RESULTS)["rows"])
-    for name, text in (
-        ("budget", budget_text(result_file.stored("budget"))),
-        ("needles", needles_text(result_file.stored("needles"))),
-        ("same bits", bits),
-    ):
-        begin, end = f"<!-- {name}: written by bench.document -->\n", f"<!-- end of {name} -->"
-        before, rest = page.split(begin)
-        page = before + begin + "\n" + text + "\n" + end + rest.split(end)[1]
-    return page
+def parts() -> dict[str, str]:
+    """Return the generated parts of docs/accuracy.md by name."""
+    return {
+        "budget": budget_text(result_file.stored("budget")),
+        "needles": needles_text(result_file.stored("needles")),
+        "same bits": same_bits.table(result_file.read(same_bits.RESULTS)["rows"]),
+    }

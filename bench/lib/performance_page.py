@@ -1,12 +1,12 @@
-"""The page docs/performance.md and its charts from bench/results/ops_*.json; the same results give the same bytes."""
+"""The generated parts of docs/performance.md and its charts from bench/results; the same results give the same bytes."""
 
 from __future__ import annotations
 
-import re
-from collections import Counter
+import statistics
 
+from bench.lib import result_file
 from bench.lib.plot import Line, Panel, chart
-from bench.lib.points import BASE, DIAGONAL, SIZES, Point, Series, along, diagonal, exponent, tasks
+from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
 from bench.lib.tables import figure, markdown
 from bench.lib.timing import DISTURBED, OURS
 
@@ -14,35 +14,18 @@ COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
 }  # fmt: skip
-WORDS = ("op", "program", "direction", "peer", "bound by")
+WORDS = ("op", "program", "direction", "machine", "other", "Gaussians, image", "capture")
 """Columns that hold words."""
-INTRODUCTION = """# Performance
+POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
+"""Sizes of the table of renders and training steps."""
+WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
+"""Ops and directions of that table."""
+FITS = {"fern_cpu2": "fern, 3 photographs of 504 x 378 px", "temple_cpu2": "temple, 12 photographs of 640 x 480 px"}
+"""Results of whole commands, and the captures in words."""
 
-Written by `python -m bench.document` from `bench/results/ops_*.json`; do not edit. To measure a machine:
 
-<!-- docs-run: hours, or a GPU -->
-```bash
-python -m bench.kernels.ops --out bench/results/ops_MACHINE.json   # --device cpu, --budget SECONDS
-python -m bench.document
-```
-
-Times are medians of wall times in ms of one call, inputs loaded, from an idle device to an idle device. Programs that are
-compared run in turn, unless one is over 30 times slower. `both` is forward and backward together, `step` a training step:
-rendering, loss, backward pass, Adam. A star: other programs kept more than 0.2 cores busy, also on a second try.
-
-The scene is a random cloud under rule `exact`, degree 3, one camera; its Gaussians shrink as their number N grows. Columns of
-tables name N and the image [px]; charts, and the results with quartiles, have more sizes. *Over N* and *over px* are slopes of
-log time over log size through the last decade of sizes measured, around 100,000 Gaussians and 504 x 378 px: 1 is linear, below
-1 overhead still counts.
-
-Other programs: `torch conv2d` is SSIM as most trainers write it, `torch dense` a rasterizer without tiles in plain torch, up
-to 1,000 Gaussians, `naive` a kernel with one thread per pixel, `numpy` a sweep's paths, a line at a time, `gsplat` that package
-with `packed=False`, `gsplat + torch` a step of its rendering, the loss in plain torch and torch's fused Adam.
-
-Roofline: the least bytes and operations of a stage, counted by `bench/lib/roofline.py`, over ceilings measured at the start
-(the fastest of 30: triad of float32 arrays by torch.add, float32 multiply-adds in a Warp kernel). The fraction is the time
-at the roof over the time measured, on a GPU by its events; data that fits into caches can exceed 100 %.
-"""
+def _sources(kind: str, results: dict[str, dict]) -> str:
+    return "\n" + "\n".join(result_file.source(f"{kind}_{stem}") for stem in results)
 
 
 def _sizes(row: dict, names: list[str]) -> list[str]:
@@ -76,65 +59,93 @@ def _at(row: dict, point: Point) -> bool:
     return same and (row.get("width", point.width), row.get("height", point.height)) == (point.width, point.height)
 
 
-def _measured(row: dict | None) -> str:
-    """Return the time, and on CUDA the memory."""
-    memory = f" / {figure(row['peak_bytes'] / 2**20)}" if row and "peak_bytes" in row else ""
-    return _timing(row) + memory
+def _find(result: dict, task: tuple[str, str, str], point: Point) -> dict | None:
+    """Return the row of a task (op, program, direction) at a point."""
+    rows = (r for r in result["rows"] if (r["op"], r["program"], r["direction"]) == task)
+    return next((r for r in rows if _plain(r) and _at(r, point)), None)
 
 
-def times_table(rows: list[dict]) -> str:
-    """Tasks by sizes, of the base point and where Gaussians and image grow together, and the slopes along either size."""
-    plain = [r for r in rows if _plain(r)]
-    points = [Point(*sizes) for sizes in DIAGONAL[2:] if any(_at(r, Point(*sizes)) for r in plain)]
-    over = {axis: {(s.op, s.program, s.direction): s.points for s in along(rows, axis)} for axis in ("N", "pixels")}
+def sizes_table(results: dict[str, dict]) -> str:
+    """Return times of rendering and training steps by size and machine."""
     body = []
-    for op, program, direction in tasks(rows):
-        own = [r for r in plain if (r["op"], r["program"], r["direction"]) == (op, program, direction)]
-        cells = [_measured(next((r for r in own if _at(r, p)), None)) for p in points]
-        slopes = [exponent(over[axis].get((op, program, direction), ())) for axis in over]
-        cells += ["" if slope is None else f"{slope:.2f}" for slope in slopes]
-        if any(cells):
-            body.append([op, program, direction, *cells])
-    sizes = [f"{p.count:,}; {p.width} x {p.height}" for p in points]
-    return markdown(["op", "program", "direction", *sizes, "over N", "over px"], body, WORDS)
+    for point in POINTS:
+        for result in results.values():
+            rows = [_find(result, (op, OURS, direction), point) for op, direction in WHOLE]
+            if any(rows):
+                size = f"{point.count:,}, {point.width} x {point.height}"
+                body.append([size, result_file.machine_name(result), *map(_timing, rows)])
+    head = ["Gaussians, image", "machine", "render [ms]", "with gradients [ms]", "training step [ms]"]
+    return markdown(head, body, WORDS)
 
 
-def peer_table(rows: list[dict]) -> str:
-    """The largest size at which another program did the same work."""
-    ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
-    peers = [r for r in rows if r["program"] != OURS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
-    columns, body = ["N", "image"], []
-    for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
-        r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
-        mine = ours[r["op"], r["direction"], _key(r)]
-        ratio = figure(r["median_ms"] / mine["median_ms"])
-        body.append([op, direction, *_sizes(r, columns), program, _timing(r), _timing(mine), ratio])
-    head = ["op", "direction", *columns, "peer", "peer [ms]", "warpgs [ms]", "peer / warpgs"]
-    return markdown(head, body, WORDS) if body else ""
-
-
-def roof_table(rows: list[dict]) -> str:
-    """Our own tasks against the roof, where each was measured at its heaviest."""
+def gsplat_table(result: dict) -> str:
+    """Return times and memory beside gsplat; ratios are ours over gsplat's."""
     body = []
-    for op, program, direction in tasks(rows):
-        own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, program, direction) and "roof_ms" in r]
-        own = [r for r in own if _plain(r)] or own
-        if own:
-            r = max(own, key=lambda r: r["roof_ms"])
-            cells = [op, direction, *_sizes(r, ["N", "image"])]
-            cells += [r["bound"], figure(r["roof_ms"]), figure(r.get("gpu_ms", r["median_ms"]))]
-            body.append([*cells, f"{figure(100 * r['fraction'])} %"])
-    return markdown(["op", "direction", "N", "image", "bound by", "roof [ms]", "measured [ms]", "fraction"], body, WORDS)
+    for r in result["rows"]:
+        wall, steps, peak = r["wall_ms"], r["step_wall_ms"], r["peak_ratio"]
+        cells = [figure(t["median"]) for t in (wall["warpgs"], wall["gsplat dense"])]
+        cells += [f"{r['wall_ms_ratio']['warpgs']:.3f}", f"{r['wall_ms_ratio']['warpgs, never recorded']:.3f}"]
+        cells += [figure(steps["warpgs graph"]["median"]), figure(steps["gsplat"]["median"]), f"{r['step_ratio']:.3f}"]
+        cells += [f"{peak['warpgs']:.3f}", f"{peak['warpgs atomic']:.3f}"]
+        body.append([r["configuration"].replace(" at ", ", ").replace("x", " x "), *cells])
+    head = ["Gaussians, image", "warpgs [ms]", "gsplat [ms]", "ratio", "ratio, `record=False`", "step [ms]", "gsplat step [ms]"]
+    return markdown([*head, "ratio", "memory ratio", "atomic sums"], body, WORDS)
 
 
-def skipped_list(skipped: list[dict]) -> str:
-    """Return a list of the reasons, the first of each kind, with the tasks not measured and at how many sizes."""
-    groups: dict[str, tuple[str, Counter]] = {}
-    for r in skipped:
-        _, counts = groups.setdefault(re.sub(r"[\d.]+", "", r["reason"]), (r["reason"], Counter()))
-        counts[f"{r['op']} {r['direction']} ({r['program']})"] += 1
-    lines = (f"- {why}: " + ", ".join(f"{n} of {task}" for task, n in counts.items()) for why, counts in groups.values())
-    return "\n".join(lines) + "\n"
+def fits_table(results: dict[str, dict]) -> str:
+    """Return medians of whole commands by capture."""
+    body = []
+    for name, words in (
+        ("fern_cpu2", "fern, 3 photographs of 504 x 378 px"),
+        ("temple_cpu2", "temple, 12 photographs of 640 x 480 px"),
+    ):
+        rows = [r for r in results[name]["rows"] if r["side"] == "new"]
+        middle = {key: statistics.median(r[key] for r in rows) for key in ("setup", "training", "wall", "psnr")}
+        body.append([words, f"{rows[0]['steps']:,}", *(f"{middle[k]:.0f}" for k in ("setup", "training", "wall"))])
+        body[-1].append(f"{middle['psnr']:.2f}")
+    return markdown(["capture", "steps", "start [s]", "training [s]", "whole command [s]", "PSNR [dB]"], body, WORDS)
+
+
+def _roof(rows: list[dict], op: str, direction: str) -> str:
+    """Return the fraction of the roof of one of our tasks, where it was measured at its heaviest."""
+    own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, OURS, direction) and "roof_ms" in r and _plain(r)]
+    return f"{figure(100 * max(own, key=lambda r: r['roof_ms'])['fraction'])} %" if own else ""
+
+
+def ops_table(results: dict[str, dict]) -> str:
+    """Return time, memory and fraction of the roof of each of our tasks at the base size, by machine."""
+    every = [task for result in results.values() for task in tasks(result["rows"]) if task[1] == OURS]
+    head, body = ["op", "direction"], []
+    for result in results.values():
+        memory = [f"{result_file.machine_name(result)} [MiB]"] if result["machine"]["device"] == "cuda" else []
+        head += [f"{result_file.machine_name(result)} [ms]", *memory, f"{result_file.machine_name(result)}: of the roof"]
+    for op, _, direction in dict.fromkeys(every):
+        cells = [op, direction]
+        for result in results.values():
+            row = _find(result, (op, OURS, direction), BASE)
+            cells.append(_timing(row))
+            if result["machine"]["device"] == "cuda":
+                cells.append(figure(row["peak_bytes"] / 2**20) if row and "peak_bytes" in row else "")
+            cells.append(_roof(result["rows"], op, direction))
+        body.append(cells)
+    return markdown(head, body, WORDS)
+
+
+def peers_table(results: dict[str, dict]) -> str:
+    """Return the times of other programs at the largest size that both did."""
+    body = []
+    for result in results.values():
+        rows = result["rows"]
+        ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
+        peers = [r for r in rows if r["program"] != OURS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
+        for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
+            r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
+            mine = ours[r["op"], r["direction"], _key(r)]
+            size = ", ".join(filter(None, _sizes(r, ["N", "image"])))
+            cells = [program, _timing(r), _timing(mine), figure(r["median_ms"] / mine["median_ms"])]
+            body.append([result_file.machine_name(result), op, direction, size, *cells])
+    head = ["machine", "op", "direction", "Gaussians, image", "other", "other [ms]", "warpgs [ms]", "other / warpgs"]
+    return markdown(head, body, WORDS)
 
 
 def _lines(series: list[Series], name) -> tuple[Line, ...]:
@@ -180,47 +191,24 @@ def charts(title: str, rows: list[dict]) -> dict[str, str]:
     return made
 
 
-def machine_text(stem: str, result: dict, plots: list[str]) -> str:
-    """The section of one machine."""
-    versions = ", ".join(f"{k} {v}" for k, v in result["versions"].items())
-    machine = result["machine"]
-    facts = f"{machine['processor']}, {machine['cores']} cores, {machine['threads']} threads, {machine['memory_gib']} GiB"
-    if machine["device"] == "cuda":
-        facts = f"{machine['name']} ({machine['device_memory_gib']} GiB) beside {facts}"
-    roof, rows = result["roofline"], result["rows"]
-    memory = ""
-    if busy := [r["gpu_ms"] / r["median_ms"] for r in rows if "gpu_ms" in r and "median_ms" in r]:
-        memory = " / peak memory above the inputs [MiB]"
-        memory += f". The GPU's own time, kept in the results, is {min(busy):.0%} to {max(busy):.0%} of the wall time"
-    parts = [
-        f"## {machine['name']} ({stem})\n",
-        f"{facts}. {versions}. Commit {result['commit']}, {result['date']}, {result['repeats']} repeats."
-        + (f" {result['note'].rstrip('.')}." if result.get("note") else "")
-        + f" Results: `bench/results/ops_{stem}.json`.\n",
-        *(f"![{name} of {stem}](plots/{stem}_{name}.svg)\n" for name in plots),
-        f"### Times\n\nWall time [ms]{memory}.\n",
-        times_table(rows),
-    ]
-    if peers := peer_table(rows):
-        parts += ["### Beside other programs\n\nAt the largest size that both programs did.\n", peers]
-    if result.get("absent"):
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in sorted(result["absent"].items()))
-        parts.append(f"Not measured, because not there or not working: {reasons}.\n")
-    ceilings = f"{roof['bytes_per_s'] / 1e9:,.1f} GB/s and {roof['operations_per_s'] / 1e9:,.0f} Gop/s"
-    parts += [f"### Roofline\n\nCeilings: {ceilings}. Each task at its heaviest.\n", roof_table(rows)]
-    if result["skipped"]:
-        parts += ["### Not measured\n\nThe reason at the first of its kind, and the number of sizes.\n"]
-        parts.append(skipped_list(result["skipped"]))
-    return "\n".join(parts)
-
-
-def files(results: dict[str, dict]) -> dict[str, str]:
-    """Return all files, by path under docs/, from results by machine."""
-    made, sections = {}, [INTRODUCTION]
+def plots(results: dict[str, dict]) -> dict[str, str]:
+    """Return all charts by path under docs/, from results by machine."""
+    made = {}
     for stem, result in sorted(results.items()):
         machine = result["machine"]
         name = machine["name"] if machine["device"] == "cuda" else f"{machine['name']}, {machine['threads']} threads"
-        plots = charts(name, result["rows"])
-        made |= {f"plots/{stem}_{kind}.svg": svg for kind, svg in plots.items()}
-        sections.append(machine_text(stem, result, list(plots)))
-    return made | {"performance.md": "\n".join(sections)}
+        made |= {f"plots/{stem}_{kind}.svg": svg for kind, svg in charts(name, result["rows"]).items()}
+    return made
+
+
+def parts() -> dict[str, str]:
+    """Return the generated parts of docs/performance.md by name."""
+    ops, gsplat, turns = (result_file.stored(kind) for kind in ("ops", "gsplat", "turns"))
+    sources = _sources("ops", ops)
+    return {
+        "sizes": sizes_table(ops) + sources,
+        "gsplat": gsplat_table(gsplat["h200"]) + _sources("gsplat", gsplat),
+        "whole fits": fits_table(turns) + _sources("turns", turns),
+        "ops": ops_table(ops),
+        "other programs": peers_table(ops),
+    }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -107,8 +105,6 @@ def growth(small: dict, large: dict) -> float | None:
 
 
 SIZES = ("N", "width", "height", "degree", "cameras", "threads")
-DECADE = 11.0
-"""Span of the fit: 1920 x 1080 has 10.9 times as many pixels as 504 x 378, and that should count as a decade."""
 
 
 @dataclass(frozen=True)
@@ -170,12 +166,3 @@ def diagonal(rows: list[dict]) -> list[Series]:
         if len(points) > 1:
             found.append(Series(*task, tuple(sorted(points.items())), {}))
     return found
-
-
-def exponent(points: Sequence[tuple[float, float]]) -> float | None:
-    """Slope of log time over log size, by least squares through the last decade of sizes; None for fewer than two points."""
-    last = [(math.log(x), math.log(y)) for x, y in points if x * DECADE >= max(x for x, _ in points)]
-    if len(last) < 2:
-        return None
-    mean_x, mean_y = (sum(v) / len(last) for v in zip(*last))
-    return sum((x - mean_x) * (y - mean_y) for x, y in last) / sum((x - mean_x) ** 2 for x, _ in last)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -113,6 +114,25 @@ def read(path: Path) -> dict:
     if missing:
         raise ValueError(f"{path}: no result, it has no {', '.join(missing)}; measure again or choose another file")
     return values
+
+
+def machine_name(values: dict) -> str:
+    """Return the machine of a result in the words of the pages: ``2 cores``, ``H200``."""
+    return "2 cores" if values["machine"]["device"] == "cpu" else values["machine"]["name"].removeprefix("NVIDIA ")
+
+
+def source(name: str) -> str:
+    """Return a line on a kept result for the pages: file, machine, commit, command without its output, note."""
+    values = read(FOLDER / f"{name}.json")
+    machine = machine_name(values)
+    if values["machine"]["device"] == "cpu":
+        machine += ", " + values["machine"]["name"].replace("(R)", "").removesuffix(" Processor")
+    command = re.sub(r" --out [\w./]+", "", values["command"] or "")
+    fence = "``" if "`" in command else "`"
+    ran = f"{fence}{command}{fence}" if command else "command not kept"
+    commit = values.get("commits", {}).get("new") or values["commit"] or "not kept"
+    note = f" {values['note']}" if values.get("note") else ""
+    return f"Source: `{name}.json`; {machine}; commit {commit}; {ran}.{note}\n"
 
 
 def stored(kind: str) -> dict[str, dict]:

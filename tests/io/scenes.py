@@ -75,7 +75,17 @@ def pose_numbers(i: int) -> list[float]:
     return [*quaternion(VIEWMATS[i, :3, :3]), *VIEWMATS[i, :3, 3]]
 
 
-MODEL_IDS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5}
+MODEL_IDS = {
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RADIAL_FISHEYE": 9,
+}
 PINHOLE = (FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 
 

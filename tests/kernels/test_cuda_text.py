@@ -6,6 +6,7 @@ import pytest
 import warp as wp
 
 from warpgs.kernels import blend_channels, blend_cuda, median_depth, project
+from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.pipeline.runs.precompile import fit_kernels
 
 ARCHITECTURE = 75
@@ -22,6 +23,8 @@ def modules() -> dict[str, wp.Module]:
         for depth, absgrad in itertools.product((True, False), repeat=2):
             made = blend_cuda.make_backward(8, depth, 64, True, channels, absgrad)
             kernels += [made.backward, made.gather]
+    for model in CAMERA_MODELS.names():
+        kernels += [project.make_forward(wp.float32, True, model), project.make_backward(wp.float32, True, model)]
     return {k.module.name: k.module for k in kernels}
 
 

@@ -92,9 +92,14 @@ def test_a_step_renders_by_the_views_own_camera(fit, captured):
 
 
 def test_a_step_in_chunks_renders_the_same(fit):
-    """Chunks count the tiles of each window by the same camera."""
+    """Chunks count the tiles of each window by the same camera; its coefficients move Gaussians by tiles."""
     whole, chunks = rendered_alone(fit, 1), rendered_alone(fit, 1, max_instances=20)
     assert torch.equal(whole, chunks)
+    camera = ring(1, 160, 128)[0]
+    for number in (1, -1):
+        c = bent(camera, (0.8 * number, 0.0, -0.8 * number, 0.0))
+        renders = [rasterize(three_gaussians(), c, RasterizeOptions(max_instances=most)) for most in (None, 20)]
+        assert torch.equal(renders[0].rgb, renders[1].rgb) and float(renders[0].alpha.max()) > 0.5
 
 
 def test_memory_is_planned_for_the_instances_of_the_model(fit):
@@ -140,7 +145,7 @@ def test_run_folders_keep_the_model():
 def test_what_cannot_be_rendered_is_refused_before_the_first_step():
     """An unknown model, or one with other coefficients; the error says which."""
     first, *rest = views(2)
-    for change, words in (({"model": "fisheye"}, "no camera model 'fisheye'"), ({"distortion": np.zeros(2)}, "takes 4")):
+    for change, words in (({"model": "fish"}, "no camera model 'fish'"), ({"distortion": np.zeros(2)}, "takes 4")):
         wrong = dataclasses.replace(first, camera=dataclasses.replace(first.camera, **change))
         with pytest.raises(UsageError, match=words):
             Trainer([*rest, wrong], seeds(), CONFIG, CPU)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tests.gaussians import camera, cloud, leaves
+from tests.lens_cameras import LENSES, lens_camera
 from warpgs.constants import FAR, RULES
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 
@@ -46,6 +47,17 @@ def test_gaussians_outside_are_not_there(path, device, dtype):
     for name, tensor in found.tensors().items():
         assert torch.equal(tensor.grad[inside], expected.tensors()[name].grad)
         assert not bool(tensor.grad[~inside].any())
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_depth_of_a_lens(model, dtype, device):
+    """Along the z axis, or the distance from a fisheye."""
+    g, cam = cloud(200, dtype, device), lens_camera(model, width=64, height=48, dtype=dtype, device=device)
+    depths = g.means.norm(dim=1) if model == "fisheye" else g.means[:, 2]
+    inside = (depths >= PLANES["near"]) & (depths <= PLANES["far"])
+    seen = rasterize(g, cam).tile_counts[0] > 0
+    assert bool((seen & ~inside).any()) and bool((seen & inside).any())
+    assert torch.equal(rasterize(g, cam, RasterizeOptions(**PLANES)).tile_counts[0] > 0, seen & inside)
 
 
 def test_planes_are_inclusive(device, dtype):

@@ -11,7 +11,7 @@ import numpy as np
 
 from warpgs.errors import UsageError
 from warpgs.files import filling, is_empty, make_folder, write_json, write_text
-from warpgs.geometry import quaternions
+from warpgs.geometry import pinhole_of, quaternions
 from warpgs.scene import Camera
 
 NAMES = ("cameras.json", "transforms.json", "sparse")
@@ -31,14 +31,17 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
     Args:
         path: cameras.json or transforms.json, in any folder, where an existing file is replaced; or a folder named sparse, as
             COLMAP's text files in its folder 0, which must not be there yet.
-        cameras: Pinhole cameras in file units, numpy arrays.
+        cameras: Cameras in file units, numpy arrays; for lenses, pinholes of the same K are written, and a note says so.
 
     Raises:
         ResourceError: The folder or the disk does not take the file.
-        UsageError: The name says no format, or the folder is there.
+        UsageError: The name says no format, the folder is there, or a camera is orthographic.
     """
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")
+    bent = sum(c.model != "pinhole" for c in cameras)
+    notes = [f"{bent} of {len(cameras)} cameras have lenses with distortion, written as pinholes of the same K"] if bent else []
+    cameras = [pinhole_of(c) for c in cameras]
     if path.name == "transforms.json":
         write_json(path, {"camera_model": "PINHOLE", "frames": [_frame(i, c) for i, c in enumerate(cameras)]})
     elif path.name == "sparse":
@@ -52,8 +55,8 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
         write_json(path, [_inria(i, c) for i, c in enumerate(cameras)])
         off = max((max(abs(c.K[0, 2] - c.width / 2), abs(c.K[1, 2] - c.height / 2)) for c in cameras), default=0.0)
         if off > MAX_OFF_CENTER:
-            return [f"cameras.json holds no principal points; they lie up to {off:.1f} px from the middle of the images"]
-    return []
+            notes.append(f"cameras.json holds no principal points; they lie up to {off:.1f} px from the middle of the images")
+    return notes
 
 
 def _world_from_camera(camera: Camera) -> np.ndarray:

@@ -1,6 +1,6 @@
 """COLMAP reconstructions, binary and text: cameras, images, points (colmap.github.io, "Output Format").
 
-Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a pinhole scene needs and are not read.
+Other files of a reconstruction (rigs, frames, project.ini) hold nothing that a scene needs and are not read.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
 """Name and number of parameters by model number."""
-OTHER_MODELS = {
-    5: "OPENCV_FISHEYE", 6: "FULL_OPENCV", 7: "FOV", 8: "SIMPLE_RADIAL_FISHEYE", 9: "RADIAL_FISHEYE",
-    10: "THIN_PRISM_FISHEYE",
+NATIVE_MODELS = {
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 8: ("SIMPLE_RADIAL_FISHEYE", 4), 9: ("RADIAL_FISHEYE", 5),
 }  # fmt: skip
+"""Models that are read where lenses are kept, and are not undistorted here."""
+OTHER_MODELS = {7: "FOV", 10: "THIN_PRISM_FISHEYE"} | {number: name for number, (name, _) in NATIVE_MODELS.items()}
 STEMS = ("cameras", "images", "points3D")
 
 
@@ -143,48 +144,52 @@ def _store(table: dict, key: int, value: object, where: str) -> None:
 
 
 def _lens(where: str, model: str, width: int, height: int, p: tuple[float, ...]) -> Lens:
-    if model in ("PINHOLE", "OPENCV"):
+    fisheye = model.endswith("FISHEYE")
+    if "OPENCV" in model or model == "PINHOLE":
         (fx, fy, cx, cy), distortion = p[:4], p[4:]
     else:
         fx, cx, cy = p[:3]
         fy, distortion = fx, p[3:]
-        if distortion:  # SIMPLE_RADIAL has k1, RADIAL k1 and k2
+        if distortion and not fisheye:  # SIMPLE_RADIAL has k1, RADIAL k1 and k2
             distortion = (*distortion, *[0.0] * (4 - len(distortion)))
-    return Lens(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width, height, tuple(distortion), model).checked(where)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    return Lens(K, width, height, tuple(distortion), model, fisheye).checked(where)
 
 
-def _unknown_model(path: Path, model: object) -> DataError:
-    supported = ", ".join(name for name, _ in MODELS.values())
+def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]]) -> DataError:
+    supported = ", ".join(name for name, _ in known.values())
+    kept = known is MODELS and model in [name for name, _ in NATIVE_MODELS.values()]
     return DataError(
         f"{path}: camera model {model} is not supported (supported: {supported}). "
-        "Run `colmap image_undistorter` and give its output folder"
+        f"Run `colmap image_undistorter` and give its output folder{', or fit with --lenses native' if kept else ''}"
     )
 
 
-def read_cameras(path: Path) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt.
+def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
+    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` reads those that are not undistorted, too.
 
     Raises:
         DataError: The file is malformed, or a camera model is not supported.
     """
     cameras: dict[int, Lens] = {}
+    known = MODELS | NATIVE_MODELS if native else MODELS
     if path.suffix == ".bin":
         r = _BinaryFile(path)
         for _ in range(r.count(24)):
             number, model, width, height = r.take("iiQQ")
-            if model not in MODELS:
-                raise _unknown_model(path, OTHER_MODELS.get(model, model))
-            name, count = MODELS[model]
+            if model not in known:
+                raise _unknown_model(path, OTHER_MODELS.get(model, model), known)
+            name, count = known[model]
             where = f"{path}, camera {number}"
             _store(cameras, number, _lens(where, name, width, height, r.take(f"{count}d")), where)
         r.end()
         return cameras
-    counts = dict(MODELS.values())
+    counts = dict(known.values())
     for line, words in _rows(path):
         with _understood(path, line):
             number, model, parameters = int(words[0]), words[1], tuple(float(w) for w in words[4:])
             if model not in counts:
-                raise _unknown_model(path, model)
+                raise _unknown_model(path, model, known)
             _expect(len(parameters) == counts[model], f"{model} has {counts[model]} parameters, not {len(parameters)}")
             where = f"{path}, line {line}, camera {number}"
             _store(cameras, number, _lens(where, model, int(words[2]), int(words[3]), parameters), where)
@@ -356,7 +361,7 @@ class ColmapReader(Reader):
 
 def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pose]) -> tuple[list[View], list[str]]:
     """Return the views of a reconstruction in file coordinates, sorted by the names in the file, and notes."""
-    lenses = read_cameras(scene.inside(model / f"cameras.{kind}"))
+    lenses = read_cameras(scene.inside(model / f"cameras.{kind}"), scene.options.lenses == "native")
     file = model / f"images.{kind}"
     images, factor, note = scene.images()
     notes = [note] if note else []

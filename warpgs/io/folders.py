@@ -122,6 +122,7 @@ class SceneFolder:
         loaded = load_image(
             self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
             max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout", max_side=self.options.max_side,
+            native=self.options.lenses == "native",
         )  # fmt: skip
         self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
         return loaded
@@ -244,7 +245,7 @@ class ViewList:
     def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
         """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
         height, width = loaded.image.shape[:2]
-        camera = Camera(viewmat, loaded.K, width, height)
+        camera = Camera(viewmat, loaded.K, width, height, loaded.camera_model, loaded.distortion)
         self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha))
         self._done.update(loaded.done)
         if loaded.kept is not None:

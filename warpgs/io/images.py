@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from warpgs import lenses
 from warpgs.errors import DataError, UsageError
 from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
 from warpgs.io.exif import read_exif
@@ -38,9 +40,11 @@ class Lens:
     height: int
     """Image height [px]."""
     distortion: tuple[float, ...] = ()
-    """k1, k2, p1, p2[, k3] of the OpenCV model; empty for none."""
+    """k1, k2, p1, p2[, k3[, k4, k5, k6]] of the OpenCV model, or k1, k2, k3, k4 of a fisheye; empty for none."""
     model: str = "PINHOLE"
     """Name of the camera model, for notes."""
+    fisheye: bool = False
+    """The model is OpenCV's fisheye."""
 
     def checked(self, where: str) -> Lens:
         """Return this lens after a check of its numbers; ``where`` is file and image, for errors.
@@ -79,6 +83,10 @@ class LoadedImage:
     """Opacity in [0, 1], float32, shape [H, W]; None where the image is opaque."""
     kept: float | None = None
     """Fraction of the pixels that a mask file keeps, in [0, 1]; None without one."""
+    camera_model: str = "pinhole"
+    """Camera model of the pixels, as `Camera.model`."""
+    distortion: np.ndarray | None = None
+    """Coefficients of the camera model, as `Camera.distortion`."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -146,6 +154,30 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
         alpha = cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     done = (*loaded.done, f"freed of lens distortion ({lens.model})")
     return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
+
+
+@functools.lru_cache(maxsize=4)
+def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float, ...], width: int, height: int) -> np.ndarray:
+    """Return a mask [H, W], True where some light reaches a pixel through the lens; ``intrinsics`` are fx, fy, cx and cy."""
+    fx, fy, cx, cy = intrinsics
+    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
+    with np.errstate(all="ignore"):
+        return np.isfinite(lenses.from_plane(model, np.array(distortion), np.stack([x, y], -1))).all(-1)
+
+
+def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
+    """Keep the pixels and say which camera took them; pixels that the lens does not reach leave the mask."""
+    height, width = loaded.image.shape[:2]
+    model, count = ("fisheye", 4) if lens.fisheye else ("opencv", 8)
+    distortion = np.zeros(count)
+    distortion[: len(lens.distortion)] = lens.distortion
+    K = loaded.K
+    mask = _reached(model, tuple(distortion), (K[0, 0], K[1, 1], K[0, 2], K[1, 2]), width, height)
+    if loaded.mask is not None:
+        mask = mask & loaded.mask
+    done = (*loaded.done, f"kept with the distortion of their lens ({lens.model})")
+    kept = None if mask.all() else mask
+    return replace(loaded, mask=kept, done=done, camera_model=model, distortion=distortion)
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> LoadedImage:
@@ -245,6 +277,7 @@ def load_image(
     max_pixels: int = MAX_PIXELS,
     cutout: bool = False,
     max_side: int = 0,
+    native: bool = False,
 ) -> LoadedImage:
     """Decode an image, set it upright if its camera says so, undo distortion, and resample.
 
@@ -260,6 +293,7 @@ def load_image(
         max_pixels: Largest number of pixels that the file may have.
         cutout: What the mask does not keep is transparent, gray in part; else pixels kept by half or less do not count.
         max_side: Longest side that the image keeps [px] after ``downscale``; 0 for no limit.
+        native: Keep the distortion of the lens instead of undoing it.
 
     Returns:
         The image with intrinsics for its final size.
@@ -281,9 +315,13 @@ def load_image(
     if mask is not None:
         mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
     loaded = _with_mask(path, LoadedImage(image, mask, K, done, alpha), cutout)
-    if any(lens.distortion):
+    if not native and (lens.fisheye or len(lens.distortion) > 5):
+        raise DataError(f"{path}: an image of a {lens.model} lens is not undistorted here; keep the lens by --lenses native")
+    if not native and any(lens.distortion):
         loaded = _undistort(loaded, lens)
     loaded = _shrink(path, loaded, downscale, max_side)
+    if native and (lens.fisheye or any(lens.distortion)):
+        loaded = _native(loaded, lens)
     if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; look at all three")
     return _over_background(loaded, background)

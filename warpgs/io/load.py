@@ -36,12 +36,13 @@ def load_scene(
     black_is_empty: bool = True,
     score_masks: str | Path | None = None,
     max_pixels: int = MAX_PIXELS,
+    lenses: str = "undistort",
     progress: Callable[[str], object] | None = None,
 ) -> Scene:
     """Read a scene folder of any supported format.
 
-    Views come sorted by name, undistorted and downscaled, in coordinates that are recentred and rescaled in float64
-    (`Scene.normalization` leads back). Everything that was chosen on the way is in `Scene.notes`.
+    Views come sorted by name, downscaled and, unless lenses are kept, undistorted, in coordinates that are recentred and
+    rescaled in float64 (`Scene.normalization` leads back). Everything that was chosen on the way is in `Scene.notes`.
 
     Args:
         path: The scene folder.
@@ -61,6 +62,8 @@ def load_scene(
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
             there is one.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
+        lenses: Treatment of lens distortion: undistort (images become those of a pinhole) or native (images stay as they are,
+            and ``Camera.model`` is opencv or fisheye with ``Camera.distortion``; the only way to read fisheyes).
         progress: Called with a line for the user before each image is decoded; None for nothing.
 
     Returns:
@@ -69,13 +72,13 @@ def load_scene(
     Raises:
         DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
         ResourceError: There is not enough memory to decode an image.
-        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``masks`` or ``mask_keeps`` is another
-            word, or there is no such reader.
+        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``masks``, ``mask_keeps`` or
+            ``lenses`` is another word, or there is no such reader.
     """
     root, (factor, side) = Path(path), image_scale(downscale, max_side)
     options = ReadOptions(
         factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side,
-        on_image=_counted(root, progress),
+        lenses=lenses, on_image=_counted(root, progress),
     )  # fmt: skip
     try:
         _check_folder(root)

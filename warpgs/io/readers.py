@@ -48,6 +48,8 @@ class ReadOptions:
     """Largest number of pixels that an image or a mask may have."""
     max_side: int = 0
     """Longest side that an image keeps [px], after ``downscale``; 0 for no limit."""
+    lenses: str = "undistort"
+    """Treatment of lens distortion: undistort (images become those of a pinhole) or native (`Camera.model` keeps the lens)."""
     on_image: Callable[[Path], object] | None = None
     """Called with the file of each image before it is decoded; None for nothing."""
 
@@ -60,6 +62,8 @@ class ReadOptions:
             raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
         if self.masks not in ("ignore", "cutout"):
             raise UsageError(f"--masks must be ignore or cutout, not {self.masks!r}")
+        if self.lenses not in ("undistort", "native"):
+            raise UsageError(f"--lenses must be undistort or native, not {self.lenses!r}")
         if self.mask_keeps not in ("white", "black"):
             raise UsageError(f"--mask-keeps must be white or black, not {self.mask_keeps!r}")
 

@@ -20,8 +20,9 @@ from warpgs.schema import SchemaError, check_depth, check_parts
 
 BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+FISHEYE = "OPENCV_FISHEYE"
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
-"""Keys of lens models that the five distortion terms of OpenCV cannot express."""
+"""Keys of lens models that the five distortion terms of OpenCV cannot express; a fisheye's k4 is read where lenses are kept."""
 WHITE = (1.0, 1.0, 1.0)
 MAX_BYTES = 32 * 2**20
 """Largest file [bytes]; ten thousand frames take some ten million."""
@@ -80,7 +81,7 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
     return float(value)
 
 
-def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> Lens:
+def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, native: bool = False) -> Lens:
     """Return the intrinsics of a frame; its own values come before the shared ones.
 
     Args:
@@ -89,15 +90,20 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> L
         width: Width of the image [px], where the file has none.
         height: Height of the image [px], where the file has none.
         where: File and frame, for errors.
+        native: Fisheyes are read, too.
 
     Raises:
         DataError: There is no focal length, a number is not finite, or the lens model is not supported.
     """
     model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV")))
-    if model not in MODELS:
+    kept = ", or fit them with --lenses native" if not native else ""
+    known = (*MODELS, FISHEYE) if native else MODELS
+    if model not in known:
         raise DataError(
-            f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(MODELS)}). Undistort the images first"
+            f"{where}: camera model {model[:40]} is not supported (supported: {', '.join(known)}). Undistort the images "
+            f"first{kept if model == FISHEYE else ''}"
         )
+    fisheye = native and bool(model == FISHEYE or frame.get("is_fisheye", shared.get("is_fisheye")))
     try:
         size = [_number(frame, shared, "w"), _number(frame, shared, "h")]
         width, height = (int(given) if given is not None else own for given, own in zip(size, (width, height)))
@@ -111,17 +117,23 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str) -> L
             center = _number(frame, shared, f"c{axis}")
             f.append(focal)
             c.append(side / 2 if center is None else center)
-        distortion = [_number(frame, shared, k) or 0.0 for k in ("k1", "k2", "p1", "p2", "k3")]
-        other = [k for k in UNSUPPORTED_TERMS if frame.get(k, shared.get(k))]
+        terms = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+        distortion = [_number(frame, shared, k) or 0.0 for k in terms]
+        unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
+        other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
         if other:
-            raise ValueError(f"{other[0]} belongs to a fisheye or rational lens, which is not supported. Undistort the images")
+            raise ValueError(
+                f"{other[0]} belongs to {'another lens than a fisheye' if fisheye else 'a fisheye or rational lens'}, which is "
+                f"not supported. Undistort the images{kept if other[0] == 'is_fisheye' else ''}"
+            )
     except ValueError as e:
         raise DataError(f"{where}: {e}") from e
     fx = f[0] if f[0] is not None else f[1]
     if fx is None:
         raise DataError(f"{where}: has neither fl_x nor camera_angle_x, so its focal length is unknown; add one of them")
     K = np.array([[fx, 0, c[0]], [0, fx if f[1] is None else f[1], c[1]], [0, 0, 1.0]])
-    return Lens(K, width, height, tuple(distortion) if any(distortion) else (), model).checked(where)
+    name = FISHEYE if fisheye else model
+    return Lens(K, width, height, tuple(distortion) if any(distortion) else (), name, fisheye).checked(where)
 
 
 def matrix_of(frame: dict, where: str) -> np.ndarray:
@@ -184,7 +196,7 @@ class _Reading:
         viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
         loaded = self.scene.image(
             path,
-            lambda width, height: lens_of(frame, shared, width, height, where),
+            lambda width, height: lens_of(frame, shared, width, height, where, self.scene.options.lenses == "native"),
             mask=self.mask(file, frame, path, where),
             background=self.background,
         )

@@ -209,7 +209,7 @@ def make_projection(real, camera_model: str, activated: bool = False):
     return SimpleNamespace(
         Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, opacity_of=opacity_of, direction=direction, finite3=finite3,
         rotation=r.rotation, rotation_backward=r.rotation_backward,
-        axes_backward=camera.axes_backward, position_backward=camera.position_backward,
+        depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
         vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
     )  # fmt: skip
 

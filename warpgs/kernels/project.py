@@ -23,7 +23,7 @@ from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION
 
 PROJECTED_SIZE = 12
 """Numbers of a projected Gaussian, 16-byte aligned in float32:
-0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 z-depth [u],
+0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
 
 
@@ -78,7 +78,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
         e = m.ellipse(
             means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
         )  # fmt: skip
-        if e.valid == 0 or not (e.position[2] <= far):
+        if e.valid == 0 or not (m.depth_of(e.position) <= far):
             return 0
         opacity = m.opacity_of(logit_opacities[n])
         if opacity_factors.shape[0] > 0:
@@ -139,7 +139,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
         result[5] = opacity
         for channel in range(3):
             result[6 + channel] = wp.max(color[channel], real(0.0))
-        result[9] = e.position[2]
+        result[9] = m.depth_of(e.position)
         result[10] = half_width
         result[11] = half_height
         store(projected, i, result)

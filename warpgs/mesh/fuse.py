@@ -78,7 +78,7 @@ def integrate_views(
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Pinhole cameras, arrays of numpy.
+        cameras: Cameras, arrays of numpy.
         render: Settings of the rasterizer.
         plan: The grid.
         depth: Depth that is fused.
@@ -101,7 +101,7 @@ def fuse(
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Pinhole cameras, arrays of numpy, at least one.
+        cameras: Cameras, arrays of numpy, at least one; for lenses, pinholes of the same K stand.
         render: Settings of the rasterizer, as the fit used them.
         options: Options.
         stage: Function that shows a line of progress.
@@ -110,7 +110,7 @@ def fuse(
     Raises:
         DataError: No camera sees a surface.
         ResourceError: The grid does not fit into memory.
-        UsageError: A camera is no pinhole, or an option is out of range.
+        UsageError: A camera is orthographic, or an option is out of range.
     """
     views = surface_views(gaussians, cameras, render, options.depth, "looking where surfaces are", stage)
     samples = [sample_surface(v, max(1, SAMPLES // len(cameras))) for v in views]
@@ -138,7 +138,7 @@ def vertex_colors(
     Args:
         mesh: The mesh, V vertices.
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Pinhole cameras, arrays of numpy.
+        cameras: Cameras, arrays of numpy.
         render: Settings of the rasterizer.
         plan: Grid that the mesh was made with.
         depth: Depth that was fused.

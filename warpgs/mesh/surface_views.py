@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.geometry import back_project
+from warpgs.geometry import back_project, pinhole_of
 from warpgs.kernels.tsdf import face_cosines
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
@@ -44,15 +44,16 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
 
     Args:
         gaussians: N Gaussians in the units of the camera.
-        camera: Pinhole camera, arrays of numpy.
+        camera: Camera, arrays of numpy; for one with a lens, the pinhole of the same K stands.
         options: Settings of the rasterizer.
         depth: Depth that is taken, one of `DEPTHS`.
 
     Raises:
-        UsageError: The camera is no pinhole, or the depth is unknown.
+        UsageError: The camera is orthographic, or the depth is unknown.
     """
     if depth not in DEPTHS:
         raise UsageError(f"depth {depth!r} is not one of {', '.join(DEPTHS)}")
+    camera = pinhole_of(camera)
     r = rasterize(gaussians, camera, replace(options, median_depth=depth == "median"))
     z = r.depth if r.median_depth is None else r.median_depth
     z = torch.where(r.alpha >= MIN_ALPHA, z, torch.where(r.alpha <= EMPTY, torch.inf, 0.0)).contiguous()
@@ -68,14 +69,14 @@ def surface_views(
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Pinhole cameras, arrays of numpy.
+        cameras: Cameras, arrays of numpy.
         options: Settings of the rasterizer.
         depth: Depth that is taken, one of `DEPTHS`.
         purpose: Words for the line of progress.
         stage: Function that shows a line of progress, before each view.
 
     Raises:
-        UsageError: A camera is no pinhole, or the depth is unknown.
+        UsageError: A camera is orthographic, or the depth is unknown.
     """
     for i, camera in enumerate(cameras, 1):
         stage(f"{purpose}: view {i} of {len(cameras)}")

@@ -52,7 +52,7 @@ class RasterizeOptions:
     """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     near: float | None = None
     """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. A Gaussian
-    has the depth of its mean along the camera's z axis, and is left out as a whole."""
+    has the depth of its mean, along the camera's z axis or, of a fisheye, the distance, and is left out as a whole."""
     far: float | None = None
     """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the rule's, 1e10."""
     sh_degree: int | None = None

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import torch
 
+from warpgs import lenses
 from warpgs.constants import FRUSTUM_MARGIN, RULES
-from warpgs.geometry import check_pinhole, rotation_matrices
+from warpgs.geometry import rotation_matrices
 from warpgs.kernels import sh
 from warpgs.scene import Camera, Gaussians
 
@@ -40,14 +41,13 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int) -> _Ellipses:
     unit = quats / quats.norm(dim=-1, keepdim=True)
     positions = means @ rotation.T + translation
     opacities = torch.sigmoid(logits)
-    visible = torch.nonzero((positions[:, 2] >= rule.near) & (opacities >= rule.alpha_cut)).squeeze(1)
-    visible = visible[torch.argsort(positions[visible, 2], stable=True)]
+    depths = lenses.depth_of(camera.model, positions)
+    lens = None if camera.distortion is None else torch.as_tensor(camera.distortion, dtype=torch.float64, device=means.device)
+    seen = lenses.on_lens(camera.model, lens, positions)
+    visible = torch.nonzero(seen & (depths >= rule.near) & (opacities >= rule.alpha_cut)).squeeze(1)
+    visible = visible[torch.argsort(depths[visible], stable=True)]
     positions, opacities = positions[visible], opacities[visible]
-    z, focal, center = positions[:, 2:], torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
-    pixels = focal * positions[:, :2] / z + center
-    size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=means.device)
-    clamped = torch.minimum(torch.maximum(pixels, -FRUSTUM_MARGIN * size), (1 + FRUSTUM_MARGIN) * size)
-    jacobians = torch.cat([torch.diag_embed(focal / z), ((center - clamped) / z)[..., None]], -1)
+    pixels, jacobians = _pixels(camera, K, lens, positions)
     axes = jacobians @ rotation @ rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
     covariances = axes @ axes.mT + rule.low_pass * torch.eye(2, dtype=torch.float64, device=means.device)
     inverse = torch.linalg.inv_ex(covariances).inverse
@@ -59,6 +59,32 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int) -> _Ellipses:
     reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # a hair more than where alpha is the cut
     half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
     return _Ellipses(pixels, half, (A, B, C), opacities, colors)
+
+
+def _pixels(
+    camera: Camera, K: torch.Tensor, lens: torch.Tensor | None, positions: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the pixels [N, 2] of positions in the camera [N, 3], and the Jacobians [N, 2, 3] of their expansion."""
+    z, focal, center = positions[:, 2:], torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=K.device)
+
+    def clamped(pixels: torch.Tensor) -> torch.Tensor:
+        return torch.minimum(torch.maximum(pixels, -FRUSTUM_MARGIN * size), (1 + FRUSTUM_MARGIN) * size)
+
+    if camera.model == "pinhole":
+        pixels = focal * positions[:, :2] / z + center
+        return pixels, torch.cat([torch.diag_embed(focal / z), ((center - clamped(pixels)) / z)[..., None]], -1)
+    pixels = focal * lenses.to_plane(camera.model, lens, positions) + center
+    at = positions
+    if camera.model == "opencv":  # as far as the pixel is moved towards the axis, so is the point
+        scale = (clamped(pixels) - center) / torch.where(pixels == center, 1, pixels - center)
+        scale = torch.where((clamped(pixels) != pixels) & (scale >= 0) & (scale < 1), scale, 1)
+        at = torch.cat([positions[:, :2] * scale, z], 1)
+    with torch.enable_grad():
+        at = at.detach().requires_grad_()
+        found = lenses.to_plane(camera.model, lens, at).sum(0)
+        rows = [torch.autograd.grad(found[i], at, retain_graph=True)[0] for i in range(2)]
+    return pixels, focal[:, None] * torch.stack(rows, 1)
 
 
 def _block(g: _Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torch.Tensor, background: torch.Tensor):
@@ -97,9 +123,9 @@ def reference_image(
         Colours, not clamped, shape [h, w, 3].
 
     Raises:
-        UsageError: The camera is no pinhole.
+        UsageError: The camera model is known to the kernels alone.
     """
-    check_pinhole(camera)
+    lenses.check_known(camera.model)
     g, device = _project(gaussians, camera, degree), gaussians.means.device
     left, top, width, height = window
     image = torch.empty(height, width, 3, dtype=torch.float64, device=device)

@@ -27,6 +27,8 @@ class CameraModel:
 
         ``in_range(position, lens, near) -> bool``: True where the model can project this position. A NaN must give False.
 
+        ``depth_of(position) -> real``: The depth [u], above 0 in range: it orders the Gaussians, and is rendered.
+
         ``pixel_of(position, K, lens) -> vec2``: The projected position [px].
 
         ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is taken [px]: ``pixel`` itself, clamped
@@ -39,7 +41,7 @@ class CameraModel:
         rows.
 
         ``position_backward(position, K, lens, pixel, point, axes, v_first, v_second, v_pixel, v_depth) -> Gradients``: The
-        gradients of position and intrinsics from those of the two rows, of the pixel and of ``position[2]``.
+        gradients of position and intrinsics from those of the two rows, of the pixel and of the depth.
         ``Gradients`` is a struct with ``v_position`` (vec3) and ``v_K`` (mat33). Where ``point`` equals ``pixel``, J
         moves with the position; else it does not. The coefficients have no gradient.
 

@@ -45,6 +45,10 @@ def _make_functions(real: type) -> SimpleNamespace:
         return position[2] >= near and position[2] <= real(FAR)
 
     @wp.func
+    def depth_of(position: vec3) -> real:
+        return position[2]
+
+    @wp.func
     def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
         return vec2(K[0, 0] * position[0] / position[2] + K[0, 2], K[1, 1] * position[1] / position[2] + K[1, 2])
 
@@ -135,6 +139,6 @@ def _make_functions(real: type) -> SimpleNamespace:
         return g
 
     return SimpleNamespace(
-        in_range=in_range, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
+        in_range=in_range, depth_of=depth_of, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
         axes_backward=axes_backward, position_backward=position_backward,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from warpgs.errors import UsageError
-from warpgs.geometry import check_pinhole, look_at, matmul
+from warpgs.geometry import look_at, matmul, pinhole_of
 from warpgs.pipeline.films.rig import MIN_SWING, Rig
 from warpgs.scene import Camera
 
@@ -26,14 +26,15 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
     """Return a camera with the size and field of view of a film.
 
     Args:
-        camera: Camera of a photograph; its pose and camera model stay.
+        camera: Camera of a photograph; its pose stays, and for a lens the pinhole of the same K stands.
         size: Width and height [px]; None for those of the photograph.
         fov_y: Vertical field of view [rad], as of a principal point in the middle; None for that of the photograph.
         turned: Whether the photograph lies on its side, so that width and height are swapped.
 
     Raises:
-        UsageError: A field of view is given for a camera that is no pinhole.
+        UsageError: The camera is orthographic.
     """
+    camera = pinhole_of(camera)
     K, width, height = camera.K, camera.width, camera.height
     if turned:
         K, width, height = K[[1, 0, 2]][:, [1, 0, 2]], height, width
@@ -41,7 +42,6 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
         return replace(camera, K=K, width=width, height=height)
     new_width, new_height = size or (width, height)
     if fov_y is not None:
-        check_pinhole(camera)
         fy = 0.5 * new_height / math.tan(0.5 * fov_y)
     else:
         fy = K[1, 1] * new_height / height

@@ -13,7 +13,7 @@ import torch
 from warpgs import schema
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
-from warpgs.geometry import matmul, nearest_rotation, quaternions, rotation_matrices
+from warpgs.geometry import matmul, nearest_rotation, pinhole_of, quaternions, rotation_matrices
 from warpgs.input_files import read_input, unread_reason
 from warpgs.pipeline.films.camera_paths import framed
 from warpgs.scene import Camera, Normalization
@@ -148,7 +148,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     if not 1 <= len(values) <= MAX_KEYFRAMES:
         raise DataError(f"{path}: holds {len(values)} keyframes; a path takes 1 to {MAX_KEYFRAMES:,}")
     K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])
-    template, result = replace(template, K=K, model="pinhole"), []
+    template, result = replace(pinhole_of(template), K=K), []
     for i, value in enumerate(values):
         matrix = np.array(value["c2w"], np.float64)
         rotation = np.clip(matrix[:3, :3], -2, 2)  # so that no square overflows

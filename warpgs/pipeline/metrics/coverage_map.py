@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from warpgs.constants import NEAR
-from warpgs.geometry import check_pinhole, relative_pose
+from warpgs.geometry import check_pinhole, pinhole_of, relative_pose
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
@@ -75,14 +75,13 @@ def depth_views(
         The views in the order of the cameras, on the device of the Gaussians.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is orthographic; for one with a lens, the pinhole of the same K stands.
     """
     pixels = sum(c.width * c.height for c in cameras)
     factor = min(1.0, (max_pixels / max(1, pixels)) ** 0.5)
     views = []
     for i, camera in enumerate(cameras):
-        check_pinhole(camera)
-        small = _resized(camera, factor)
+        small = _resized(pinhole_of(camera), factor)
         depth = depth_of(gaussians, small, options)
         mask = None if masks is None else masks[i]
         if mask is not None:

@@ -14,6 +14,7 @@ from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, TOLERANCE, Coverage,
 from warpgs.pipeline.metrics.evaluate import over_white, render_view, to_8_bit
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.metrics.region import scored_region
+from warpgs.priors.pinhole_views import pinhole_view
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.terminal import counted
 from warpgs.scene import Gaussians, View
@@ -154,9 +155,10 @@ def score_by_coverage(
         ``depth_differences`` and ``photo_psnr``: the table of `photo_errors`; ``tolerance``; ``summary``, a sentence.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is orthographic. Views of lenses are scored as a pinhole would show them.
     """
     tell("finding what no training view saw")
+    train, test = ([pinhole_view(v) for v in views] for views in (train, test))
     training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
     errors = photo_errors(train, training)
     transparent = any(v.alpha is not None for v in (*train, *test))

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 
 from warpgs.io.splits import Split
+from warpgs.lenses import CENTRAL
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.request import SceneRequest
@@ -56,8 +57,8 @@ class FitJob:
 
     @property
     def other_models(self) -> list[str]:
-        """Camera models of the views other than pinhole, which only the kernels know."""
-        return sorted({v.camera.model for v in self.scene.views} - {"pinhole"})
+        """Camera models of the views without a pinhole of the same K, which no comparison of views can take."""
+        return sorted({v.camera.model for v in self.scene.views} - {*CENTRAL})
 
     def say(self, line: str) -> None:
         """Print a line for the user, unless the fit is to be silent, or to tell of its progress alone."""

@@ -1,4 +1,4 @@
-"""Pruning of a finished model: Gaussians and harmonics that its training views do not miss go (docs/complexity.md)."""
+"""Pruning of a finished model: Gaussians and harmonics that its training views do not miss go (docs/decisions/020)."""
 
 from __future__ import annotations
 

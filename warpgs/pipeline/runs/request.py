@@ -55,6 +55,9 @@ class SceneRequest:
     max_side: int | None = None
     """Longest side that an image keeps [px], 0 for no limit; None for 0 where a factor is given, else for 1600, or 800 in a fit
     on a CPU."""
+    lenses: str = "undistort"
+    """Treatment of lens distortion: undistort (images become those of a pinhole) or native (the model is rendered through the
+    lens; the only way to read fisheyes)."""
 
     def with_scale(self, device: str) -> SceneRequest:
         """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
@@ -151,7 +154,7 @@ def read_scene(request: SceneRequest, progress: Callable[[str], object] | None =
         request.path, reader=request.reader, downscale=request.downscale, max_side=request.max_side, strict=request.strict,
         allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
         black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
-        progress=progress,
+        lenses=request.lenses, progress=progress,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

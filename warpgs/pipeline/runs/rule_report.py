@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from warpgs.constants import TILE_SIZE
+from warpgs.lenses import MODELS
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.reference import reference_image
@@ -65,7 +66,7 @@ def rule_report_of(
 
     Three random views are rendered with the rule, as in the fit, and 64 x 64 px of each are compared with the image that
     rule `exact` defines, computed in float64 by other means than the kernels (`warpgs.render.reference`); by the kernels where
-    the camera is no pinhole.
+    `warpgs.lenses` does not know the camera model.
 
     Args:
         gaussians: Of the finished fit, float32.
@@ -109,8 +110,8 @@ def rule_report_of(
 
 
 def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor) -> torch.Tensor:
-    """Return the image of a window under `exact` in float64: by other means than the kernels, which alone know other models."""
-    if camera.model == "pinhole":
+    """Return the image of a window under `exact` in float64: by the kernels where they alone know the model."""
+    if camera.model in MODELS:
         with _one_thread():
             return reference_image(part, camera, window, background, part.sh_degree)
     doubled = Gaussians(**{n: t.double() for n, t in part.tensors().items()})

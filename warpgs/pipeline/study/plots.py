@@ -126,8 +126,7 @@ def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
             out += _line(panel, line, TOP + ROW * (i + 0.5) - 3, x0, px)
     if not panels:
         out.append(_text(MARGIN, 66, "no pair of runs to compare", 13, color=SOFT))
-    together = ", the bars of a panel together" if len(names) > 2 else ""
-    words = f"large dot: mean; bar: 95 % t interval{together}; small dots: single seeds"
+    words = f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds"
     out.append(_text(MARGIN, height - 18, words, 11, color=SOFT))
     x = MARGIN + 6.0 * len(words) + 8
     for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval holds 0")):

@@ -1,4 +1,4 @@
-"""Held-out blocks of pixels, and the gain on them with its noise, by which a fit ends (docs/complexity.md).
+"""Held-out blocks of pixels, and the gain on them with its noise, by which a fit ends (docs/decisions/020).
 
 To leave views or pixels out to choose a size is VGNC's idea (arXiv 2504.14548), here without its generative model.
 """

@@ -12,6 +12,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
+from warpgs.lenses import CENTRAL
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
 from warpgs.pipeline.train.config import FitConfig
@@ -21,6 +22,7 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.sampling_event import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
+from warpgs.priors.pinhole_views import lens_depth, pinhole_view
 from warpgs.priors.view_prior import view_priors
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import PointCloud, Prior, View
@@ -72,7 +74,11 @@ def prepare(
     @functools.cache
     def start() -> Start:
         progress("finding the first points")
-        found = initial_points(train, points, config.init, generator, usable, progress)
+        # what is searched for along lines is searched for in pinholes; given points need no search
+        views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
+        found = initial_points(views, points, config.init, generator, usable, progress)
+        if found.depths is not None:
+            found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
         return subsample(found, config.max_gaussians, generator)
 
     notes = []
@@ -90,12 +96,12 @@ def prepare(
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
-    """Refuse settings that compare views with each other where a camera is no pinhole; only the kernels know other models."""
-    others = sorted({v.camera.model for v in train} - {"pinhole"})
+    """Refuse settings that compare views with each other where a camera has no pinhole of the same K."""
+    others = sorted({v.camera.model for v in train} - {*CENTRAL})
     if others and (config.init.source != "points" or samples(config)):
         raise UsageError(
-            f"camera model {others[0]}: this start or strategy compares views, which needs pinhole cameras; fit with --preset "
-            "3dgs --init.source points, or undistort the images"
+            f"camera model {others[0]}: this start or strategy compares views, which needs one of {', '.join(CENTRAL)}; fit "
+            "with --preset 3dgs --init.source points, or undistort the images"
         )
 
 

@@ -1,4 +1,4 @@
-"""Early stopping of a fit by the error of held-out blocks of pixels, beside any strategy (docs/complexity.md)."""
+"""Early stopping of a fit by the error of held-out blocks of pixels, beside any strategy (docs/decisions/020)."""
 
 from __future__ import annotations
 

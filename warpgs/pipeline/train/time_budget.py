@@ -22,7 +22,7 @@ REPEATS = 5
 """Timed renders of a probe, after a first that compiles and loads kernels."""
 STEP, SETUP = 1.6, 11.0
 """Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
-a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px (docs/trade.md). On CUDA, where
+a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px. On CUDA, where
 steps are captured and probes are not, a step takes less, so that the prediction is an upper limit."""
 MIN_STEPS = 100
 """Fewest steps chosen: with fewer nothing is seen. The most are those of a fit without a budget (`steps_by_views`)."""

@@ -81,12 +81,10 @@ class Trainer:
         self.messages: list[str] = []
         """Sentences for the user that were not shown yet."""
         cloud, cameras = made.start.cloud, [v.camera for v in train]
-        extent = scene_extent(cameras, cloud)
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
-        # `settings_by_views` has chosen
-        assert config.steps is not None and config.sh_degree is not None and config.half_resolution is not None
+        assert config.half_resolution is not None  # `settings_by_views` has chosen
         self.half_resolution = config.half_resolution
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
@@ -98,29 +96,29 @@ class Trainer:
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
-
-        self.table = Table.of_gaussians(initial_gaussians(cloud, config.init, config.sh_degree, extent, device), {})
-        self.context = StrategyContext(
-            config.groups(), config.strategy_config, self.table, self.generator, config.seed,
-            plan_phases(config.phases, config.steps), extent, config.rule, self.background,
-        )  # fmt: skip
-        """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
-        self.strategy, self.stopping = find_strategy(config.strategy)(self.context), Stopping(config.stopping)
-        self.table.add_columns(self.strategy.columns())
-        self.learned = self._make_learned(train)
-        learned = self.learned.views
-        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(learned.table.params)))
-        self.taker = StepTaker(self.learned, self.buffers, config.rule, self.background, self.batch, ranks)
+        self._make_parts(train, cloud, scene_extent(cameras, cloud))
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
-        self._begin(with_learned(views, learned))
+        self._begin(with_learned(views, self.learned.views))
 
-    def _make_learned(self, train: list[View]) -> Learned:
-        """Return what steps change: the Gaussians, the parameters of view modules, and the strategy."""
-        views = LearnedViews.first(self.config.view_modules, train, self.device)
+    def _make_parts(self, train: list[View], cloud: PointCloud, extent: float) -> None:
+        """Make the Gaussians, the strategy, the parameters of view modules, and the taker of steps; extent in scene units."""
+        c, device = self.config, self.device
+        assert c.steps is not None and c.sh_degree is not None  # `settings_by_views` has chosen
+        self.table = Table.of_gaussians(initial_gaussians(cloud, c.init, c.sh_degree, extent, device), {})
+        self.context = StrategyContext(
+            c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
+            self.background,
+        )  # fmt: skip
+        """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
+        self.strategy, self.stopping = find_strategy(c.strategy)(self.context), Stopping(c.stopping)
+        self.table.add_columns(self.strategy.columns())
+        views = LearnedViews.first(c.view_modules, train, device)
         self.table.batch = views.table.batch = self.batch
-        seed = self.config.seed if self.dropout > 0 else None
-        return Learned(self.table, views, self.strategy, seed, camera_centers([v.camera for v in train], self.device))
+        seed, centers = c.seed if self.dropout > 0 else None, camera_centers([v.camera for v in train], device)
+        self.learned = Learned(self.table, views, self.strategy, seed, centers)
+        self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(views.table.params)))
+        self.taker = StepTaker(self.learned, self.buffers, c.rule, self.background, self.batch, self.ranks)
 
     def _begin(self, views: list[TrainingView]) -> None:
         """Train on these views, or on what early stopping leaves of them."""

@@ -1,0 +1,39 @@
+"""Pages with generated parts: the text between two comments that name the part; all else is written by hand."""
+
+from __future__ import annotations
+
+import re
+
+from bench.lib import accuracy_page, performance_page, result_file, results_page, trade_page
+
+DOCS = result_file.ROOT / "docs"
+PARTS = {
+    "accuracy.md": accuracy_page.parts,
+    "performance.md": performance_page.parts,
+    "results.md": results_page.parts,
+    "trade.md": trade_page.parts,
+}
+"""Functions that return the generated parts of each page by name."""
+
+
+def filled(page: str, parts: dict[str, str]) -> str:
+    """Return a page with its generated parts replaced.
+
+    Args:
+        page: Text with a pair of comments for each part, ``NAME: written by bench.document`` and ``end of NAME``.
+        parts: Text of each part by name.
+
+    Raises:
+        ValueError: The page and ``parts`` have different names.
+    """
+    marks = re.compile(r"(<!-- ([\w ]+): written by bench\.document -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
+    names = [match[2] for match in marks.finditer(page)]
+    if sorted(names) != sorted(parts):
+        raise ValueError(f"the page has marks of {', '.join(names)}, the parts are {', '.join(parts)}; make them equal")
+    return marks.sub(lambda match: f"{match[1]}\n{parts[match[2]]}\n{match[3]}", page)
+
+
+def files() -> dict[str, str]:
+    """Return all pages with generated parts, and the charts, by their path under docs/."""
+    pages = {name: filled((DOCS / name).read_text("utf-8"), parts()) for name, parts in PARTS.items()}
+    return pages | performance_page.plots(result_file.stored("ops"))

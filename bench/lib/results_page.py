@@ -1,0 +1,200 @@
+"""The generated parts of docs/results.md."""
+
+from __future__ import annotations
+
+import statistics
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+
+from bench.lib import result_file
+from bench.lib.preset_table import by_seed
+from bench.lib.tables import markdown, mean_sd
+from warpgs.pipeline.study.statistics import paired_difference
+
+RUNGS = (
+    ("3dgs", "", "`3dgs`, random points"),
+    ("3dgs sweep 8 px", "3dgs", "+ start from the depth sweep"),
+    ("strong-3dgs", "3dgs sweep 8 px", "+ dropout, with the method's learning rates, degree and schedule"),
+    ("paper", "strong-3dgs", "+ placement by importance"),
+)
+"""Presets of the ladder, the preset below each, and words."""
+ABLATED = {
+    "no events": "no sampling events: no placement, layers or protection",
+    "no agp": "pixels of highest importance, not sampled ones",
+    "no ra": "pixels without consistent depth too",
+    "no hier": "one layer",
+    "no s_render": "no residual in the importance",
+    "no s_semantic": "no semantics in the importance",
+    "no s_geometry": "no geometry in the importance",
+    "no pm": "no protection of new Gaussians",
+}
+"""Rows of the ablation in the words of the page."""
+CAPTURES = {
+    "fern:3": ("fern", 3), "fern:6": ("fern", 6), "fern:9": ("fern", 9), "fern:17": ("fern", 17),
+    "horns:3": ("horns", 3), "horns:6": ("horns", 6), "horns:9": ("horns", 9), "horns:54": ("horns", 54),
+    "fox:8": ("fox", 8), "fox:all": ("fox", 43), "temple:4": ("temple", 4), "temple:12": ("temple", 12),
+}  # fmt: skip
+"""Scene and number of training views of each row of the presets' result."""
+PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
+POSES = {
+    "given": "given with the photographs",
+    "joint": "found, held-out photographs included",
+    "aligned": "found from the training photographs alone",
+}
+MCMC = {
+    "warpgs mcmc": "preset `mcmc`",
+    "gsplat mcmc": "gsplat's MCMC, our scene units",
+    "gsplat mcmc, own units": "gsplat's MCMC, units of its parser",
+    "warpgs 3dgs": "preset `3dgs`, which sets the cap",
+}
+
+
+def table(head: Sequence[str], rows: list[list[str]]) -> str:
+    """Return a Markdown table: the first column to the left, the others to the right."""
+    return markdown(head, rows, head[:1])
+
+
+def _result(name: str) -> tuple[dict, str]:
+    return result_file.read(result_file.FOLDER / f"{name}.json"), "\n" + result_file.source(name)
+
+
+def _scores(rows: list[dict]) -> str:
+    return f"{mean_sd([r['psnr'] for r in rows])} / {statistics.mean(r['ssim'] for r in rows):.3f}"
+
+
+def _change(own: dict[int, dict], base: dict[int, dict], key: str, digits: int) -> str:
+    """Return the mean difference over the seeds that both have, with its 95 % interval."""
+    seeds = sorted(own.keys() & base)
+    d = paired_difference([own[s][key] for s in seeds], [base[s][key] for s in seeds])
+    return f"{d.mean:+.{digits}f} [{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
+
+
+def ladder() -> str:
+    """Return the table of the method's steps from plain 3DGS, each beside the one below it."""
+    result, source = _result("presets_llff3_h200")
+    found: dict[tuple, dict[int, dict]] = defaultdict(dict)
+    for r in result["rows"]:
+        found[r["scene"], r["preset"]][r["seed"]] = r
+    body = []
+    for preset, below, words in RUNGS:
+        body.append([words])
+        for scene in ("fern", "horns"):
+            own, base = found[scene, preset], found[scene, below]
+            body[-1] += [_scores(list(own.values())), _change(own, base, "psnr", 2) if base else ""]
+    return table(["step", "fern", "change in PSNR", "horns", "change in PSNR"], body) + source + "\n" + placement_again()
+
+
+def placement_again() -> str:
+    """Return the last step of the ladder as another run has it."""
+    lines = []
+    for scene in ("fern", "horns"):
+        result, source = _result(f"compare_{scene}_llff3_h200")
+        own, base = ({r["seed"]: r for r in result["rows"] if r["variant"] == name} for name in ("paper", "strong-3dgs"))
+        lines.append(f"Placement on `{scene}` in another run: {_change(own, base, 'psnr', 2)} dB. {source.strip()}\n")
+    return "\n".join(lines)
+
+
+def ablation() -> str:
+    """Return the table of the method with one part off: means over both scenes, differences to the full method by seed."""
+    result, source = _result("ablation_llff3_h200")
+    scores: dict[str, dict[int, dict]] = {}
+    for variant in ("full", *ABLATED):
+        rows = [r for r in result["rows"] if r["variant"] == variant]
+        scores[variant] = {
+            seed: {k: statistics.mean(r[k] for r in rows if r["seed"] == seed) for k in ("psnr", "ssim")}
+            for seed in {r["seed"] for r in rows}
+        }
+    body = [["full method", _scores(list(scores["full"].values())), "", ""]]
+    for variant, words in ABLATED.items():
+        own = scores[variant]
+        changes = [_change(own, scores["full"], key, digits) for key, digits in (("psnr", 2), ("ssim", 3))]
+        body.append([words, _scores(list(own.values())), *changes])
+    return table(["part that is off", "PSNR / SSIM", "change in PSNR", "change in SSIM"], body) + source
+
+
+def views() -> str:
+    """Return the table of held-out scores by scene, number of training views and preset; empty cells were not measured."""
+    result, source = _result("presets_h200")
+    found, body = by_seed(result["rows"]), []
+    for name, (scene, count) in CAPTURES.items():
+        own = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
+        body.append([f"{scene}, {count}", *(_scores(rows) if rows else "" for rows in own)])
+    heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {result['versions']['gsplat']}"]
+    return table(["scene, views", *heads], body) + source
+
+
+def mcmc() -> str:
+    """Return the table of MCMC beside gsplat's."""
+    result, source = _result("mcmc_h200")
+    body = []
+    for program, words in MCMC.items():
+        rows = [r for r in result["rows"] if r["program"] == program]
+        body.append([words, _scores(rows), f"{statistics.mean(r['gaussians'] for r in rows):,.0f}"])
+    return table(["program", "PSNR / SSIM", "Gaussians"], body) + source
+
+
+def objects() -> str:
+    """Return the table on objects cut out, by the format of the scene."""
+    result, source = _result("objects_h200")
+    body = []
+    for form in ("transforms", "colmap"):
+        rows = [r for r in result["rows"] if r["format"] == form]
+        psnr, alpha, empty = (statistics.mean(r[k] for r in rows) for k in ("psnr_white", "alpha_object", "alpha_empty"))
+        body.append([form, f"{psnr:.2f}", f"{alpha:.4f}", f"{empty:.4f}"])
+    return table(["scene format", "PSNR over white", "alpha in the object", "alpha outside"], body) + source
+
+
+def poses() -> str:
+    """Return the table of the cost of found poses."""
+    result, source = _result("found_poses_fern_cpu2")
+    rows = {(r["poses"], r["train"]): r for r in result["rows"]}
+    counts = sorted({r["train"] for r in result["rows"]})
+    body = [[words, *(mean_sd(rows[kind, n]["psnr"]) for n in counts)] for kind, words in POSES.items()]
+    return table(["poses", *(f"{n} training photographs" for n in counts)], body) + source
+
+
+def same_image() -> str:
+    """Return the table of the agreement with gsplat."""
+    result, source = _result("parity_h200")
+    body = []
+    for r in result["rows"]:
+        worst = max(g["rel_l2"] for g in r["gradients"].values())
+        size, differences = f"{r['sh_degree']}, {r['width']} x {r['height']}", (r["image_mean"], r["image_max"], worst)
+        body.append([size, *(f"{d:.1e}" for d in differences)])
+    head = ["degree, image", "colour: mean difference", "largest", "gradients: largest relative L2"]
+    return table(head, body) + source
+
+
+def meshes() -> str:
+    """Return the table of the accuracy of meshes."""
+    result, source = _result("mesh_cpu2")
+    body = []
+    for r in sorted((r for r in result["rows"] if r["row"] == "mesh"), key=lambda r: -r["voxel"]):
+        if r["depth"] == "median":
+            cells = [f"{r['voxel']:.2g}", f"{r['triangles']:,}"]
+            body.append(cells + [f"{100 * r[k]:.2f} %" for k in ("accuracy_mean_of_radius", "completeness_mean_of_radius")])
+    return table(["voxel", "triangles", "accuracy", "completeness"], body) + source
+
+
+def repeats() -> str:
+    """Return the table of the price of sums in a fixed order, and of the spread of atomic ones."""
+    result, source = _result("determinism_h200")
+    body = []
+    for r in result["rows"]:
+        cells = [f"{r['gaussians']:,}, {r['width']} x {r['height']}"]
+        for key in ("deterministic", "atomic"):
+            price = r["price"][key]
+            cells.append(f"{price['median_ms']:.2f} / {price['peak_bytes'] / 2**20:.0f}")
+        differ = max(s["repeats_that_differ"] for s in r["spread"].values())
+        ulps = max(s["max_ulp"] for s in r["spread"].values())
+        body.append([*cells, f"{differ} of {result['repeats'] - 1}", f"{ulps:,}"])
+    head = ["Gaussians, image", "fixed order [ms / MiB]", "atomic [ms / MiB]", "atomic repeats that differ", "largest [ulp]"]
+    return table(head, body) + source
+
+
+PARTS: tuple[Callable[[], str], ...] = (ladder, ablation, views, mcmc, objects, poses, same_image, meshes, repeats)
+
+
+def parts() -> dict[str, str]:
+    """Return the generated parts of docs/results.md by name."""
+    return {part.__name__.replace("_", " "): part() for part in PARTS}
