@@ -8,11 +8,11 @@ Without --image a pattern of coloured rings is fitted. Prints the PSNR before an
 import argparse
 from pathlib import Path
 
+import warpgs
+
 import numpy as np
 import torch
 from PIL import Image
-
-import warpgs
 
 
 def rings(size: int) -> torch.Tensor:

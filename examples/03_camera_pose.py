@@ -9,10 +9,10 @@ pose before and after; writes the image, the render from the wrong pose and that
 import argparse
 from pathlib import Path
 
+import warpgs
+
 import torch
 from PIL import Image
-
-import warpgs
 
 SIZE = 96
 

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
+import warpgs
+from warpgs.pipeline.train.loss import LossInputs, register
+
 import numpy as np
 import torch
 from PIL import Image
-
-import warpgs
-from warpgs.pipeline.train.loss import LossInputs, register
 
 
 def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> torch.Tensor:

@@ -14,14 +14,14 @@ from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import torch
-from PIL import Image
-
 import warpgs
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.strategies.base import register
+
+import numpy as np
+import torch
+from PIL import Image
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,6 @@ import math
 import tempfile
 from pathlib import Path
 
-import numpy as np
-
 import warpgs
 from warpgs.errors import DataError
 from warpgs.geometry import look_at
@@ -36,6 +34,8 @@ from warpgs.report.images import png
 from warpgs.scene import Scene
 from warpgs.synthetic import raycast
 from warpgs.synthetic.demo import camera_path, still_life
+
+import numpy as np
 
 UP = np.array([0.0, -1.0, 0.0])
 """Upward direction of the format: +y points down, as in an OpenCV camera."""

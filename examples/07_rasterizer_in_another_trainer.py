@@ -10,11 +10,11 @@ import argparse
 import tempfile
 from pathlib import Path
 
+import warpgs
+
 import numpy as np
 import torch
 from PIL import Image
-
-import warpgs
 
 LRS = {"means": 2e-3, "quats": 1e-3, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh": 1e-2}
 C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic

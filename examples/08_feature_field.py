@@ -8,10 +8,10 @@ Prints the cosine similarity of the features before and after; writes the three 
 import argparse
 from pathlib import Path
 
+import warpgs
+
 import torch
 from PIL import Image
-
-import warpgs
 
 CHANNELS = 16
 

@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import warpgs
+
 import torch
 from PIL import Image
-
-import warpgs
 
 LRS = {"means": 5e-3, "quats": 5e-3, "scales": 2e-2, "opacities": 5e-2, "sh0": 2e-2, "shN": 1e-3}
 OPTIONS: dict[str, dict[str, Any]] = {

@@ -6,6 +6,7 @@ import re
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"  # workers share the cores; tests that are about threads set their number
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as warpgs does where it is imported before torch
 
 import pytest
 import torch

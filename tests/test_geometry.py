@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from tests.gaussians import camera, cloud
+from tests.gaussians import SMOOTH, camera, cloud, hand_placed
 from tests.lens_cameras import LENSES, lens_camera
 from warpgs import geometry
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
 
 
@@ -53,6 +53,35 @@ def test_logits_of_both_ends_are_infinite():
     for probability in (-0.1, 1.1):
         with pytest.raises(ValueError):
             geometry.logit(probability)
+
+
+def test_normals_of_gaussians_are_their_shortest_axes():
+    """The eigenvector of the smallest eigenvalue of each covariance, towards the camera; of a batch, towards each."""
+    g, cams = hand_placed(), camera(cameras=3)
+    found = geometry.gaussian_normals(g, cams)
+    turns = geometry.rotation_matrices(g.quats / g.quats.norm(dim=1, keepdim=True))
+    axis = torch.linalg.eigh(turns @ torch.diag_embed((2 * g.log_scales).exp()) @ turns.mT).eigenvectors[..., 0]
+    for viewmat, normals in zip(cams.viewmat, found):
+        assert torch.allclose((normals * axis).sum(1).abs(), torch.ones(len(g), dtype=torch.float64), atol=1e-12)
+        in_camera = g.means @ viewmat[:3, :3].T + viewmat[:3, 3]
+        assert bool(((normals @ viewmat[:3, :3].T * in_camera).sum(1) < 0).all())
+        one = Camera(viewmat.numpy(), cams.K[0].numpy(), cams.width, cams.height)
+        assert torch.allclose(geometry.gaussian_normals(g, one), normals, atol=1e-15)
+        parallel = geometry.gaussian_normals(g, dataclasses.replace(one, model="orthographic"))
+        assert bool((parallel @ viewmat[2, :3] < 0).all()) and torch.equal(parallel.abs(), normals.abs())
+
+
+def test_gradient_of_the_normals_of_gaussians():
+    """By quaternions of any length, also through an image of normals."""
+    g, cam = hand_placed(degree=0), camera()
+    quats = g.quats.clone().requires_grad_()
+
+    def rendered(quats: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        turned = dataclasses.replace(g, quats=quats)
+        normals = geometry.gaussian_normals(turned, cam)
+        return normals, rasterize(turned, cam, RasterizeOptions(rule=SMOOTH, features=normals)).features
+
+    assert torch.autograd.gradcheck(rendered, quats, fast_mode=True)
 
 
 def test_points_come_back_from_pixels_and_depths():

@@ -7,14 +7,12 @@ argument ``units`` that says which.
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
+from warpgs.runtime.openmp import let_idle_threads_sleep
 from warpgs.version import __version__ as __version__
 
-# Between its loops torch's OpenMP keeps its threads spinning, on cores that our own launches need: two threads then blend no
-# faster than one. OpenMP reads this once, when torch is imported; whoever set it, or imported torch before us, has their way.
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+let_idle_threads_sleep()  # before torch is imported
 
 __all__ = [
     "PRESETS",

@@ -62,12 +62,15 @@ RIM_SAMPLES = 16
 @document_fields
 @dataclass(frozen=True)
 class Rule:
-    """A consistent set of cut-offs for projection and blending."""
+    """A consistent set of cut-offs for projection and blending.
+
+    Lengths [u] are in the unit of the Gaussians.
+    """
 
     name: str
     """Name in options and reports."""
     alpha_cut: float = ALPHA_CUT
-    """Smallest alpha that is blended; 0 blends all, and every Gaussian then spans every tile."""
+    """Smallest alpha that is blended, 1/255 by default; 0 blends all, and every Gaussian then spans every tile."""
     alpha_max: float = ALPHA_MAX
     """Largest alpha; where alpha is clamped to it, its gradient is zero."""
     transmittance_stop: float = TRANSMITTANCE_STOP
@@ -76,7 +79,9 @@ class Rule:
     """True to blend the Gaussian that crosses the stop, so that at most 1e-4 of the pixel is left for what lies behind, and
     accumulated alpha is monotone in every opacity within that. False to drop it, which leaves up to 1e-2."""
     near: float = NEAR
-    """Nearest depth rendered [u]."""
+    """Nearest depth rendered [u], at least 0."""
+    far: float = FAR
+    """Farthest depth rendered [u], at most 1e10."""
     low_pass: float = LOW_PASS
     """Variance added to both image axes [px^2]."""
     square_sigma: float = 0.0

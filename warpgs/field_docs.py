@@ -9,6 +9,9 @@ from typing import TypeVar
 
 Kind = TypeVar("Kind", bound=type)
 
+HELP_WIDTH = 76
+"""Width of a line, to which ``help`` adds a margin of four letters."""
+
 
 def field_docs(kind: type) -> dict[str, str]:
     """Return the docstrings of the fields of a dataclass by name, each on one line; those of its bases included."""
@@ -30,6 +33,7 @@ def field_docs(kind: type) -> dict[str, str]:
 
 def document_fields(kind: Kind) -> Kind:
     """Add the docstrings of a dataclass's fields to its own, so that ``help`` shows them; returns the class."""
-    lines = [f"    {name}: {text}" for name, text in field_docs(kind).items()]
-    kind.__doc__ = "\n".join([f"{kind.__doc__}\n", "Attributes:", *lines])
+    wrap = textwrap.TextWrapper(HELP_WIDTH, initial_indent="    ", subsequent_indent=" " * 8, break_on_hyphens=False)
+    lines = [wrap.fill(f"{name}: {text}") for name, text in field_docs(kind).items()]
+    kind.__doc__ = "\n".join([f"{inspect.cleandoc(kind.__doc__ or '')}\n", "Attributes:", *lines])
     return kind

@@ -13,7 +13,7 @@ import numpy as np
 
 from warpgs import lenses
 from warpgs.errors import UsageError
-from warpgs.scene import Camera
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians
 
 if TYPE_CHECKING:
     import torch
@@ -231,6 +231,31 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
     normals = normals / torch.where(square == 0, 1, square).double().sqrt().to(depth.dtype)
     inner = shown[1:-1, 1:-1] & shown[1:-1, 2:] & shown[1:-1, :-2] & shown[2:, 1:-1] & shown[:-2, 1:-1]
     return torch.nn.functional.pad(torch.where(inner[..., None], normals, 0), (0, 0, 1, 1, 1, 1))
+
+
+def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) -> torch.Tensor:
+    """Compute the normal of each Gaussian: its shortest axis, on the side of the camera.
+
+    Differentiable in ``quats``. Which axis and which side has no gradient. A round Gaussian has no normal of meaning. As
+    `RasterizeOptions.features` the normals render an image of normals.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: One camera, or C of them, with arrays or tensors.
+
+    Returns:
+        Unit normals in the axes of the world, shape [N, 3], or [C, N, 3] for C cameras.
+    """
+    import torch
+
+    means, quats, scales, *_ = gaussians.tensors().values()
+    axes = rotation_matrices(quats / quats.norm(dim=-1, keepdim=True))
+    normals = torch.take_along_dim(axes, scales.argmin(-1)[:, None, None], 2)[..., 0]
+    viewmat = torch.as_tensor(camera.viewmat).detach().to(means)
+    center = -(viewmat[..., :3, :3] * viewmat[..., :3, 3:]).sum(-2)
+    away = viewmat[..., 2:3, :3] if camera.model == "orthographic" else means.detach() - center[..., None, :]
+    faces = (normals.detach() * away).sum(-1, keepdim=True) <= 0
+    return torch.where(faces, normals, -normals)
 
 
 def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarray:

@@ -13,12 +13,12 @@ import dataclasses
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
-
 import warpgs
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
 from warpgs.pipeline.train.loss import LossInputs, register, total
+
+import torch
 
 MIN_ALPHA = 0.5
 """Opacity above which a pixel shows a surface."""

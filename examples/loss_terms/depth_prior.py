@@ -13,13 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
-
 import warpgs
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.loss import LossInputs, register, total
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Prior
+
+import torch
 
 MIN_ALPHA = 0.5
 """Opacity above which the depth of a pixel counts: elsewhere the background contributes more."""

@@ -165,6 +165,20 @@ def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
         assert all(torch.equal(a, b) for a, b in itertools.zip_longest(each, wanted))
 
 
+def test_other_planes_are_another_graph(surroundings):
+    """Near and far plane of the rule count, in the image and in gradients."""
+    g, cam, own = leaves(cloud(200)), camera(64, 48, dtype=torch.float32), Recorder(NoGraphPool(CPU))
+    for planes in ({}, {"near": 3.5, "far": 4.5}, {"far": 4.0}):
+        settings = dataclasses.replace(SETTINGS, width=64, height=48, window=(0, 0, 64, 48))
+        settings = dataclasses.replace(settings, rule=dataclasses.replace(RULES["exact"], **planes))
+        calls = [own.render(inputs_of(g, cam), None, settings) for _ in range(4 * MIN_CALLS)]  # each time twice as many
+        assert calls[0] is None
+        found = calls[-1]
+        images = found[0][0][0], rasterize(g, cam, RasterizeOptions(**planes)).rgb
+        gradients = (torch.autograd.grad(i.square().sum(), list(g.tensors().values())) for i in images)
+        assert torch.equal(*images) and all(torch.equal(a, b) for a, b in zip(*gradients))
+
+
 def test_a_rasterizer_that_is_too_small_says_so(surroundings):
     """The call runs without graphs, and the next rasterizer has the capacity."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))

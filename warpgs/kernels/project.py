@@ -72,13 +72,13 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
         coefficients: wp.array2d(dtype=m.vec3),
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
-        near: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
+        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
     ):  # fmt: skip
         """Project Gaussian n; return the number of tiles it touches. Where that is 0 it is culled, and nothing is written."""
         e = m.ellipse(
             means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
         )  # fmt: skip
-        if e.valid == 0:
+        if e.valid == 0 or not (m.depth_of(e.position) <= far):
             return 0
         opacity = m.opacity_of(logit_opacities[n])
         if opacity_factors.shape[0] > 0:
@@ -154,7 +154,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
         opacity_factors: wp.array(dtype=real),
         width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
         tile_size: int, sh_count: int,
-        near: real, low_pass: real, alpha_cut: real, square_sigma: real,
+        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real,
         # outputs
         projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
     ):  # fmt: skip
@@ -166,7 +166,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
             i, n, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
             logit_opacities, opacity_factors, coefficients,
             width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
-            near, low_pass, alpha_cut, square_sigma, projected,
+            near, far, low_pass, alpha_cut, square_sigma, projected,
         )  # fmt: skip
         tile_counts[i] = tiles
         if tiles == 0:
@@ -207,7 +207,7 @@ def project_tensors(
     tile_counts = allocator.output((cameras, count), torch.int32, means.device)
     arguments = [
         *_views(inputs), interop.view(inputs.opacity_factors, real), *settings.size, *settings.window,
-        settings.tile_size, settings.sh_count, rule.near, rule.low_pass, rule.alpha_cut, rule.square_sigma,
+        settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
     kernel = make_forward(real, _native(means), settings.camera_model, settings.activated)
@@ -308,8 +308,8 @@ def project(
     """Project N Gaussians into C cameras (EWA, first order).
 
     Differentiable in the seven tensors. A Gaussian is culled, with zeros for results and gradients, where its depth is
-    below ``rule.near``, its opacity below the cut, its box outside the image, or a parameter that is read not finite or
-    outside the ranges of docs/conventions.md (depth 1e10 u, projected mean 1e9 px, axes 1e30 px, coefficients 1e6).
+    below ``rule.near`` or above ``rule.far``, its opacity below the cut, its box outside the image, or a parameter that is
+    read not finite or outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6).
     Derivation of the backward pass: docs/project.md.
 
     Args:

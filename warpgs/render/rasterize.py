@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from warpgs.constants import K_TOLERANCE, Rule
+from warpgs.constants import FAR, K_TOLERANCE, Rule
 from warpgs.errors import ResourceError, UsageError
 from warpgs.field_docs import document_fields
 from warpgs.kernels.blend_records import WIDTHS
@@ -50,6 +50,11 @@ class RasterizeOptions:
 
     rule: str | Rule = "exact"
     """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
+    near: float | None = None
+    """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. A Gaussian
+    has the depth of its mean, along the camera's z axis or, of a fisheye, the distance, and is left out as a whole."""
+    far: float | None = None
+    """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the rule's, 1e10."""
     sh_degree: int | None = None
     """Spherical-harmonics degree used; None for all that is stored."""
     background: torch.Tensor | None = None
@@ -109,12 +114,17 @@ ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
 
 
 def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
-    """Return the rule that the options name.
+    """Return the rule that the options name, with their near and far plane.
 
     Raises:
         UsageError: The rule, the tile size or the camera model is unknown, or options exclude each other.
+        ValueError: The near or the far plane is outside its range.
     """
     rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
+    near = rule.near if options.near is None else options.near
+    far = rule.far if options.far is None else options.far
+    if not 0 <= near < far <= FAR:
+        raise ValueError(f"near {near} and far {far} bound no range of depths: give 0 <= near < far <= {FAR:g}")
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
@@ -125,7 +135,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     if options.error_bound and options.capacity is not None:
         raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
-    return rule
+    return replace(rule, near=near, far=far)
 
 
 def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions) -> None:
@@ -265,7 +275,7 @@ def rasterize(
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew or another last row than 0, 0, 1.
+            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")

@@ -17,6 +17,7 @@ from warpgs.errors import ResourceError
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
 from warpgs.runtime.load_module import load_module
 from warpgs.runtime.native_output import hidden_stderr
+from warpgs.runtime.openmp import warn_if_spinning
 
 wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
 
@@ -260,6 +261,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         with _LOADING if debugging else contextlib.nullcontext():
             wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
         return
+    warn_if_spinning()
     first = wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_cmd=True)
     chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
     left = iter(range(chunks))  # threads take the next range when they are done with one

@@ -1,0 +1,32 @@
+"""OpenMP's idle threads, which sleep where warpgs is imported before torch, and otherwise spin."""
+
+import functools
+import os
+import sys
+import warnings
+
+VARIABLE = "OMP_WAIT_POLICY"
+"""Environment variable that OpenMP reads once, when torch is imported."""
+
+SPINNING = "torch" in sys.modules and VARIABLE not in os.environ
+"""True where torch was imported before warpgs, and the environment does not set the variable."""
+
+
+def let_idle_threads_sleep() -> None:
+    """Let OpenMP's idle threads sleep in this process, if torch is not imported yet, and in its children.
+
+    Between its loops OpenMP keeps its threads spinning, on cores that our own launches need. On two busy cores a backward pass
+    then took six times as long. A variable that is set already is left as it is.
+    """
+    os.environ.setdefault(VARIABLE, "passive")
+
+
+@functools.cache
+def warn_if_spinning() -> None:
+    """Warn, in the first call, where torch was imported first."""
+    if SPINNING:
+        warnings.warn(
+            f"idle threads of torch slow down rendering on a CPU: import warpgs before torch, or set {VARIABLE}=passive",
+            RuntimeWarning,
+            stacklevel=2,
+        )
