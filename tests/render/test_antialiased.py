@@ -111,7 +111,7 @@ def test_tiles_follow_from_the_reduced_opacity(device):
     assert r.visible[0].tolist() == [False, True] and r.tile_counts[0].tolist() == [0, 1]
     half_widths = [float(found.projected[0, 1, 10].detach()) for found in (r, rasterize(g, cam))]
     assert half_widths[0] < 0.2 < 1 < half_widths[1]
-    assert float(r.alpha.max()) >= ALPHA_CUT or bool((r.alpha == 0).all())
+    assert float(r.alpha.detach().max()) >= ALPHA_CUT
 
 
 def test_float32_keeps_the_digits_of_needles(device):

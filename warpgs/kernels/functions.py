@@ -194,7 +194,7 @@ def make_projection(real, camera_model: str, activated: bool = False):
     def compensation(e: Ellipse) -> real:
         """Return sqrt(det(cov2d) / det(cov2d + low_pass I)), the antialiasing factor of the opacity, at most 1."""
         normal = wp.cross(e.m1, e.m2)
-        largest = wp.max(wp.max(wp.abs(normal[0]), wp.abs(normal[1])), wp.abs(normal[2]))
+        largest = wp.max(wp.abs(normal))
         if not largest > real(0.0):
             return real(0.0)
         normal = normal / largest  # its square could underflow

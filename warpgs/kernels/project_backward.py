@@ -64,10 +64,9 @@ def make_functions(real, camera_model: str, activated: bool = False, antialiased
         v_m1 = s_det * (per_det * (wp.cross(e.m2, normal) + blur * e.m1)) + v_b * e.m2
         v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
         if wp.static(antialiased):  # compensation -> projected axes (section 4)
-            largest = wp.max(wp.max(wp.abs(normal[0]), wp.abs(normal[1])), wp.abs(normal[2]))
-            if largest > real(0.0):
-                unit = wp.normalize(normal / largest)
-                compensation = m.compensation(e)
+            compensation = m.compensation(e)
+            if compensation > real(0.0):
+                unit = wp.normalize(normal / wp.max(wp.abs(normal)))  # divided, since its square could underflow
                 v_compensation = v_projected[i, 5] * (projected[i, 5] / compensation) * e.shrink
                 by_normal = blur * (wp.dot(e.m1, e.m1) + wp.dot(e.m2, e.m2) + blur) * per_det * inv_det
                 by_blur = compensation * (blur * per_det)
