@@ -21,7 +21,7 @@ from warpgs.pipeline.runs.commands import render
 from warpgs.pipeline.runs.export_filters import Filters
 from warpgs.pipeline.runs.export_model import convert
 from warpgs.pipeline.runs.model_and_cameras import open_file
-from warpgs.render.rasterize import rasterize
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera
 
 
@@ -130,6 +130,35 @@ def test_a_file_shows_what_it_held(rule, tmp_path):
         image = rasterize(model.gaussians(), torch_camera(there)).rgb
         want = rasterize(made, torch_camera(c)).rgb
         assert float((image - want).abs().max()) < 1e-3 and float(want.max()) > 0.1
+
+
+def test_a_file_renders_antialiased(tmp_path):
+    """Its options have the setting, and so have the frames of a film; runs, which have their own, refuse it."""
+    made = cloud(50)
+    made.log_scales.sub_(2)  # below a pixel
+    write_gaussians(tmp_path / "a.ply", made, units="file")
+    write_cameras(tmp_path / "cameras.json", make_cameras())
+    model, _ = open_file(tmp_path / "a.ply", tmp_path / "cameras.json", "exact", "cpu", antialiased=True)
+    camera = torch_camera(next(iter(model.cameras().values())))
+    image, plain = (rasterize(model.gaussians(), camera, options).rgb for options in (model.options(), RasterizeOptions()))
+    assert torch.equal(image, rasterize(model.gaussians(), camera, RasterizeOptions(antialiased=True)).rgb)
+    assert float(image.sum()) < 0.7 * float(plain.sum())
+    file = [
+        "render",
+        str(tmp_path / "a.ply"),
+        "--cameras",
+        str(tmp_path / "cameras.json"),
+        "--path",
+        "views",
+        "--device",
+        "cpu",
+    ]
+    frames = []
+    for flags in (["--antialiased"], []):
+        assert main([*file, "--out", str(tmp_path / f"out{len(flags)}"), *flags]) == 0
+        frames.append(sorted((tmp_path / f"out{len(flags)}").glob("*.png"))[0].read_bytes())
+    assert frames[0] != frames[1]
+    assert main(["render", str(tmp_path), "--antialiased"]) == UsageError.exit_code
 
 
 def test_render_of_a_file(tmp_path):

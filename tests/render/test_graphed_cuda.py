@@ -67,7 +67,9 @@ def equal(a: list, b: list) -> bool:
     return len(a) == len(b) and all(torch.equal(x, y) for s, t in zip(a, b) for x, y in zip(s, t, strict=True))
 
 
-@pytest.mark.parametrize("options", [{}, {"rule": "gsplat-1.5", "tile_size": 8}, {"sh_degree": 0, "window": (16, 0, 32, 32)}])
+@pytest.mark.parametrize(
+    "options", [{}, {"rule": "gsplat-1.5", "tile_size": 8}, {"sh_degree": 0, "window": (16, 0, 32, 32), "antialiased": True}]
+)
 def test_a_loop_sees_the_same_bits(fresh, options):
     """The results of every step agree, those of earlier steps too when all is over."""
     background = torch.tensor([0.2, 0.5, 0.1], device=CUDA)

@@ -191,6 +191,16 @@ def make_projection(real, camera_model: str, activated: bool = False):
         return e
 
     @wp.func
+    def compensation(e: Ellipse) -> real:
+        """Return sqrt(det(cov2d) / det(cov2d + low_pass I)), the antialiasing factor of the opacity, at most 1."""
+        normal = wp.cross(e.m1, e.m2)
+        largest = wp.max(wp.abs(normal))
+        if not largest > real(0.0):
+            return real(0.0)
+        normal = normal / largest  # its square could underflow
+        return wp.min(largest * (wp.sqrt(wp.dot(normal, normal)) / wp.sqrt(e.det)), real(1.0))
+
+    @wp.func
     def direction(mean: vec3, view: mat44) -> vec4:
         """Return the unit vector from the camera centre to the mean, and the distance; zeros where the two coincide."""
         centered = mean + vec3(
@@ -207,7 +217,8 @@ def make_projection(real, camera_model: str, activated: bool = False):
         return vec4(d[0], d[1], d[2], length * largest)
 
     return SimpleNamespace(
-        Ellipse=Ellipse, ellipse=ellipse, sigmoid=sigmoid, opacity_of=opacity_of, direction=direction, finite3=finite3,
+        Ellipse=Ellipse, ellipse=ellipse, compensation=compensation, sigmoid=sigmoid, opacity_of=opacity_of,
+        direction=direction, finite3=finite3,
         rotation=r.rotation, rotation_backward=r.rotation_backward,
         depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
         vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,

@@ -40,7 +40,7 @@ def step_bytes(sizes: StepSizes) -> Needs:
 
 
 @functools.cache
-def make_forward(real, native: bool, camera_model: str, activated: bool = False):
+def make_forward(real, native: bool, camera_model: str, activated: bool = False, antialiased: bool = False):
     """Make the forward kernel.
 
     Args:
@@ -48,6 +48,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
         native: True for CUDA and float32.
         camera_model: Name of the camera model, whose functions are compiled in.
         activated: True for scales and opacities themselves; False for their logarithms and logits.
+        antialiased: True to multiply opacities by `compensation`.
     """
     m = make_projection(real, camera_model, activated)
     s = make_spans(real)
@@ -62,7 +63,8 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
             projected[i, k] = values[k]
 
     store = make_native().store_row if native else store_values
-    module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}{'.activated' * activated}"
+    variant = f"{'.activated' * activated}{'.antialiased' * antialiased}"
+    module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}{variant}"
 
     @wp.func
     def project_one(
@@ -83,6 +85,8 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False)
         opacity = m.opacity_of(logit_opacities[n])
         if opacity_factors.shape[0] > 0:
             opacity *= opacity_factors[n]
+        if wp.static(antialiased):
+            opacity *= m.compensation(e)
         if not (wp.isfinite(opacity) and opacity > real(0.0) and opacity >= alpha_cut):
             return 0
 
@@ -210,7 +214,7 @@ def project_tensors(
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    kernel = make_forward(real, _native(means), settings.camera_model, settings.activated)
+    kernel = make_forward(real, _native(means), settings.camera_model, settings.activated, settings.antialiased)
     interop.launch(kernel, cameras * count, arguments, means.device, cost=5)
     return projected, tile_counts
 
@@ -278,7 +282,7 @@ def project_gradients(
         int(wants_camera), *outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    kernel = make_backward(real, native, settings.camera_model, settings.activated)
+    kernel = make_backward(real, native, settings.camera_model, settings.activated, settings.antialiased)
     interop.launch(kernel, threads, arguments, device, cost=10 * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]

@@ -11,7 +11,7 @@ from warpgs.kernels.native import make_functions as make_native
 
 
 @functools.cache
-def make_functions(real, camera_model: str, activated: bool = False):
+def make_functions(real, camera_model: str, activated: bool = False, antialiased: bool = False):
     """Make the functions that take the gradients of one projected Gaussian to those of its parameters."""
     m = make_projection(real, camera_model, activated)
     vec2 = m.vec2
@@ -36,7 +36,8 @@ def make_functions(real, camera_model: str, activated: bool = False):
     @wp.func
     def shape(
         mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33, lens: wp.array(dtype=real),
-        width: real, height: real, near: real, low_pass: real, v_projected: wp.array2d(dtype=real), i: int,
+        width: real, height: real, near: real, low_pass: real,
+        projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int,
     ) -> ShapeGradient:  # fmt: skip
         g = ShapeGradient()
         e = m.ellipse(mean, quat, log_scale, view, K, lens, width, height, near, low_pass)
@@ -62,6 +63,15 @@ def make_functions(real, camera_model: str, activated: bool = False):
         per_c = real(1.0) / e.c
         v_m1 = s_det * (per_det * (wp.cross(e.m2, normal) + blur * e.m1)) + v_b * e.m2
         v_m2 = s_det * (per_det * (wp.cross(normal, e.m1) + blur * e.m2)) + v_b * e.m1 + s_c * (per_c * e.m2)
+        if wp.static(antialiased):  # compensation -> projected axes (section 4)
+            compensation = m.compensation(e)
+            if compensation > real(0.0):
+                unit = wp.normalize(normal / wp.max(wp.abs(normal)))  # divided, since its square could underflow
+                v_compensation = v_projected[i, 5] * (projected[i, 5] / compensation) * e.shrink
+                by_normal = blur * (wp.dot(e.m1, e.m1) + wp.dot(e.m2, e.m2) + blur) * per_det * inv_det
+                by_blur = compensation * (blur * per_det)
+                v_m1 += v_compensation * (by_normal * wp.cross(e.m2, unit) - by_blur * e.m1)
+                v_m2 += v_compensation * (by_normal * wp.cross(unit, e.m1) - by_blur * e.m2)
 
         # projected axes -> camera axes (section 3)
         v_axes = m.axes_backward(e.position, K, lens, e.expansion_point, v_m1, v_m2)
@@ -123,7 +133,7 @@ def make_functions(real, camera_model: str, activated: bool = False):
 
 
 @functools.cache
-def make_backward(real, native: bool, camera_model: str, activated: bool = False):
+def make_backward(real, native: bool, camera_model: str, activated: bool = False, antialiased: bool = False):
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
     Args:
@@ -132,9 +142,10 @@ def make_backward(real, native: bool, camera_model: str, activated: bool = False
             block.
         camera_model: Name of the camera model, whose functions are compiled in.
         activated: True for scales and opacities themselves; False for their logarithms and logits.
+        antialiased: True where opacities were multiplied by `compensation`.
     """
     m = make_projection(real, camera_model, activated)
-    f = make_functions(real, camera_model, activated)
+    f = make_functions(real, camera_model, activated, antialiased)
     functions = sh.make_functions(real)
     vec3 = m.vec3
     vec4 = m.vec4
@@ -146,7 +157,8 @@ def make_backward(real, native: bool, camera_model: str, activated: bool = False
 
     # four blocks to a multiprocessor
     registers = {"cuda_max_registers": 128} if native else {}
-    module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}{'.activated' * activated}"
+    variant = f"{'.activated' * activated}{'.antialiased' * antialiased}"
+    module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}{variant}"
 
     @wp.kernel(enable_backward=False, module=module, **registers)
     def backward(
@@ -198,6 +210,7 @@ def make_backward(real, native: bool, camera_model: str, activated: bool = False
                     real(height),
                     near,
                     low_pass,
+                    projected,
                     v_projected,
                     i,
                 )

@@ -30,6 +30,8 @@ class ProjectSettings:
     """Name of the camera model."""
     activated: bool = False
     """True where ``log_scales`` and ``logit_opacities`` of `ProjectInputs` hold scales and opacities themselves."""
+    antialiased: bool = False
+    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)) (docs/project.md)."""
 
 
 class ProjectInputs(NamedTuple):

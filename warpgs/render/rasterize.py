@@ -85,6 +85,9 @@ class RasterizeOptions:
     absgrad: bool = False
     """True to sum magnitudes of the gradients of projected means over pixels, too: ``Render.means2d.absgrad``. At most 11
     channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
+    antialiased: bool = False
+    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting: Gaussians
+    below a pixel lose the brightness that widening by ``Rule.low_pass`` adds. For models that were trained so."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
@@ -287,8 +290,9 @@ def rasterize(
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
-    named = {"window": _checked_window(camera, options), "tile_size": options.tile_size, "absgrad": options.absgrad}
-    settings = settings_of(camera, degree, rule, activated=isinstance(gaussians, ActivatedGaussians), **named)
+    named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
+    named |= {"window": _checked_window(camera, options), "activated": isinstance(gaussians, ActivatedGaussians)}
+    settings = settings_of(camera, degree, rule, **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if inputs.means.is_cuda and options.repeatable():

@@ -36,11 +36,14 @@ class RenderSettings:
     """True where scales and opacities are given themselves (`ProjectSettings.activated`)."""
     absgrad: bool = False
     """True to sum magnitudes of the gradients of projected means, too (`BlendSettings.absgrad`)."""
+    antialiased: bool = False
+    """True to reduce the opacity of Gaussians that the pixel filter widens (`ProjectSettings.antialiased`)."""
 
     def projection(self) -> ProjectSettings:
         """Return what the projection takes."""
         size, count = (self.width, self.height), sh.coefficient_count(self.degree)
-        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, self.camera_model, self.activated)
+        variant = (self.camera_model, self.activated, self.antialiased)
+        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, *variant)
 
     def of_window(self) -> dict[str, Any]:
         """Return size, place and cut-offs of the window, as binning and blending take them by name."""

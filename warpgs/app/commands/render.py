@@ -12,7 +12,7 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help.
 
     Raises:
-        UsageError: Cameras or a rule are given for a run.
+        UsageError: Cameras, a rule or antialiasing are given for a run.
     """
     import tyro
 
@@ -24,6 +24,8 @@ def run(arguments: list[str], about: str) -> int:
         """Cameras for a file of Gaussians: cameras.json, transforms.json, COLMAP's folder, or a scene."""
         rule: str | None = None
         """Cut-offs that a file of Gaussians was trained with: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
+        antialiased: bool = False
+        """Render a file of Gaussians that was trained with antialiasing, as by gsplat's rasterize_mode antialiased."""
         path: str = "auto"
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
@@ -56,12 +58,12 @@ def run(arguments: list[str], about: str) -> int:
     from warpgs.pipeline.runs.commands import render
 
     settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
-    if a.run.is_dir() and (a.cameras is not None or a.rule is not None):
-        raise UsageError("--cameras and --rule are for files of Gaussians; a run has its own")
+    if a.run.is_dir() and (a.cameras is not None or a.rule is not None or a.antialiased):
+        raise UsageError("--cameras, --rule and --antialiased are for files of Gaussians; a run has its own")
     given = (a.cameras, a.rule) if a.run.is_file() or a.cameras is not None else None
     for line in render(
         a.run, a.path, a.out, settings, a.device,
-        background=a.background, coverage=a.coverage, sheet=a.sheet, file_of=given,
+        background=a.background, coverage=a.coverage, sheet=a.sheet, file_of=given, antialiased=a.antialiased,
     ):  # fmt: skip
         say(line)
     return 0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +57,8 @@ class FittedModel(Model):
     """Steps done."""
     transparent: bool = field(default=False, kw_only=True)
     """True if the scene's images have an alpha channel, so that renders are transparent."""
+    antialiased: bool = field(default=False, kw_only=True)
+    """True where renders are antialiased (`RasterizeOptions.antialiased`)."""
 
     def __repr__(self) -> str:
         """Describe the model in one line."""
@@ -68,8 +70,8 @@ class FittedModel(Model):
         return {n: convert_camera(c, self.normalization, "scene", units) for n, c in self.scene_cameras.items()}
 
     def options(self) -> RasterizeOptions:
-        """Return the rasterizer's options of the fit: rule and background."""
-        return options_for(self.rule, self.background, self.scene_gaussians)
+        """Return the rasterizer's options of the fit: rule, background and antialiasing."""
+        return replace(options_for(self.rule, self.background, self.scene_gaussians), antialiased=self.antialiased)
 
 
 def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:

@@ -116,6 +116,7 @@ def render(
     folder: Path, path: str, out: Path | None, settings: FilmSettings, device_name: str, *,
     background: str = "auto", coverage: bool = False, sheet: bool = False,
     file_of: tuple[Path | None, str | None] | None = None,
+    antialiased: bool = False,
 ) -> list[str]:  # fmt: skip
     """Render a run or a file of Gaussians along a path to PNG files and a film, or to a film alone; returns lines for the user.
 
@@ -129,6 +130,7 @@ def render(
         coverage: Whether to write images of what no training view saw, too.
         sheet: Whether to write six frames in one image, too.
         file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.
+        antialiased: Whether that file was trained with antialiasing.
 
     Raises:
         DataError: The folder is no run, or the file, its cameras or the keyframes cannot be read.
@@ -145,7 +147,7 @@ def render(
     if file_of is None:
         stored = open_run(folder, device_name)
     else:
-        stored, notes = open_file(folder, *file_of, device_name)
+        stored, notes = open_file(folder, *file_of, device_name, antialiased)
         notes += ["black lies behind the Gaussians; --background gives another colour"] if color is None else []
     tell = Stages()
     settings = replace(settings, background=color)

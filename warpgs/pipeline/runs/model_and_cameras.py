@@ -26,6 +26,7 @@ def open_file(
     cameras: Path | None,
     rule: str | None = None,
     device: str = "auto",
+    antialiased: bool = False,
 ) -> tuple[FittedModel, list[str]]:
     """Read a file of Gaussians and the cameras that it is seen through; returns the model and notes for the user.
 
@@ -34,6 +35,7 @@ def open_file(
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
         rule: Name of the cut-offs that it was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
+        antialiased: True for a model that was trained so (`RasterizeOptions.antialiased`).
 
     Raises:
         DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
@@ -60,7 +62,8 @@ def open_file(
     if rule is None:
         notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat-1.6 or gsplat-1.5 suits models of gsplat")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
-    model = FittedModel(gaussians, normalization, in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
+    shown = (in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
+    model = FittedModel(gaussians, normalization, *shown, antialiased=antialiased)
     return model, [*notes, f"{len(gaussians):,} Gaussians, {len(found)} cameras"]
 
 
