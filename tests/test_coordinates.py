@@ -84,7 +84,7 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(DataError, match="cannot be read"):
         load(tmp_path / "a")
     write_ply(tmp_path / "a", g, units="file")
-    with pytest.raises(DataError, match="damaged or no safetensors file"):
+    with pytest.raises(DataError, match="damaged or not a safetensors file"):
         load(tmp_path / "a")
     from safetensors.torch import save_file
 

@@ -128,7 +128,7 @@ def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
         (["b.mine", "--format", "best"], "unknown format 'best'; choose one of"),
         (["b.mine", "--format", "{own}:Archive", "--spz.version", "2"], "--spz.* are not options of the format"),
         (["b.spz", "--spz.version", "9"], "SPZ version 9"),
-        (["cameras.json", "--format", "{own}:Archive"], "--format is for Gaussians"),
+        (["cameras.json", "--format", "{own}:Archive"], "--format does not apply to cameras"),
     ],
 )
 def test_mistakes_are_one_sentence(own, tmp_path, capsys, flags, said):

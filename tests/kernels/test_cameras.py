@@ -62,10 +62,10 @@ def test_another_model_renders(device, dtype, max_instances):
 def test_unknown_models_are_refused():
     """The error names the models there are."""
     cam = dataclasses.replace(camera(dtype=torch.float32), model="fish")
-    with pytest.raises(UsageError, match=r"no camera model 'fish'; choose one of fisheye, opencv, orthographic, pinhole"):
+    with pytest.raises(UsageError, match=r"unknown camera model 'fish'; choose one of fisheye, opencv, orthographic, pinhole"):
         rasterize(cloud(3), cam)
     options = {"width": 18, "height": 17, "degree": 1, "rule": RULES["exact"], "camera_model": "fish"}
-    with pytest.raises(UsageError, match="no camera model 'fish'"):
+    with pytest.raises(UsageError, match="unknown camera model 'fish'"):
         project(*cloud(3).tensors().values(), cam.viewmat[None], cam.K[None], **options)
 
 

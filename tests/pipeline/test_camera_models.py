@@ -145,7 +145,7 @@ def test_run_folders_keep_the_model():
 def test_what_cannot_be_rendered_is_refused_before_the_first_step():
     """An unknown model, or one with other coefficients; the error says which."""
     first, *rest = views(2)
-    for change, words in (({"model": "fish"}, "no camera model 'fish'"), ({"distortion": np.zeros(2)}, "takes 4")):
+    for change, words in (({"model": "fish"}, "unknown camera model 'fish'"), ({"distortion": np.zeros(2)}, "takes 4")):
         wrong = dataclasses.replace(first, camera=dataclasses.replace(first.camera, **change))
         with pytest.raises(UsageError, match=words):
             Trainer([*rest, wrong], seeds(), CONFIG, CPU)

@@ -19,7 +19,7 @@ def test_folders_and_globs(tmp_path):
 
 def test_a_scene_is_no_folder_of_scenes(tmp_path):
     write_scenes(tmp_path, 1)
-    with pytest.raises(UsageError, match="is one scene: fit it with `warpgs fit`"):
+    with pytest.raises(UsageError, match="is a single scene: fit it with `warpgs fit`"):
         list_jobs(str(tmp_path / "s0"))
 
 

@@ -137,7 +137,7 @@ def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_
     assert main(["export", str(tmp_path / "run"), "--to", str(tmp_path / "a.ply")]) == 0
     assert main(["eval", str(tmp_path / "run"), "--device", "cpu"]) == 3
     assert "passed from Python" in capsys.readouterr().err
-    with pytest.raises(DataError, match="no record of a fit"):
+    with pytest.raises(DataError, match="not a record of a fit"):
         (tmp_path / "x").mkdir()
         (tmp_path / "x" / "config.json").write_text("{}")
         warpgs.fit(scene, few, out=tmp_path / "x", resume=True)

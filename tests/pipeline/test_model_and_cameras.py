@@ -81,7 +81,7 @@ def test_cameras_turn_with_their_gaussians(tmp_path):
         ("a", "cameras.json"), ("b", "b/transforms.json"))]  # fmt: skip
     images = [rasterize(m.gaussians(), torch_camera(list(m.cameras().values())[1])).rgb for m in models]
     assert float((images[0] - images[1]).abs().max()) < 1e-3 and float(images[0].max()) > 0.1
-    with pytest.raises(UsageError, match="are for Gaussians"):
+    with pytest.raises(UsageError, match="do not apply to cameras"):
         convert(tmp_path / "cameras.json", tmp_path / "c" / "cameras.json", Filters(clean=True))
     convert(tmp_path / "cameras.json", tmp_path / "l" / "cameras.json", Filters(rotate="level"))
     with pytest.raises(UsageError, match="not supported"):

@@ -138,7 +138,7 @@ def test_story_follows_the_switches(run, tmp_path):
     method = dataclasses.replace(METHOD, agp=False, sampler=sampler)
     other = fitted(dataclasses.replace(CONFIG, method=method), steps=8)
     words = sampling_report_of(other, tmp_path).words
-    assert "the highest in S_importance" in words and "other views confirm and whose S_geometry" in words
+    assert "the highest in S_importance" in words and "other views confirm and with S_geometry" in words
     assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story.words
     free = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(method, ra=False)), steps=8)
     assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words

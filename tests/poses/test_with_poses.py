@@ -43,7 +43,8 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
     scene = tmp_path / "scene"
     scene.mkdir()
     rows = found[1]["photographs"]
-    for lost, said in ((0, []), (2, [f"2 of 6 photographs have no pose and were not used: {scene / 'poses.txt'} says why"])):
+    missing = f"2 of 6 photographs have no pose and were not used: see {scene / 'poses.txt'} for reasons and remedies"
+    for lost, said in ((0, []), (2, [missing])):
         unposed = [p | {"registered": False, "reason": "has none"} for p in rows[:lost]]
         write_record(scene, found[1] | {"photographs": [*unposed, *rows[lost:]]})
         assert [line.partition(", and")[0] for line in lost_lines(tmp_path)] == said
