@@ -24,6 +24,7 @@ endif
 
 # LOCKED=1: only files whose hashes stand in requirements.lock; else, from wherever pip is told, the versions of constraints.txt
 $(VENV)/installed: pyproject.toml constraints.txt requirements.lock
+	@echo "installing into $(VENV): a few minutes, 3 to 8 GB"
 	$(PYTHON) -m venv $(VENV)
 ifdef LOCKED
 	$(BIN)/python -m pip install --quiet --require-hashes --no-deps --requirement requirements.lock
@@ -44,6 +45,7 @@ demo: install
 	$(BIN)/warpgs demo $(OUT)/scene
 	$(BIN)/warpgs fit $(OUT)/scene --split llff:6 --out $(OUT)/run
 	@echo "images: $(OUT)/run/renders    report: $(OUT)/run/report.html"
+	@echo "for the commands above, first: source $(BIN)/activate"
 
 # Everything that must pass before a change is offered. PYTEST are the words of one pytest run.
 PYTEST := $(BIN)/python -m pytest -q

@@ -8,7 +8,7 @@ import pytest
 from tests.scenes import ring
 from warpgs.errors import UsageError
 from warpgs.geometry import look_at, project_points
-from warpgs.pipeline.films.camera_paths import BY_KIND, camera_path, framed
+from warpgs.pipeline.films.camera_paths import BY_KIND, camera_path, framed, path_of
 from warpgs.pipeline.films.keyframes import Keyframe, through
 from warpgs.pipeline.films.rig import common_up, rig_of, up_of
 from warpgs.pipeline.films.view_tour import tour_of
@@ -83,6 +83,16 @@ def test_the_rig_is_found(cameras, kind, all_round):
         assert (rig.span is None) == all_round
     if kind in ("ring", "forward"):
         assert all(rig.reach(c) > 0 for c in cameras)
+
+
+def test_a_film_of_one_side_stays_near_the_photographs():
+    """Over a wide arc it goes from one to the next; a spiral comes no nearer than from their mean place."""
+    wide, narrow = around(np.arange(0, 70, 12)), around(np.arange(0, 31, 6))
+    assert [path_of(rig_of(c, 2.0)) for c in (wide, narrow)] == ["interpolate", "spiral"]
+    rig = rig_of(narrow, 2.0)
+    mean = np.mean([c.center for c in narrow], axis=0)
+    distances = [np.linalg.norm(c.center - rig.center) for c in camera_path("spiral", rig, narrow, 40)]
+    assert min(distances) >= np.linalg.norm(mean - rig.center) * (1 - 1e-9) and max(distances) > 1.1 * min(distances)
 
 
 @pytest.mark.parametrize("roll", [(0, 0), (90, 90), (90, -90), (3, -4)])

@@ -128,9 +128,9 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
 
 def _check_folder(root: Path) -> None:
     if root.is_file():
-        raise DataError(f"{root}: is a file; give the folder that holds the images and their cameras")
+        raise DataError(f"{root}: is a file; give a folder of photographs, or of images with their cameras")
     if not root.is_dir():
-        raise DataError(f"{root}: no such folder; give the folder that holds the images and their cameras")
+        raise DataError(f"{root}: no such folder; give a folder of photographs, or of images with their cameras")
 
 
 def _accepted(root: Path, reader: Reader) -> Reader:

@@ -14,6 +14,8 @@ from warpgs.scene import Camera
 
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
 """Path of each kind of rig where none was asked for."""
+WIDE_ARC = math.radians(75)
+"""Arc of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the captured area."""
 SWING = 0.9
 """Fraction of the cameras' range that a film swings through: coverage is lower at its ends."""
 MAX_ELEVATION = math.radians(80)
@@ -52,6 +54,12 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
     return replace(camera, K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), width=new_width, height=new_height)
 
 
+def path_of(rig: Rig) -> str:
+    """Return the path of a rig where none was asked for."""
+    wide = rig.kind == "forward" and rig.span is not None and rig.span[1] - rig.span[0] > WIDE_ARC
+    return "interpolate" if wide else BY_KIND[rig.kind]
+
+
 def upright(rig: Rig, camera: Camera) -> Camera:
     """Return a camera with its centre and axis turned upright, for photographs that lie on their side."""
     if not rig.turned:
@@ -61,7 +69,7 @@ def upright(rig: Rig, camera: Camera) -> Camera:
 
 
 def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np.ndarray]:
-    """Return poses of two turns that open and close again while moving in and out, all looking at the rig's centre."""
+    """Return poses of two turns that open and close again while moving back and in again, all looking at the rig's centre."""
     center = np.mean([c.center for c in cameras], axis=0)
     forward = rig.center - center
     depth = math.sqrt((forward * forward).sum())
@@ -73,7 +81,7 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
     spans = [max(0.7 * float(np.abs(matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
     poses = []
     for t in np.arange(frames) / frames:
-        angle, radius, push = 4 * np.pi * t, np.sin(np.pi * t), 0.15 * depth * np.sin(2 * np.pi * t)
+        angle, radius, push = 4 * np.pi * t, np.sin(np.pi * t), -0.15 * depth * np.sin(np.pi * t) ** 2
         eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up) + push * forward
         poses.append(look_at(eye, rig.center, up))
     return poses

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.films.camera_paths import BY_KIND, LIMITS, camera_path, framed, upright
+from warpgs.pipeline.films.camera_paths import LIMITS, camera_path, framed, path_of, upright
 from warpgs.pipeline.films.keyframes import read_keyframes, through
 from warpgs.pipeline.films.rig import Rig, rig_of
 from warpgs.pipeline.films.view_tour import tour_of
@@ -159,7 +159,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
     notes = [f"{len(train)} training cameras look {rig.describe()}"]
     if rig.turned:
         notes.append("the photographs lie on their side; the film is upright, by the plane of the cameras")
-    kind = BY_KIND[rig.kind] if path == "auto" else path
+    kind = path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)
         remedy = "the model shows nothing there: `warpgs eval` scores each view"

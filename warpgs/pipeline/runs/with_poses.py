@@ -43,7 +43,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
         if record["source_sha256"] != source_digest(source, request.allow_outside):
             raise UsageError(f"{source} holds the poses of other photographs than {scene}; give another --out")
     else:
-        progress(f"{source} holds no cameras: finding poses, which {scene} keeps")
+        progress(f"{source} holds no cameras: finding poses of its photographs, kept in {scene}")
         threads = torch.get_num_threads()
         record = find_poses(
             source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,

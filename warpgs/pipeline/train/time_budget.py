@@ -89,7 +89,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
         f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, predicted to take {needed:.0f} s "
         f"here, where a render with gradients takes {1000 * probe:.0f} ms"
         + (f"; {len(views)} views need no more" if steps == most else "")
-        + "; scores and report come on top"
+        + "; poses, start, scores and report come on top"
     )
 
 
