@@ -23,6 +23,8 @@ MAX_BYTES = 16 * 2**20
 """Largest file of keyframes."""
 MAX_SKEW = 1e-3
 """Largest difference between a matrix of a file and the rotation nearest to it."""
+MIN_SECONDS, MAX_SECONDS = 1e-3, 86400.0
+"""Least and largest time from one keyframe to the next [s]: slopes of the curve between them stay finite."""
 MAX_REACH = 1e12
 """Largest coordinate of a camera centre in a file."""
 
@@ -162,8 +164,11 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
             )
         if value["fov_y"] > 3.1:
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
-        if result and value["seconds"] <= values[i - 1]["seconds"]:
-            raise DataError(f"{path}: seconds of keyframe {i} is not after that of keyframe {i - 1}; put them in order of time")
+        if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
+            raise DataError(
+                f"{path}: seconds of keyframe {i} is not after that of keyframe {i - 1}, by {MIN_SECONDS:g} to "
+                f"{MAX_SECONDS:g}; put them in order of time"
+            )
         viewmat, rotation = np.eye(4), nearest_rotation(rotation)
         viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -matmul(rotation.T, matrix[:3, 3])
         camera = convert_camera(replace(template, viewmat=viewmat), normalization, "file", "scene")
