@@ -105,7 +105,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
         try:
             _check_unpacked(file)
             # weights_only: tensors and plain containers, nothing that could run
-            state = torch.load(file, map_location="cpu", weights_only=True)
+            state = torch.load(_mapped(file), map_location="cpu", weights_only=True, mmap=_mapped(file) is not file)
         except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
             reason = str(e).splitlines()[0][:120] if str(e) else ""
             raise DataError(
@@ -116,6 +116,16 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
     if not isinstance(state, dict):
         raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; give the weights alone")
     return state, digest
+
+
+def _mapped(file: BinaryIO) -> str | BinaryIO:
+    """Return the name of an open archive by which torch maps it, so that tensors take no memory until they are read.
+
+    The file itself where there are no such names, or torch would have to unpickle the tensors with the rest.
+    """
+    named = os.name == "posix" and os.path.exists(f"/dev/fd/{file.fileno()}") and zipfile.is_zipfile(file)
+    file.seek(0)
+    return f"/dev/fd/{file.fileno()}" if named else file
 
 
 def _check_unpacked(file: BinaryIO) -> None:
@@ -133,6 +143,8 @@ def _check_unpacked(file: BinaryIO) -> None:
         others = sum(member.file_size for member in members if Path(member.filename).parent.name != "data")
         if others > MAX_PICKLE:
             raise ValueError(f"it holds {others:,} bytes beside its tensors, more than {MAX_PICKLE:,}")
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise ValueError("its tensors are packed")
     file.seek(0)
 
 
