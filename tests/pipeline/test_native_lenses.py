@@ -113,7 +113,7 @@ def test_orthographic_views_are_fitted_from_points(tmp_path):
     # 16.7 dB; 16.8 by pinholes
     assert result.metrics["test"]["psnr"] > 16 and "coverage" not in result.metrics
     assert result.metrics["rule"]["mean"] < 1e-5 and (tmp_path / "run" / "report.html").is_file()
-    with pytest.raises(UsageError, match="camera model orthographic: .* --init.source points"):
+    with pytest.raises(UsageError, match=r"camera model orthographic: .* --init.source points"):
         warpgs.fit(scene, steps=2, **options)
     with pytest.raises(UsageError, match="'orthographic'"):
         warpgs.render_path(result, "turntable", out=tmp_path / "film", frames=2)
