@@ -183,6 +183,18 @@ def test_bad_sources_are_named(files, tmp_path):
 
 
 @ALEX
+def test_weights_are_the_same_where_files_cannot_be_mapped(files, tmp_path, monkeypatch):
+    """Not every system has names for open files."""
+    from safetensors.torch import load_file
+
+    convert_lpips(files[3], files[4], tmp_path / "mapped")
+    monkeypatch.setattr("warpgs.files.DESCRIPTORS", tmp_path / "none")
+    convert_lpips(files[3], files[4], tmp_path / "read")
+    mapped, read = (load_file(tmp_path / name) for name in ("mapped", "read"))
+    assert mapped.keys() == read.keys() and all(torch.equal(t, read[n]) for n, t in mapped.items())
+
+
+@ALEX
 def test_packed_weights_are_refused_before_they_are_unpacked(files, tmp_path):
     """A small archive may unpack to any size, and torch copies a large pickle."""
     import zipfile

@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 
 import torch
 
+from warpgs import files
 from warpgs.errors import DataError, UsageError
 from warpgs.files import remove_leftovers, write_bytes
 from warpgs.input_files import open_input, read_input, unread_reason
@@ -123,9 +124,10 @@ def _mapped(file: BinaryIO) -> str | BinaryIO:
 
     The file itself where there are no such names, or torch would have to unpickle the tensors with the rest.
     """
-    named = os.name == "posix" and os.path.exists(f"/dev/fd/{file.fileno()}") and zipfile.is_zipfile(file)
+    name = files.DESCRIPTORS / str(file.fileno())
+    named = name.exists() and zipfile.is_zipfile(file)
     file.seek(0)
-    return f"/dev/fd/{file.fileno()}" if named else file
+    return str(name) if named else file
 
 
 def _check_unpacked(file: BinaryIO) -> None:
