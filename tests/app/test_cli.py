@@ -190,7 +190,8 @@ def failure(capsys, code: int, *arguments: str) -> str:
 def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys):
     """2 usage, 3 data, 4 resources; each names the thing and the way out, and no folder is left behind."""
     out = str(tmp_path / "new")
-    assert "unknown command 'train'" in failure(capsys, 2, "train")
+    assert "unknown command 'train'; choose one of demo" in failure(capsys, 2, "train")
+    assert "unknown command 'rendr'; did you mean render?" in failure(capsys, 2, "rendr")
     assert "choose another --out" in failure(capsys, 2, "fit", str(scene), "--out", str(run))
     assert "preset 'best'" in failure(capsys, 2, "fit", str(scene), "--out", out, "--preset", "best")
     assert "device 'tpu'" in failure(capsys, 2, "fit", str(scene), "--out", out, "--device", "tpu")

@@ -70,8 +70,8 @@ def test_one_of_two_gets_the_folder(reference: Reference, tmp_path, one, other, 
         if one == other:
             assert loser.wait() == 4 and "choose another folder" in said, said
             assert f"process {winner.pid} on" in said or "another process is writing" in said, said  # before it has signed
-        else:  # a fit takes no folder that holds a run, whether somebody writes there or not
-            assert loser is processes[0] and loser.wait() == 2 and "exists already" in said, said
+        else:  # a fit takes no folder that holds a run; while somebody writes there, resuming is no way out
+            assert loser is processes[0] and loser.wait() == 4 and "choose another folder" in said, said
         go(winner)
         _, errors = winner.communicate()
         assert winner.returncode == 0, errors

@@ -105,8 +105,10 @@ def test_what_was_chosen_is_said(model):
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
     assert plan.notes[-1].startswith("path interpolate: through 3 of 5 training views in the order of their names")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
-    with pytest.raises(UsageError, match=r"path 'orbit' is not one of auto, views, turntable, spiral, interpolate or a \.json"):
+    with pytest.raises(UsageError, match="path 'orbit'; choose one of auto, views, turntable, spiral, interpolate, or give"):
         plan_film(model, "orbit", FilmSettings())
+    with pytest.raises(UsageError, match=r"unknown path 'turntabel'; did you mean turntable\?"):
+        plan_film(model, "turntabel", FilmSettings())
 
 
 @pytest.mark.parametrize(

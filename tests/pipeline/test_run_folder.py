@@ -9,12 +9,15 @@ import pytest
 
 import warpgs
 from warpgs.app.cli import main
-from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK
 from warpgs.pipeline.farm import ensure_run
+from warpgs.pipeline.films.plan import FilmSettings
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs import fit as fit_module
 from warpgs.pipeline.runs.checkpoint import TENSORS
+from warpgs.pipeline.runs.commands import evaluate, render
+from warpgs.pipeline.runs.export_model import export
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.synthetic.demo import write_demo
@@ -123,6 +126,31 @@ def test_a_checkpoint_of_another_fit_is_not_continued(folder, tmp_path, key):
     with pytest.raises(DataError, match=f"and config.json beside it belong to different fits: {word} differs"):
         fit(folder, tmp_path / "run", resume=True)
     assert contents(tmp_path / "run") == before
+
+
+def test_a_folder_in_use_names_its_user_and_does_not_advise_to_resume(folder, tmp_path):
+    """Whether it holds a run already or not; a lock file that nobody holds is no user."""
+    shutil.copytree(folder / "run", tmp_path / "run")
+    with hold_folder(tmp_path / "run"), pytest.raises(FolderHeldError, match=f"process {os.getpid()} on .* is writing there"):
+        fit(folder, tmp_path / "run")
+    (tmp_path / "run" / LOCK).write_text("")
+    with pytest.raises(UsageError, match="exists already; choose another --out, or continue that run with --resume"):
+        fit(folder, tmp_path / "run")
+
+
+def test_commands_on_a_run_that_has_not_ended_print_that(folder, tmp_path):
+    """Render, export, page, evaluation and plot; none does for a finished run."""
+    shutil.copytree(folder / "run", tmp_path / "run")
+    commands = {
+        "export": lambda: export(tmp_path / "run", tmp_path / "a.ply"),
+        "eval": lambda: evaluate(tmp_path / "run", "cpu"),
+        "render": lambda: render(tmp_path / "run", "views", tmp_path / "film", FilmSettings(), "cpu"),
+    }
+    assert not [line for c in commands.values() for line in c() if ": unfinished," in line]
+    (tmp_path / "run" / "metrics.json").unlink()
+    for name, command in commands.items():
+        lines = [line for line in command() if "unfinished, the fit stopped after step 2" in line]
+        assert len(lines) == 1 and "--resume" in lines[0], name
 
 
 def test_a_fit_that_was_killed_before_it_had_a_record_can_be_begun_again(folder, tmp_path):

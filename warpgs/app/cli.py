@@ -15,6 +15,7 @@ from warpgs.runtime.output_streams import careful_output
 from warpgs.runtime.ranks import last_words
 from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
 from warpgs.runtime.terminal import accept_all_letters, say
+from warpgs.suggestion import did_you_mean
 from warpgs.temporary import system_folder
 from warpgs.version import __version__
 
@@ -105,7 +106,8 @@ def _run(arguments: list[str]) -> int:
     name = arguments[0]
     try:
         if name not in COMMANDS:
-            raise UsageError(f"unknown command {name!r}; choose one of {', '.join(COMMANDS)}")
+            hint = did_you_mean(name, COMMANDS) or f"choose one of {', '.join(COMMANDS)}"
+            raise UsageError(f"unknown command {name!r}; {hint}")
         if name == "fit" and wants_help(arguments[1:]):  # before the import, which costs seconds
             for line in help_lines(COMMANDS[name]):
                 say(line)

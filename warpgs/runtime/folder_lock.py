@@ -62,6 +62,17 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
             raise
 
 
+def check_free(folder: Path) -> None:
+    """Check that no process holds a folder; writes nothing, and takes a folder that cannot be read as free.
+
+    Raises:
+        FolderHeldError: Another process holds it.
+    """
+    with contextlib.suppress(OSError), open_folder(folder) as opened:
+        with os.fdopen(opened.open_regular(LOCK, os.O_RDWR), "r+b", buffering=0) as file:
+            _lock(file, folder)
+
+
 @contextlib.contextmanager
 def _held(folder: Folder) -> Iterator[bool]:
     """Hold the lock of a folder; gives whether there are locks."""

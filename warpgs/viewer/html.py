@@ -155,4 +155,4 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
         notes = write_html(target, gaussians, cameras, run.background)
     size = format_bytes(target.stat().st_size)
     last = f"{len(gaussians):,} Gaussians in {target}, {size}; open it in any browser, without a network"
-    return [*held, *lines, *notes, last]
+    return [*run.notes(), *held, *lines, *notes, last]

@@ -18,6 +18,7 @@ from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.report.image_names import image_names
 from warpgs.scene import Camera, Gaussians
+from warpgs.suggestion import did_you_mean
 
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
 """Names of paths; the name of a JSON file of keyframes is one, too."""
@@ -141,7 +142,8 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         UsageError: The path is unknown.
     """
     if path not in PATHS and not path.lower().endswith(".json"):
-        raise UsageError(f"path {path!r} is not one of {', '.join(PATHS)} or a .json file of keyframes")
+        hint = did_you_mean(path, PATHS) or f"choose one of {', '.join(PATHS)}, or give a .json file of keyframes"
+        raise UsageError(f"unknown path {path!r}; {hint}")
     scene = model.cameras()
     train = [scene[n] for n in model.train]
     depth, coverage = depth_and_coverage(model.gaussians(), train, model.options())

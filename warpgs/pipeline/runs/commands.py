@@ -99,11 +99,12 @@ def evaluate(
             "config_hash": stored.record["config_hash"], "steps": stored.step,
         }  # fmt: skip
         write_json(folder / "eval.json", metrics)
+    notes = [*stored.notes(), *notes, *renaming_notes(names)]
     if not test:
-        return [*notes, *renaming_notes(names), f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
+        return [*notes, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
     lines = [_view_line(r) for r in metrics["views"]]
     lines += coverage_lines(metrics["coverage"]) if by_coverage else []
-    return [*notes, *renaming_notes(names), *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
+    return [*notes, *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
 
 
 def _view_line(row: dict[str, Any]) -> str:
@@ -146,6 +147,7 @@ def render(
     stored: FittedModel
     if file_of is None:
         stored = open_run(folder, device_name)
+        notes = stored.notes()
     else:
         stored, notes = open_file(folder, *file_of, device_name, antialiased)
         notes += ["black lies behind the Gaussians; --background gives another colour"] if color is None else []

@@ -95,6 +95,8 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     if kind.max_degree < gaussians.sh_degree:
         lines.append(f"harmonics above degree {kind.max_degree} are dropped: {kind.suffix} files cannot hold them")
         gaussians = limit_degree(gaussians, kind.max_degree)
+    if stored is not None:
+        lines = [*stored.notes(), *lines]
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
         lines.append(f"the file does not hold the background colour of the fit, #{color}")

@@ -28,6 +28,7 @@ from warpgs.pipeline.runs.coverage_report import coverage_of_run
 from warpgs.pipeline.runs.fit_steps import model_fields, take_steps, tell
 from warpgs.pipeline.runs.folder import (
     CONFIG,
+    METRICS_FILE,
     check_checkpoint,
     check_same,
     read_record,
@@ -273,7 +274,7 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
         metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
         if job.out is not None and overview is not None:
             job.progress("making the report")
-            write_json(job.out / "metrics.json", metrics)
+            write_json(job.out / METRICS_FILE, metrics)
             record["notes"] = job.notes
             write_report(
                 job.out, job.scene, job.split, trainer.gaussians, metrics, record,

@@ -27,11 +27,13 @@ from warpgs.pipeline.runs.request import FitRequest, SceneRequest, choose_device
 from warpgs.pipeline.runs.schemas import MODEL_STATE, check_record
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.poses.record import JSON as POSES
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import check_free, hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
 from warpgs.version import __version__
 
 CONFIG = "config.json"
+METRICS_FILE = "metrics.json"
+"""Scores, sizes and times, which a fit writes at its end."""
 IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
 """Folders in a run folder with the images that its fit writes."""
 POSED_SCENE = "scene"
@@ -57,7 +59,8 @@ def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
     One that holds found poses alone, as a fit leaves it that ended before its first step, is taken in both cases.
 
     Raises:
-        ResourceError: Another process writes into the folder, or it cannot be written.
+        FolderHeldError: Another process writes into the folder.
+        ResourceError: It cannot be written.
         UsageError: The folder holds something already, or no run to continue.
     """
     _check_folder(out, resume)
@@ -74,6 +77,7 @@ def _check_folder(out: Path, resume: bool) -> None:
         if resume and not (out / CONFIG).is_file():
             raise UsageError(f"--resume: {out} holds no {CONFIG}; give the folder of a run")
         if not resume and out.exists() and not (out.is_dir() and is_empty(out)):
+            check_free(out)
             raise UsageError(f"{out} exists already; choose another --out, or continue that run with --resume")
     except OSError as e:
         raise UsageError(f"{out}: cannot be read ({e.strerror or e}); choose another --out") from e
@@ -217,6 +221,13 @@ class StoredRun(FittedModel):
     """The run folder."""
     record: dict[str, Any]
     """Contents of its config.json."""
+
+    def notes(self) -> list[str]:
+        """Return a note for the user where the fit has not ended; nothing for a finished or a pruned run."""
+        if "pruned" in self.record or (self.folder / METRICS_FILE).is_file():
+            return []
+        why = f"unfinished, the fit stopped after step {self.step:,}"
+        return [f"{self.folder}: {why}; to finish it, repeat its command with --resume"]
 
     def scene_request(self, reader: str | None = None) -> SceneRequest:
         """Return the scene that was fitted, as it was read.

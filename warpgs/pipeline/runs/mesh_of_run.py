@@ -63,7 +63,7 @@ def mesh(
         write_mesh(target, made, up)
     if up is None and target.suffix.lower() == ".glb":
         notes = [*notes, "the cameras agree on no upward direction, so the mesh may lie on its side in a viewer"]
-    return [*notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
+    return [*run.notes(), *notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
 
 
 def _lines(found: FusedMesh, views: int) -> list[str]:

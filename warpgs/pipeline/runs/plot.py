@@ -126,7 +126,7 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     if not len(points):
         raise DataError(f"{folder}: no Gaussian has an opacity of {MIN_OPACITY} or more; there is nothing to show")
     most = MAX_POINTS[settings.points]
-    notes = [] if len(points) <= most else [f"a sample of {most:,} of {len(points):,} is shown"]
+    notes = stored.notes() + ([] if len(points) <= most else [f"a sample of {most:,} of {len(points):,} is shown"])
     chosen = np.sort(np.random.default_rng(0).permutation(len(points))[:most])
     shown = (train, test) if settings.cameras else ([], [])
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []

@@ -110,6 +110,7 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
     record = stored.record | {"pruned": figures, "cameras": {n: camera_values(c) for n, c in stored.scene_cameras.items()}}
     notes = _write(out, record, made, stored.step, stored.normalization)
     lines = [
+        *stored.notes(),
         *notes,
         f"{len(before):,} -> {len(made.degrees):,} Gaussians, mean SH degree {figures['mean_degree'][0]:.2f} -> "
         f"{figures['mean_degree'][1]:.2f}",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import numbers
 import types
 import typing
@@ -18,6 +17,7 @@ from warpgs.pipeline.train.view_modules.base import VIEW_MODULES, ViewModule
 from warpgs.plugins import Registry, flag_group
 from warpgs.runtime.byte_units import parse_bytes
 from warpgs.schema import SchemaError, of_type
+from warpgs.suggestion import did_you_mean
 
 Path = tuple[str, ...]
 """Names of fields from a `FitConfig` to a setting; a number among them is the place of a loss term or a view module."""
@@ -212,9 +212,8 @@ def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
     """Return the message on a name that no setting has, with the nearest one that there is, spelled as it was."""
     known = {keyword(n) if keywords else n: n for n in setting_names(config)}
     last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # as in `opacity` for `init.opacity`
-    near = last or difflib.get_close_matches(name, known, 1)
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
     if name in groups:
         return f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or one of them by its name"
-    hint = f"did you mean {near[0]}?" if near else "`warpgs fit --help-all` lists all"
+    hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"{place}: unknown setting {name[:60]!r}; {hint}"

@@ -1,0 +1,13 @@
+"""The known name nearest to a mistyped one."""
+
+import difflib
+from collections.abc import Iterable
+
+MAX_COMPARED = 60
+"""Letters of a mistyped name that are compared."""
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return the question whether the nearest of the ``known`` names was meant; empty where none is near."""
+    near = difflib.get_close_matches(word[:MAX_COMPARED], list(known), 1)
+    return f"did you mean {near[0]}?" if near else ""
