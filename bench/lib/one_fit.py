@@ -23,7 +23,6 @@ from warpgs.io.splits import split_views
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.runs.prune import prune
 from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.runs.results import options_for
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.scene import Scene, View
@@ -189,5 +188,5 @@ def bare_fit(scene: Scene, train: list[View], test: list[View], config: FitConfi
         "points": points, "seconds": time.perf_counter() - wall, "setup": setup, "cpu_seconds": time.process_time() - cpu,
         "setup_cpu": setup_cpu, "gaussians": len(trainer.gaussians), "bytes": model_bytes(trainer), "steps": config.steps,
     }  # fmt: skip
-    options = options_for(config.rule, scene.background, trainer.gaussians)
+    options = trainer.context.render_options()
     return row | scores((render_view(trainer.gaussians, v, options)[0] for v in test), test)

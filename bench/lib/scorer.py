@@ -21,7 +21,7 @@ class Scorer:
         self.own = self._psnr(self.run.gaussians())
 
     def _psnr(self, gaussians: Gaussians) -> float:
-        metrics = evaluate_run(None, gaussians, *self.views, self.run.rule, self.run.background)
+        metrics = evaluate_run(None, gaussians, *self.views, self.run.options())
         return float(metrics["test"]["psnr"])
 
     def loss(self, gaussians: Gaussians) -> float:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import torch
 
 from warpgs.kernels.step_buffers import Setting
+from warpgs.pipeline.model.scale_limits import TrainingCameras
 from warpgs.pipeline.model.sh_degrees import model_bytes as bytes_of
 from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.train.by_views import settings_by_views
@@ -23,6 +24,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.pipeline.train.warmup import warm_up
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.ranks import ALONE
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
@@ -126,7 +128,7 @@ class Steps:
 
     def __init__(self, gaussians: Gaussians, camera: Camera, target: torch.Tensor, rule: str, lr: float | None = None):
         device = target.device
-        self.rule, self.lr, self.background = rule, lr, torch.zeros(3, device=device)
+        self.lr, self.options = lr, RasterizeOptions(rule=rule, background=torch.zeros(3, device=device))
         self.table = Table.of_gaussians(gaussians, {})
         self.buffers = StepBuffers(device, 3 * len(self.table.params))
         config = FitConfig()
@@ -139,16 +141,22 @@ class Steps:
             plan_phases(config.phases, MAX_STEPS),
             1.0,
             rule,
-            self.background,
+            self.options.background,
         )
         strategy = Strategy(context)  # of the base class: it changes nothing
-        self.learned = Learned(self.table, LearnedViews((), (), device, 0), strategy, None, torch.zeros(1, 3, device=device))
+        self.learned = Learned(
+            self.table,
+            LearnedViews((), (), device, 0),
+            strategy,
+            None,
+            TrainingCameras(torch.zeros(1, 3, device=device), torch.zeros(1, 9, device=device)),
+        )
         numbers = torch.zeros(1, dtype=torch.int64, device=device)
         self.views = ViewStack(
             camera.viewmat, camera.K, camera.K.new_empty(1, 0), camera.model, target[None], None, {}, numbers
         )
         self.plan = StepPlan(gaussians.sh_degree, False, tuple(built_in_terms(LossConfig())), None)
-        self.graphs = StepGraphs(self.learned, self.buffers, rule, self.background) if device.type == "cuda" else None
+        self.graphs = StepGraphs(self.learned, self.buffers, self.options) if device.type == "cuda" else None
         self._load(range(1, (MAX_STEPS if device.type == "cuda" else 1) + 1))
 
     def _load(self, steps: range) -> None:
@@ -162,7 +170,7 @@ class Steps:
     def eager(self) -> None:
         """Take the first step of a batch from Python, again and again: the same work each time."""
         self.buffers.counter.zero_()
-        step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.rule, self.background, None))
+        step(self.learned, self.views, self.buffers, self.plan, eager_renderer(self.options, None))
 
     def _graph(self) -> torch.cuda.CUDAGraph:
         return self.graphs.capture_all([KIND], {KIND: self.views}, self.plan, None)[0]

@@ -23,7 +23,6 @@ from bench.lib.tables import named
 from warpgs.errors import DataError, WarpgsError
 from warpgs.io.load import load_scene
 from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.results import options_for
 from warpgs.render.rasterize import rasterize
 
 
@@ -41,7 +40,7 @@ def run_order(run: Path, scene: Path, device: torch.device) -> Iterator[dict]:
     if source.points is None or source.points.tracks is None:
         raise DataError(f"{scene}: has no points that name the views which saw them; give a COLMAP folder")
     gaussians, cameras = stored.gaussians(), stored.cameras()
-    options = options_for(stored.record["config"]["rule"], tuple(stored.record["background"]), gaussians)
+    options = stored.options()
     for name in stored.record["test"]:
         if name not in {v.name for v in source.views}:
             raise DataError(f"{scene}: lacks {name}, which {run} holds out; give the reconstruction of the same photographs")

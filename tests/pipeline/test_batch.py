@@ -41,7 +41,7 @@ def test_a_batch_of_one_view_is_a_step_of_one_view():
     """Through dropout, sampling events, layers and protection: the same bits by way of the sums."""
     views = photos(3)
     one, batch = (Trainer(views, seeds(61), METHOD, CPU, priors=priors(views)) for _ in range(2))
-    batch.taker.batched = BatchSteps(batch.learned, batch.buffers, METHOD.rule, batch.background, Tree(1, ALONE))
+    batch.taker.batched = BatchSteps(batch.learned, batch.buffers, batch.context.render_options(), Tree(1, ALONE))
     advanced(one, 24), advanced(batch, 24)
     assert len(one.strategy.events) > 1 and same_bits(one, batch)
 

@@ -80,10 +80,10 @@ def test_a_step_renders_by_the_views_own_camera(fit, captured):
     for number in range(4):
         fit.buffers.load([number], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
         if captured:
-            capacity = step.instance_capacity(fit.gaussians, stack, plan.degree, fit.config.rule)
-            render = step.captured_renderer(fit.config.rule, fit.background, capacity, fit.buffers.stop)
+            capacity = step.instance_capacity(fit.gaussians, stack, plan.degree, fit.context.render_options())
+            render = step.captured_renderer(fit.context.render_options(), capacity, fit.buffers.stop)
         else:
-            render = step.eager_renderer(fit.config.rule, fit.background, None)
+            render = step.eager_renderer(fit.context.render_options(), None)
         step.view_gradients(fit.learned, stack, fit.buffers, plan, render)
         image = torch.as_tensor(views()[number].image)
         wanted = ((rendered_alone(fit, number) - image) ** 2).mean()
@@ -109,9 +109,9 @@ def test_memory_is_planned_for_the_instances_of_the_model(fit):
     most = max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in cameras)
     pinholes = [dataclasses.replace(c, model="pinhole", distortion=None) for c in cameras]
     assert most != max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in pinholes)
-    assert most_instances(fit.gaussians, [v.camera for v in fit.views], fit.config.rule) == most
+    assert most_instances(fit.gaussians, [v.camera for v in fit.views], options) == most
     (stack,) = fit.stacks.values()
-    capacity = step.instance_capacity(fit.gaussians, stack, 0, fit.config.rule)
+    capacity = step.instance_capacity(fit.gaussians, stack, 0, options)
     assert capacity == int(step.CAPACITY_FACTOR * most) + 1024
 
 

@@ -114,7 +114,7 @@ def test_scores_split_into_what_they_are_made_of(tmp_path):
     train, test = views[:2], views[3:]
     names = {v.name: v.name.removesuffix(".png") for v in views}
     dim = [View(v.name, v.camera, 0.9 * v.image) for v in test]
-    found = coverage_of_run(tmp_path, three_gaussians(), train, dim, "exact", (0.0, 0.0, 0.0), names=names)
+    found = coverage_of_run(tmp_path, three_gaussians(), train, dim, RasterizeOptions(), names=names)
     shares = list(found["classes"].values())
     assert sum(r["share_of_pixels"] for r in shares) == pytest.approx(1) == sum(r["share_of_error"] for r in shares)
     for row, v in zip(found["views"], dim):

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from tests.scenes import photos, seeds
 from warpgs.pipeline.model.init import InitConfig, initial_gaussians
 from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.image_names import image_names, renaming_notes
 
 
@@ -49,6 +50,6 @@ def test_images_of_views_with_like_names_are_all_written(tmp_path):
     for view, name in zip(views, wanted):
         object.__setattr__(view, "name", name)
     gaussians = initial_gaussians(seeds(), InitConfig(), 3, 1.0, torch.device("cpu"))
-    evaluate_run(tmp_path, gaussians, views[4:], views[:4], "exact", (0.0, 0.0, 0.0))
+    evaluate_run(tmp_path, gaussians, views[4:], views[:4], RasterizeOptions())
     for folder in ("renders", "depth"):
         assert len(list((tmp_path / folder).iterdir())) == 4

@@ -158,6 +158,6 @@ def test_a_refined_pose_learns_from_a_term():
     fit.learned.views.table.params[ROTATION].data[1] = torch.tensor([0.0, 0.2, 0.0])
     (stack,) = fit.stacks.values()
     fit.buffers.load([1], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
-    found = view_gradients(fit.learned, stack, fit.buffers, plan, eager_renderer(config.rule, fit.background, None))
+    found = view_gradients(fit.learned, stack, fit.buffers, plan, eager_renderer(fit.context.render_options(), None))
     rotation = found.gradients[len(fit.table.params) + list(fit.learned.views.table.params).index(ROTATION)]
     assert float(rotation[1].abs().max()) > 10 and not bool(rotation[[0, 2]].any())

@@ -39,7 +39,7 @@ def masked(views: list[View]) -> list[View]:
 
 
 def instances(fit: Trainer) -> int:
-    return most_instances(fit.gaussians, [v.camera for v in fit.views], "exact")
+    return most_instances(fit.gaussians, [v.camera for v in fit.views], fit.context.render_options())
 
 
 def measured(fit: Trainer, steps: int) -> int:

@@ -24,7 +24,7 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
     """Each row is the score of its view, whoever finished first; means are over these; every held-out view has its files."""
     gaussians, views = scene
     test, train = views[:10], views[10:]
-    found = evaluate_run(tmp_path, gaussians, train, test, "exact", BLACK)
+    found = evaluate_run(tmp_path, gaussians, train, test, options_for("exact", BLACK, gaussians))
     options = options_for("exact", BLACK, gaussians)
     wanted = [score(v, render_view(gaussians, v, options)[0]).row() for v in views]
     assert found["views"] == wanted[:10] and len({r["psnr"] for r in wanted}) == 12
@@ -37,7 +37,7 @@ def test_scores_are_those_of_their_views(scene, tmp_path):
 def test_without_held_out_views_training_views_are_pictured(scene, tmp_path):
     """And no score is called held-out."""
     gaussians, views = scene
-    found = evaluate_run(tmp_path, gaussians, views[:2], [], "exact", BLACK)
+    found = evaluate_run(tmp_path, gaussians, views[:2], [], options_for("exact", BLACK, gaussians))
     assert found["test"] == {} and found["views"] == [] and found["baselines"] == {} and found["train"]["psnr"] > 5
     assert len(list((tmp_path / "renders").iterdir())) == 2
 
@@ -50,7 +50,7 @@ def test_a_picture_that_cannot_be_written_is_said(scene, tmp_path, monkeypatch):
 
     monkeypatch.setattr(results, "write_bytes", full)
     with pytest.raises(ResourceError, match="no space left"):
-        evaluate_run(tmp_path, scene[0], scene[1][:1], scene[1][1:3], "exact", BLACK)
+        evaluate_run(tmp_path, scene[0], scene[1][:1], scene[1][1:3], options_for("exact", BLACK, scene[0]))
 
 
 def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_path):

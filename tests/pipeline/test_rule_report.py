@@ -20,7 +20,8 @@ from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Gaussians, View
 
 CPU = torch.device("cpu")
-BACKGROUND = (0.2, 0.4, 0.6)
+BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
+EXACT = RasterizeOptions(background=BACKGROUND)
 
 
 def views(count: int = 5, width: int = 150, height: int = 100) -> list[View]:
@@ -40,8 +41,8 @@ def test_error_is_the_difference_of_the_pictures(device):
     """For a coarse rule the figures are those of its pictures and exact's, whole pictures in float32, within float32."""
     g, seen = crowd(device), views(2, 60, 48)  # smaller than a part: the parts are the pictures
     for rule in ("fast", "gsplat-1.5"):
-        found = rule_report_of(g, seen, rule, BACKGROUND, seed=0)
-        options = RasterizeOptions(background=torch.tensor(BACKGROUND))
+        found = rule_report_of(g, seen, RasterizeOptions(rule=rule, background=BACKGROUND), seed=0)
+        options = EXACT
         pairs = [
             [rasterize(g, v.camera, dataclasses.replace(options, rule=r)).rgb.flatten() for r in (rule, "exact")] for v in seen
         ]
@@ -55,7 +56,7 @@ def test_error_is_the_difference_of_the_pictures(device):
 
 def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
     """Rule exact: the arithmetic alone, and no second time."""
-    found = rule_report_of(crowd(device), views(), "exact", BACKGROUND, seed=3)
+    found = rule_report_of(crowd(device), views(), EXACT, seed=3)
     assert 0 < found["mean"] < 2e-6 and "exact_ms" not in found and found["psnr"] > 90
     assert "has no cut-offs" in found["summary"] and "random training views" in found["summary"]
 
@@ -63,7 +64,7 @@ def test_nothing_traded_is_said_and_is_as_small_as_float32(device):
 def test_the_seed_draws_views_and_parts():
     """Three views, parts of 64 px on tile edges or the picture's, others for another seed."""
     g, seen = crowd(CPU), views(6)
-    first, again, other = (rule_report_of(g, seen, "exact", BACKGROUND, seed=s) for s in (0, 0, 1))
+    first, again, other = (rule_report_of(g, seen, EXACT, seed=s) for s in (0, 0, 1))
     assert first["views"] == again["views"] and first["mean"] == again["mean"] and first["views"] != other["views"]
     assert len(first["views"]) == 3
     for x, y, w, h in first["views"].values():
@@ -76,7 +77,7 @@ def test_a_gaussian_that_is_no_number_changes_nothing():
     g = crowd(CPU)
     bad = g.means.clone()
     bad[5] = float("nan")
-    found = rule_report_of(dataclasses.replace(g, means=bad), views(1), "exact", BACKGROUND, seed=0)
+    found = rule_report_of(dataclasses.replace(g, means=bad), views(1), EXACT, seed=0)
     assert found["mean"] < 2e-6
 
 

@@ -14,6 +14,7 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import (
     LimitConfig,
     Limits,
+    TrainingCameras,
     long_axes,
     scene_radius,
     shape_figures,
@@ -28,7 +29,7 @@ from warpgs.scene import Gaussians, PointCloud
 
 CPU = torch.device("cpu")
 YES, NO = torch.tensor([True]), torch.tensor([False])
-CENTERS, VIEWS = torch.zeros(1, 3), photos(4)
+CAMERAS, VIEWS = TrainingCameras(torch.zeros(1, 3), torch.zeros(1, 9)), photos(4)
 
 
 def params(log_scales: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -39,11 +40,11 @@ def test_axes_are_cut_and_needles_thickened():
     """The middle axis follows the longest, the shortest stays; what is within the limits stays as it is; twice is as once."""
     found = params(torch.log(torch.tensor([[900.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.05], [40.0, 40.0, 40.0]])))
     limits = Limits(30.0, 30.0)
-    limits.hold(found, CENTERS, YES)
+    limits.hold(found, CAMERAS, YES)
     expected = torch.tensor([[30.0, 1e-6, 1.0], [2.0, 1.0, 1e-9], [1e-3, 3.0, 0.1], [30.0, 30.0, 30.0]])
     assert torch.allclose(found["log_scales"].exp(), expected, rtol=1e-5)
     once = found["log_scales"].clone()
-    limits.hold(found, CENTERS, YES)
+    limits.hold(found, CAMERAS, YES)
     assert torch.equal(found["log_scales"], once)
 
 
@@ -53,7 +54,7 @@ def test_any_order_of_the_axes():
     ordered = scales.sort(1, descending=True).values
     longest, middle = long_axes(scales)
     assert torch.equal(longest, ordered[:, 0]) and torch.equal(middle, ordered[:, 1])
-    Limits(ratio=2.0).hold({"log_scales": scales}, CENTERS)
+    Limits(ratio=2.0).hold({"log_scales": scales}, CAMERAS)
     longest, middle = long_axes(scales)
     assert float((longest - middle).max()) <= math.log(2) + 1e-6 and torch.equal(longest, ordered[:, 0])
 
@@ -63,9 +64,9 @@ def test_a_step_that_is_not_taken_changes_nothing():
     found = params(torch.tensor([[9.0, 0.0, 0.0], [math.nan, 0.0, 1.0]]))
     before = {n: t.clone() for n, t in found.items()}
     limits = Limits(1.0, 2.0)
-    limits.hold(found, CENTERS, NO)
+    limits.hold(found, CAMERAS, NO)
     assert all(torch.equal(t.nan_to_num(7), before[n].nan_to_num(7)) for n, t in found.items())
-    limits.hold(found, CENTERS, YES)
+    limits.hold(found, CAMERAS, YES)
     assert bool(found["log_scales"][1].isnan().any()) and float(found["log_scales"][0].max()) == 0
 
 
@@ -74,7 +75,7 @@ def test_no_gaussian_reaches_a_camera():
     found = params(torch.log(torch.tensor([[9.0, 1.0, 1e-3], [0.5, 0.2, 0.1], [math.inf, 1.0, 1.0]])))
     found["means"] = torch.tensor([[0.0, 0, 6], [0, 0, 6], [0, 0, 6]])
     limits, centers = LimitConfig(max_ratio=0).at(1.0, 100.0), torch.tensor([[0.0, 0, 0], [0, 0, 20]])
-    limits.hold(found, centers, YES)
+    limits.hold(found, CAMERAS._replace(centers=centers), YES)
     sizes = found["log_scales"].exp()
     assert torch.allclose(sizes[:2], torch.tensor([[2.0, 1.0, 1e-3], [0.5, 0.2, 0.1]])) and sizes[2, 0].isinf()
     model = Gaussians(**(cloud(2).tensors() | {n: t[:2] for n, t in found.items()}))
@@ -155,6 +156,7 @@ def test_the_ratio_is_held_from_its_time_on_and_at_the_last_step():
     for wrong in (
         {"max_size": -1},
         {"max_reach": -1},
+        {"min_pixels": -1},
         {"max_ratio": 0.5},
         {"ratio_from": 1.1},
         {"max_size": math.nan},

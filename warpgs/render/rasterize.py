@@ -112,6 +112,12 @@ class RasterizeOptions:
         return self.record and self.deterministic and not extra and all(o is None for o in others)
 
 
+def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> RenderSettings:
+    """Return the settings by which a fit renders whole images: cut-offs and antialiasing are those of the options."""
+    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
+    return settings_of(camera, degree, rule, antialiased=options.antialiased)
+
+
 ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 

@@ -32,7 +32,7 @@ class _Ellipses:
     """Colours, shape [N, 3]."""
 
 
-def _project(gaussians: Gaussians, camera: Camera, degree: int) -> _Ellipses:
+def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: bool) -> _Ellipses:
     """Project all Gaussians by the matrices of Kerbl et al. 2023, section 4."""
     rule = RULES["exact"]
     means, quats, log_scales, logits, coefficients = (t.detach().double() for t in gaussians.tensors().values())
@@ -50,6 +50,8 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int) -> _Ellipses:
     pixels, jacobians = _pixels(camera, K, lens, positions)
     axes = jacobians @ rotation @ rotation_matrices(unit[visible]) @ torch.diag_embed(log_scales[visible].exp())
     covariances = axes @ axes.mT + rule.low_pass * torch.eye(2, dtype=torch.float64, device=means.device)
+    if antialiased:
+        opacities = opacities * (torch.linalg.det(axes @ axes.mT).clamp_min(0) / torch.linalg.det(covariances)).sqrt()
     inverse = torch.linalg.inv_ex(covariances).inverse
     A, B, C = -0.5 * inverse[:, 0, :1], -inverse[:, 0, 1:], -0.5 * inverse[:, 1, 1:]
     away = means[visible] + rotation.T @ translation
@@ -105,8 +107,9 @@ def _block(g: _Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: tor
 
 @torch.no_grad()
 def reference_image(
-    gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int
-) -> torch.Tensor:
+    gaussians: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor, degree: int,
+    antialiased: bool = False,
+) -> torch.Tensor:  # fmt: skip
     """Return the colours in a window of one camera's image under rule ``exact``, in float64.
 
     Dense over the pixels of a block and by matrices throughout (Kerbl et al. 2023, section 4 and eq. 3), so for windows of
@@ -118,6 +121,7 @@ def reference_image(
         window: Left, top, width and height [px].
         background: Colour behind the scene, shape [3].
         degree: Spherical-harmonics degree used.
+        antialiased: As in `RasterizeOptions`.
 
     Returns:
         Colours, not clamped, shape [h, w, 3].
@@ -126,7 +130,7 @@ def reference_image(
         UsageError: The camera model is known to the kernels alone.
     """
     lenses.check_known(camera.model)
-    g, device = _project(gaussians, camera, degree), gaussians.means.device
+    g, device = _project(gaussians, camera, degree, antialiased), gaussians.means.device
     left, top, width, height = window
     image = torch.empty(height, width, 3, dtype=torch.float64, device=device)
     steps = torch.arange(BLOCK, dtype=torch.float64, device=device) + 0.5

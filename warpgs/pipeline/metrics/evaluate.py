@@ -111,10 +111,10 @@ def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.n
 
 
 def options_for(
-    rule: str, background: tuple[float, float, float], gaussians: Gaussians, max_instances: int | None = None
+    rule: str, background: tuple[float, float, float], gaussians: Gaussians, antialiased: bool = False
 ) -> RasterizeOptions:
-    """Return the rasterizer's options for a model: its cut-offs, its background, and a bound on instances, if any."""
-    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), max_instances=max_instances)
+    """Return the rasterizer's options for a model: its cut-offs, its background, and whether it is antialiased."""
+    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), antialiased=antialiased)
 
 
 @torch.no_grad()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -71,7 +71,7 @@ class FittedModel(Model):
 
     def options(self) -> RasterizeOptions:
         """Return the rasterizer's options of the fit: rule, background and antialiasing."""
-        return replace(options_for(self.rule, self.background, self.scene_gaussians), antialiased=self.antialiased)
+        return options_for(self.rule, self.background, self.scene_gaussians, self.antialiased)
 
 
 def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:

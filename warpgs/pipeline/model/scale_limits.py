@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from warpgs import geometry
+from warpgs import geometry, lenses
 from warpgs.errors import UsageError
 from warpgs.kernels.camera_reach import camera_reach
+from warpgs.kernels.pixel_size import pixel_size
 from warpgs.scene import Camera, Gaussians, PointCloud
 
 WITHIN = 0.9
@@ -35,25 +36,30 @@ class Limits:
     """Largest ratio of the longest axis to the middle one."""
     reach: float = 0.0
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest camera; 0 for no such limit."""
+    pixels: float = 0.0
+    """Smallest standard deviation of an axis [px], in the camera that samples the Gaussian most finely; 0 for no such limit."""
 
     @torch.no_grad()
-    def hold(self, params: dict[str, torch.Tensor], centers: torch.Tensor, going: torch.Tensor | None = None) -> None:
+    def hold(self, params: dict[str, torch.Tensor], cameras: TrainingCameras, going: torch.Tensor | None = None) -> None:
         """Bring logarithms of axes [N, 3] within the limits, in place; a second time changes nothing.
 
-        Axes are cut to the largest size; where the longest is then too long for the middle one, the middle one grows. A flat
-        disk stays one. Moments of Adam stay. It may be part of a captured step.
+        Axes are raised to the smallest size and cut to the largest, which comes before the smallest; where the longest is then
+        too long for the middle one, the middle one grows. A flat disk stays one. Moments of Adam stay. It may be part of a
+        captured step.
 
         Args:
             params: ``means`` [N, 3] and ``log_scales`` [N, 3] of `Gaussians`.
-            centers: Positions of training cameras [u], as `camera_centers` gives them, shape [C, 3].
+            cameras: Training cameras.
             going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes. None stands for True.
         """
-        if self.largest == math.inf and self.ratio == math.inf and self.reach == 0:
+        if self == NO_LIMITS:
             return
-        old = params["log_scales"].detach()
-        new = old.clamp(max=math.log(self.largest))
+        new = old = params["log_scales"].detach()
+        if self.pixels > 0:
+            new = torch.maximum(new, pixel_size(params["means"].detach(), cameras.rows, self.pixels)[:, None])
+        new = new.clamp(max=math.log(self.largest))
         if self.reach > 0:
-            new = torch.minimum(new, camera_reach(params["means"].detach(), centers, self.reach)[:, None])
+            new = torch.minimum(new, camera_reach(params["means"].detach(), cameras.centers, self.reach)[:, None])
         new = torch.where(old.isinf(), old, new)  # what is not finite is not hidden
         if self.ratio < math.inf:
             longest, middle = (x[:, None] for x in long_axes(new))
@@ -76,6 +82,9 @@ class LimitConfig:
     max_reach: float = 1 / 3
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
     a third, three of them reach no camera; larger ones beside or behind training cameras are a fog before other views."""
+    min_pixels: float = 0.2**0.5
+    """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
+    most finely; 0 for no limit. It stands for the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
     ratio_from: float = 0.7
     """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
 
@@ -86,19 +95,56 @@ class LimitConfig:
             raise UsageError(f"limits max-ratio must be 0, for no limit, or lie between 1 and 1e6, not {self.max_ratio}")
         if not 0 <= self.max_reach <= 1e6:
             raise UsageError(f"limits max-reach must be 0, for no limit, or at most 1e6, not {self.max_reach}")
+        if not 0 <= self.min_pixels <= 1e6:
+            raise UsageError(f"limits min-pixels must be 0, for no limit, or at most 1e6, not {self.min_pixels}")
         if not 0 <= self.ratio_from <= 1:
             raise UsageError(f"limits ratio-from must lie between 0 and 1, not {self.ratio_from}")
 
-    def at(self, progress: float, radius: float) -> Limits:
+    def at(self, progress: float, radius: float, antialiased: bool = False) -> Limits:
         """Return the limits of a step.
 
         Args:
             progress: Fraction of the fit that is done before it, in [0, 1]; 1 for the last step, which has all of them.
             radius: Result of `scene_radius` [u].
+            antialiased: True in an antialiased fit.
         """
         held = self.max_ratio > 0 and (progress > self.ratio_from or progress == 1)
         largest = self.max_size * radius if self.max_size > 0 else math.inf
-        return Limits(largest, self.max_ratio if held else math.inf, self.max_reach)
+        return Limits(largest, self.max_ratio if held else math.inf, self.max_reach, self.min_pixels if antialiased else 0.0)
+
+
+class TrainingCameras(NamedTuple):
+    """Training cameras, as limits of sizes refer to them."""
+
+    centers: torch.Tensor
+    """Result of `camera_centers`, shape [K, 3]."""
+    rows: torch.Tensor
+    """All of them as `pixel_size` takes them, float32, shape [C, 9]."""
+
+    @staticmethod
+    def of(cameras: Sequence[Camera], device: torch.device) -> TrainingCameras:
+        """Return the tensors of at least one camera on a device."""
+        rows = np.stack([_camera_row(c) for c in cameras])
+        return TrainingCameras(camera_centers(cameras, device), torch.as_tensor(rows, dtype=torch.float32, device=device))
+
+
+def _camera_row(camera: Camera) -> np.ndarray:
+    """Return a camera as `pixel_size` takes it, shape [9]; its cone holds eight points of the border of the image.
+
+    Where a lens does not reach one of them, the cone is all that the model can see. Of a model without centre nothing is known:
+    its pixels are of size 0, and limit nothing.
+    """
+    f, center = np.array([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
+    ends = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
+    points = (ends * (camera.width, camera.height) - center) / f
+    by_distance, central = camera.model == "fisheye", camera.model in lenses.CENTRAL
+    cosine = -1.0 if by_distance else 0.0
+    if central:
+        rays = lenses.from_plane(camera.model, camera.distortion, points)
+        cosines = rays[:, 2] / np.linalg.norm(rays, axis=1)
+        cosine = float(cosines.min()) if np.isfinite(cosines).all() else cosine
+    focal = f.max() if central else math.inf
+    return np.array([*camera.center, *camera.viewmat[2, :3], focal, cosine, by_distance])
 
 
 def camera_centers(cameras: Sequence[Camera], device: torch.device) -> torch.Tensor:

@@ -87,12 +87,10 @@ def evaluate(
     request = stored.scene_request(reader)
     with hold_folder(folder, *IMAGE_FOLDERS) as notes:
         names = image_names(v.name for v in scene.views)
-        metrics = evaluate_run(
-            folder, stored.gaussians(), train, test, stored.rule, stored.background, lpips, names=names, tell=tell
-        )
+        metrics = evaluate_run(folder, stored.gaussians(), train, test, stored.options(), lpips, names=names, tell=tell)
         if by_coverage and test:
             metrics["coverage"] = coverage_of_run(
-                folder, stored.gaussians(), train, test, stored.rule, stored.background, names=names, tell=tell
+                folder, stored.gaussians(), train, test, stored.options(), names=names, tell=tell
             )
         metrics |= {
             "protocol": protocol_of(scene, request.split, request.downscale, train, test),

@@ -11,7 +11,7 @@ import numpy as np
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.io.decoding import decode
 from warpgs.pipeline.metrics.coverage_scores import CLASSES, score_by_coverage
-from warpgs.pipeline.metrics.evaluate import options_for
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.report.coverage_image import LEGEND, coverage_image
 from warpgs.report.images import png, webp
 from warpgs.report.page import CoverageReport
@@ -31,9 +31,7 @@ def coverage_of_run(
     gaussians: Gaussians,
     train: list[View],
     test: list[View],
-    rule: str,
-    background: tuple[float, float, float],
-    max_instances: int | None = None,
+    options: RasterizeOptions,
     *,
     names: Mapping[str, str],
     tell: Callable[[str], object] = lambda line: None,
@@ -45,9 +43,7 @@ def coverage_of_run(
         gaussians: N Gaussians in scene units [u].
         train: Training views.
         test: Held-out views, at least one.
-        rule: Cut-offs of the rasterizer.
-        background: Colour behind the scene.
-        max_instances: As in RasterizeOptions.
+        options: Options of the rasterizer.
         names: Names of image files by view, as `image_names` gives them for the whole scene.
         tell: Takes a line on each view before it is rendered.
 
@@ -64,7 +60,7 @@ def coverage_of_run(
         if out is not None:
             write_bytes(out / FOLDER / f"{names[view.name]}.png", png(coverage_image(image, classes["0"], classes["1"])))
 
-    return score_by_coverage(gaussians, train, test, options_for(rule, background, gaussians, max_instances), show, tell)
+    return score_by_coverage(gaussians, train, test, options, show, tell)
 
 
 def coverage_table(coverage: dict[str, Any]) -> list[list[str]]:

@@ -19,6 +19,7 @@ from warpgs.pipeline.train.setup import terms_of
 from warpgs.pipeline.train.step import Forward, StepBuffers, StepPlan, eager_renderer, forward
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Gaussians
 
 FILE = "not_finite.safetensors"
@@ -102,7 +103,8 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
         {n: t[None] for n, t in group("maps").items()}, torch.tensor([plain["number"]], device=device), alpha,
     )  # fmt: skip
     terms = tuple(t for t in terms_of(config, plain["cutout"]) if t.active(plain["step"], config.steps))
-    buffers, render = StepBuffers(device, 1, 1), eager_renderer(config.rule, tensors["background"], None)
+    options = RasterizeOptions(rule=config.rule, background=tensors["background"], antialiased=config.antialiased)
+    buffers, render = StepBuffers(device, 1, 1), eager_renderer(options, None)
     buffers.load([0], [[0.0]], [tuple(plain["settings"])])
     plan = StepPlan(plain["degree"], False, terms, None)
     own = [group(f"views.{m.name}") for m in config.view_modules]

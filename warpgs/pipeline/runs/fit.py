@@ -16,7 +16,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
 from warpgs.io.splits import Split, check_spec
-from warpgs.pipeline.metrics.evaluate import options_for, render_view
+from warpgs.pipeline.metrics.evaluate import render_view
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
@@ -179,6 +179,8 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
     job.scene = over_background(job.scene, color)
     job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
     job.notes += [*([background] if background else []), *chosen]
+    if job.config.antialiased:
+        job.notes.append("antialiased: other programs show exported files as they are in their antialiased mode alone")
     check_renders(job.config.batch, job.config.steps or 0)
 
 
@@ -277,14 +279,14 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
             write_json(job.out / METRICS_FILE, metrics)
             record["notes"] = job.notes
             write_report(
-                job.out, job.scene, job.split, trainer.gaussians, metrics, record,
+                job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
                 sampling=sampling_report_of(trainer, job.out), overview=overview.result(), tell=job.progress,
             )  # fmt: skip
     for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
         job.say(line)
     return FitResult(
         *model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
-        transparent=job.scene.transparent,
+        transparent=job.scene.transparent, antialiased=job.config.antialiased,
     )  # fmt: skip
 
 
@@ -294,17 +296,14 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     on_cuda = job.device.type == "cuda"
     peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
     names = image_names(v.name for v in scene.views)
-    scored, tell = (job.out, gaussians, train, test, c.rule, scene.background), job.progress
-    metrics = evaluate_run(*scored, job.lpips, trainer.context.max_instances, names=names, tell=tell)
+    options, tell = trainer.context.render_options(), job.progress
+    scored = (job.out, gaussians, train, test, options)
+    metrics = evaluate_run(*scored, job.lpips, names=names, tell=tell)
     if test and not job.other_models:
-        metrics["coverage"] = coverage_of_run(*scored, trainer.context.max_instances, names=names, tell=tell)
+        metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
     tell("checking float32 accuracy")
-    rule = rule_report_of(
-        gaussians, train, c.rule, scene.background, seed=c.seed, half_resolution=trainer.half_resolution,
-        max_instances=trainer.context.max_instances,
-    )  # fmt: skip
+    rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
     shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
-    options = options_for(c.rule, scene.background, gaussians, trainer.context.max_instances)
     moved = {}
     if not job.other_models:
         shown = counted(train, job.progress, "checking for moving objects", "views")

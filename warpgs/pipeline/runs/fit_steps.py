@@ -89,7 +89,10 @@ class StepTeller:
         if job.on_step is not None:
             job.on_step(r)
         if job.on_model is not None:
-            job.on_model(FittedModel(*model_fields(job, trainer), transparent=job.scene.transparent))
+            model = FittedModel(
+                *model_fields(job, trainer), transparent=job.scene.transparent, antialiased=job.config.antialiased
+            )
+            job.on_model(model)
 
 
 def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:

@@ -303,6 +303,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
         Gaussians(**{n: t.to(where) for n, t in gaussians.tensors().items()}),
         Normalization(np.array(offset, np.float64), float(scale)),
         cameras, train, test, rule, (red, green, blue), step, folder, record, transparent=record.get("transparent", False),
+        antialiased=record["config"].get("antialiased", False),
     )  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from warpgs.pipeline.metrics.evaluate import (
     ALPHA_VARIANTS,
     ViewMetrics,
     baselines,
-    options_for,
     render_view,
     score,
     summarize,
@@ -128,10 +127,8 @@ def evaluate_run(
     gaussians: Gaussians,
     train: list[View],
     test: list[View],
-    rule: str,
-    background: tuple[float, float, float],
+    options: RasterizeOptions,
     lpips: Lpips | None = None,
-    max_instances: int | None = None,
     *,
     names: dict[str, str] | None = None,
     tell: Callable[[str], object] = lambda line: None,
@@ -145,17 +142,14 @@ def evaluate_run(
         gaussians: N Gaussians in scene units [u].
         train: Training views.
         test: Held-out views.
-        rule: Cut-offs of the rasterizer.
-        background: Colour behind the scene.
+        options: Options of the rasterizer.
         lpips: Network for LPIPS, or None.
-        max_instances: As in RasterizeOptions.
         names: Names of image files by view, as `image_names` gives them for the whole scene; None for those of these views.
         tell: Takes a line on each view before it is rendered.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
     """
-    options = options_for(rule, background, gaussians, max_instances)
     for folder in () if out is None else ("renders", "depth"):
         make_folder(out / folder)
     files = names or image_names(v.name for v in [*train, *test])
@@ -249,6 +243,7 @@ def write_report(
     scene: Scene,
     split: Split,
     gaussians: Gaussians,
+    options: RasterizeOptions,
     metrics: dict[str, Any],
     record: dict[str, Any],
     *,
@@ -263,6 +258,7 @@ def write_report(
         scene: The scene.
         split: Its views to fit and those held out.
         gaussians: The fitted model, in scene units [u].
+        options: Options of the rasterizer.
         metrics: Contents of metrics.json.
         record: Contents of config.json.
         sampling: The part on sampling events, or None.
@@ -283,7 +279,6 @@ def write_report(
         [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
         for r in metrics["views"]
     ]
-    options = options_for(record["config"]["rule"], tuple(record["background"]), gaussians)
     images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]}, tell)
     covered = None
     if "coverage" in metrics:

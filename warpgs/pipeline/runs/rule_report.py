@@ -59,9 +59,8 @@ def _seconds(render: Callable[[], object], device: torch.device) -> float:
 
 @torch.no_grad()
 def rule_report_of(
-    gaussians: Gaussians, views: list[View], rule: str, background: tuple[float, float, float], *, seed: int,
-    half_resolution: float = 0.0, max_instances: int | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    gaussians: Gaussians, views: list[View], options: RasterizeOptions, *, seed: int, half_resolution: float = 0.0
+) -> dict[str, Any]:
     """Measure error and gain of a rule on a scene; takes some tenths of a second.
 
     Three random views are rendered with the rule, as in the fit, and 64 x 64 px of each are compared with the image that
@@ -71,11 +70,9 @@ def rule_report_of(
     Args:
         gaussians: Of the finished fit, float32.
         views: Training views, at least one.
-        rule: Name of the fit's cut-offs.
-        background: Colour behind the scene.
+        options: Options of the rasterizer, with the name of the fit's cut-offs and a background.
         seed: Seed of the choice of views and parts.
         half_resolution: Fraction of the steps that saw views at half their size.
-        max_instances: As in RasterizeOptions.
 
     Returns:
         ``max``, ``mean`` and ``psnr`` [dB] (None where infinite) of the error of colours in [0, 1] over all parts; ``views``
@@ -85,9 +82,9 @@ def rule_report_of(
     generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
     device = gaussians.means.device
-    behind = gaussians.means.new_tensor(background)
-    exact = RasterizeOptions(rule="exact", background=behind, max_instances=max_instances)
-    options = dataclasses.replace(exact, rule=rule)
+    assert options.background is not None
+    options = dataclasses.replace(options, background=options.background.to(gaussians.means))
+    rule, exact = options.rule, dataclasses.replace(options, rule="exact")
     errors, windows = [], {}
     for view in chosen:
         window = windows[view.name] = _window(view.camera, generator)
@@ -95,7 +92,7 @@ def rule_report_of(
         # what reaches the part under `exact`; tiles are listed with a margin
         near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
         part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
-        wanted = _wanted(part, view.camera, window, behind)
+        wanted = _wanted(part, view.camera, window, exact)
         errors.append((found.double() - wanted).abs().flatten())
     error = torch.cat(errors)
     whole = chosen[0].camera
@@ -109,13 +106,13 @@ def rule_report_of(
     return result | {"summary": _summary(result)}
 
 
-def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], background: torch.Tensor) -> torch.Tensor:
+def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], exact: RasterizeOptions) -> torch.Tensor:
     """Return the image of a window under `exact` in float64: by the kernels where they alone know the model."""
     if camera.model in MODELS:
         with _one_thread():
-            return reference_image(part, camera, window, background, part.sh_degree)
+            return reference_image(part, camera, window, exact.background, part.sh_degree, exact.antialiased)
     doubled = Gaussians(**{n: t.double() for n, t in part.tensors().items()})
-    return rasterize(doubled, camera, RasterizeOptions(rule="exact", background=background.double(), window=window)).rgb
+    return rasterize(doubled, camera, dataclasses.replace(exact, background=exact.background.double(), window=window)).rgb
 
 
 def _summary(r: dict[str, Any]) -> str:

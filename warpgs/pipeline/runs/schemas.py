@@ -66,7 +66,8 @@ _RECORD = fields(
         "normalization": fields({"offset": items(number(), 3), "scale": number(above=0)}),
         "background": items(number(), 3), "config_hash": text, "device": text, "versions": mapping(text),
         "config": fields(
-            {"rule": one_of(*RULES), "seed": whole(0), "strategy": text, "loss_terms": _PARTS, "view_modules": _PARTS}
+            {"rule": one_of(*RULES), "seed": whole(0), "strategy": text, "loss_terms": _PARTS, "view_modules": _PARTS},
+            {"antialiased": flag},
         ),
         "cameras": mapping(_CAMERA, _view_name),
     },

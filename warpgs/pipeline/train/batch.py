@@ -23,6 +23,7 @@ from warpgs.pipeline.train.step import (
     view_gradients,
 )
 from warpgs.pipeline.train.views import Kind, ViewStack
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
@@ -56,17 +57,16 @@ def update_by_sums(
 class BatchSteps:
     """Steps of B views each."""
 
-    def __init__(self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor, tree: Tree):
+    def __init__(self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions, tree: Tree):
         """Begin without memory for sums.
 
         Args:
             learned: Tables and strategy that steps change.
             buffers: Settings and results of steps.
-            rule: Cut-offs of the rasterizer.
-            background: Colour behind the scene, shape [3].
+            options: Rule, background [3] and antialiasing of the fit.
             tree: The slots and their order.
         """
-        self.learned, self.buffers, self.tree, self.rule, self.background = learned, buffers, tree, rule, background
+        self.learned, self.buffers, self.tree, self.options = learned, buffers, tree, options
         self.slots = StepBuffers(buffers.device, 1, len(tree.slots))
         """Settings and results of this process's slots."""
         self.told_to_stop = False
@@ -75,8 +75,8 @@ class BatchSteps:
         """Sums over slots, of the sizes of the last step."""
         self._graphs = self._updates = None
         if buffers.device.type == "cuda":
-            self._graphs = StepGraphs(learned, self.slots, rule, background, view_gradients)
-            self._updates = StepGraphs(learned, buffers, rule, background)
+            self._graphs = StepGraphs(learned, self.slots, options, view_gradients)
+            self._updates = StepGraphs(learned, buffers, options)
         self._update: tuple[StepPlan, CapturedGraph] | None = None
 
     def clear(self) -> None:
@@ -128,7 +128,7 @@ class BatchSteps:
         """Return for each own slot, with a view of this kind, the function that finds its gradients."""
         if captured and self._graphs is not None:
             return [_replayed(graph) for graph in self._graphs.capture_all(kinds, stacks, plan, max_instances)]
-        render = eager_renderer(self.rule, self.background, max_instances)
+        render = eager_renderer(self.options, max_instances)
         return [functools.partial(view_gradients, self.learned, stacks[k], self.slots, plan, render) for k in kinds]
 
     @torch.no_grad()

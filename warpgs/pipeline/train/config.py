@@ -49,6 +49,10 @@ class FitConfig:
     """Seed of every random choice; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
+    antialiased: bool = False
+    """Antialiased model, for renders at other sizes than that of the photos (Mip-Splatting, Yu et al. 2024): opacities are
+    reduced below the size of a pixel, and no axis is smaller than the training cameras resolve (docs/python.md). Renders of the
+    run are antialiased, too; other programs need their antialiased mode."""
     half_resolution: float | None = 0.0
     """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md). None: by the number
     of views."""

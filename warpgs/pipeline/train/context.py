@@ -73,6 +73,8 @@ class StrategyContext:
     """Number of Gaussians that settings and memory limit allow; 0 before `Strategy.setup`."""
     max_instances: int | None = None
     """(Gaussian, tile) instances that a render may have at a time; None for no limit."""
+    antialiased: bool = False
+    """True in an antialiased fit (`RasterizeOptions.antialiased`)."""
 
     @property
     def gaussians(self) -> Gaussians:
@@ -91,4 +93,6 @@ class StrategyContext:
 
     def render_options(self) -> RasterizeOptions:
         """Return the settings with which training views are rendered whole, with all harmonics."""
-        return RasterizeOptions(rule=self.rule, background=self.background, max_instances=self.max_instances)
+        return RasterizeOptions(
+            rule=self.rule, background=self.background, max_instances=self.max_instances, antialiased=self.antialiased
+        )

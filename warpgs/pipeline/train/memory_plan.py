@@ -13,7 +13,6 @@ from dataclasses import asdict, dataclass, replace
 
 import torch
 
-from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels import blend, project, tiles
 from warpgs.kernels.tiles import MAX_INSTANCES
@@ -24,7 +23,8 @@ from warpgs.pipeline.train.slots import SUMMED
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.view_modules.base import ViewModule
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.compose import count_instances, inputs_of, settings_of
+from warpgs.render.compose import count_instances, inputs_of
+from warpgs.render.rasterize import RasterizeOptions, image_settings
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes, add_needs
 from warpgs.runtime.terminal import Detail
@@ -188,9 +188,9 @@ def layout_of(
 
 
 @torch.no_grad()
-def most_instances(gaussians: Gaussians, cameras: list[Camera], rule: str) -> int:
+def most_instances(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> int:
     """Return the (Gaussian, tile) instances of the camera that has most; cameras hold tensors."""
-    return max(int(count_instances(inputs_of(gaussians, c), settings_of(c, 0, RULES[rule]))) for c in cameras)
+    return max(int(count_instances(inputs_of(gaussians, c), image_settings(c, 0, options))) for c in cameras)
 
 
 def plan(

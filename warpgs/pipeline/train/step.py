@@ -13,21 +13,20 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.dropout import opacity_dropout
 from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
 from warpgs.pipeline.metrics.psnr import masked_mse
-from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits
+from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits, TrainingCameras
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.background import over
 from warpgs.pipeline.train.learned_views import LearnedViews, seen
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
-from warpgs.render.compose import compose, count_instances, inputs_of, settings_of
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.compose import compose, count_instances, inputs_of
+from warpgs.render.rasterize import RasterizeOptions, image_settings, rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render
@@ -113,31 +112,31 @@ Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tenso
 """Renderer of a batch of one camera. Further arguments: the degree, opacity factors, and a shift of the background [3]."""
 
 
-def eager_renderer(rule: str, background: torch.Tensor, max_instances: int | None) -> Renderer:
-    """Return a renderer that allocates what each render needs, in chunks of at most ``max_instances``; background [3]."""
+def eager_renderer(options: RasterizeOptions, max_instances: int | None) -> Renderer:
+    """Return a renderer that allocates what each render needs, in chunks of at most ``max_instances``."""
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
     ) -> Render:
-        behind = background if shift is None else background + shift
-        options = RasterizeOptions(
-            rule=rule, sh_degree=degree, background=behind, opacity_factors=factors, max_instances=max_instances,
+        behind = options.background if shift is None else options.background + shift
+        own = replace(
+            options, sh_degree=degree, background=behind, opacity_factors=factors, max_instances=max_instances,
             record=False,  # it would allocate more than was planned
         )  # fmt: skip
-        return _single(rasterize(gaussians, camera, options))
+        return _single(rasterize(gaussians, camera, own))
 
     return render
 
 
-def captured_renderer(rule: str, background: torch.Tensor, capacity: int, overflow: torch.Tensor) -> Renderer:
-    """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit; background [3]."""
-    cut_offs, backgrounds, memory = RULES[rule], background[None], InstanceMemory(capacity=capacity, overflow=overflow)
+def captured_renderer(options: RasterizeOptions, capacity: int, overflow: torch.Tensor) -> Renderer:
+    """Return a renderer with a fixed capacity of instances, which sets ``overflow`` [1] if they do not fit."""
+    backgrounds, memory = options.background[None], InstanceMemory(capacity=capacity, overflow=overflow)
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
     ) -> Render:
         behind = backgrounds if shift is None else backgrounds + shift
-        found = compose(inputs_of(gaussians, camera, factors), behind, settings_of(camera, degree, cut_offs), memory)
+        found = compose(inputs_of(gaussians, camera, factors), behind, image_settings(camera, degree, options), memory)
         return _single(Render(*found.images, found.projected, found.tile_counts))
 
     return render
@@ -161,8 +160,8 @@ class Learned:
     """Density strategy."""
     dropout_seed: int | None
     """Seed of the opacity dropout; None for none."""
-    centers: torch.Tensor
-    """Positions of training cameras [u], which limits of sizes refer to, shape [C, 3]."""
+    cameras: TrainingCameras
+    """Training cameras, which limits of sizes refer to."""
 
 
 @dataclass(frozen=True)
@@ -290,7 +289,7 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
     table.adam_step(dict(zip(table.params, own)), found.lrs[:split], stop, strategy.lr_factors(plan.phase))
     learned.views.table.adam_step(dict(zip(learned.views.table.params, of_views)), found.lrs[split:], stop)
     strategy.after_step(plan.phase, found.settings, found.going)
-    plan.limits.hold(table.params, learned.centers, found.going)
+    plan.limits.hold(table.params, learned.cameras, found.going)
     for name, value in found.statistics.items():
         table.columns[name] += value
 
@@ -303,7 +302,7 @@ class StepGraphs:
     """Captured steps, one for each plan and kind of view; captured at first use."""
 
     def __init__(
-        self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor,
+        self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions,
         work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
     ):  # fmt: skip
         """Capture nothing yet.
@@ -311,12 +310,11 @@ class StepGraphs:
         Args:
             learned: Tables and strategy that steps change.
             buffers: Settings and results of steps.
-            rule: Cut-offs of the rasterizer.
-            background: Colour behind the scene, shape [3].
+            options: Rule, background [3] and antialiasing of the fit.
             work: Function that is captured.
         """
         self.work = work
-        self.learned, self.buffers, self.rule, self.background = learned, buffers, rule, background
+        self.learned, self.buffers, self.options = learned, buffers, options
         device = buffers.device
         self.stream = torch.cuda.Stream(device)
         """Stream of captures, always the same one, since torch keeps freed memory for the stream that it was used on."""
@@ -349,13 +347,13 @@ class StepGraphs:
                 continue
             views = stacks[kind]
             now = current(views, self.learned.views)
-            capacity = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.rule)
+            capacity = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
             if max_instances is not None and capacity > max_instances:
                 raise OverLimitError(
                     f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
                 )
             self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
-            render = captured_renderer(self.rule, self.background, capacity, self.buffers.stop)
+            render = captured_renderer(self.options, capacity, self.buffers.stop)
             work = functools.partial(self.work, self.learned, views, self.buffers, plan, render)
             self._graphs[kind, plan] = self.capture(work)
         return [self._graphs[kind, plan] for kind in kinds]
@@ -379,13 +377,13 @@ class StepGraphs:
 
 
 @torch.no_grad()
-def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, rule: str) -> int:
+def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
     """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
 
     Raises:
         ResourceError: They would not fit into memory.
     """
-    counts = [count_instances(inputs_of(gaussians, c), settings_of(c, degree, RULES[rule])) for c in views.cameras()]
+    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in views.cameras()]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:

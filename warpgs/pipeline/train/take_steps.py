@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-import torch
-
 from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.slots import Tree
 from warpgs.pipeline.train.step import Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.views import Kind, ViewStack
+from warpgs.render.rasterize import RasterizeOptions
 from warpgs.runtime.ranks import Ranks
 
 
@@ -17,20 +16,19 @@ class StepTaker:
     """Steps of one fit."""
 
     def __init__(
-        self, learned: Learned, buffers: StepBuffers, rule: str, background: torch.Tensor, batch: int, ranks: Ranks
+        self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions, batch: int, ranks: Ranks
     ):  # fmt: skip
         """Capture nothing yet.
 
         Args:
             learned: Tables and strategy that steps change.
             buffers: Settings and results of steps.
-            rule: Cut-offs of the rasterizer.
-            background: Colour behind the scene, shape [3].
+            options: Rule, background [3] and antialiasing of the fit.
             batch: Views of a step.
             ranks: Processes that share them.
         """
-        self.learned, self.buffers, self.rule, self.background, self.ranks = learned, buffers, rule, background, ranks
-        own = (learned, buffers, rule, background)
+        self.learned, self.buffers, self.options, self.ranks = learned, buffers, options, ranks
+        own = (learned, buffers, options)
         self.graphs = StepGraphs(*own) if buffers.device.type == "cuda" else None
         self.batched = BatchSteps(*own, Tree(batch, ranks)) if batch > 1 else None
 
@@ -75,7 +73,7 @@ class StepTaker:
             for graph in self.graphs.capture_all(kinds, stacks, plan, max_instances):
                 graph.replay()
         else:
-            render = eager_renderer(self.rule, self.background, max_instances)
+            render = eager_renderer(self.options, max_instances)
             for kind in kinds:
                 step(self.learned, stacks[kind], self.buffers, plan, render)
 

@@ -15,7 +15,7 @@ from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceE
 from warpgs.kernels.step_buffers import NOT_FINITE, Setting
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.model.init import initial_gaussians, scene_extent
-from warpgs.pipeline.model.scale_limits import camera_centers, scene_radius
+from warpgs.pipeline.model.scale_limits import TrainingCameras, scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.background import random_shift
 from warpgs.pipeline.train.config import FitConfig
@@ -108,17 +108,17 @@ class Trainer:
         self.table = Table.of_gaussians(initial_gaussians(cloud, c.init, c.sh_degree, extent, device), {})
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
-            self.background,
+            self.background, antialiased=c.antialiased,
         )  # fmt: skip
         """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
         self.strategy, self.stopping = find_strategy(c.strategy)(self.context), Stopping(c.stopping)
         self.table.add_columns(self.strategy.columns())
         views = LearnedViews.first(c.view_modules, train, device)
         self.table.batch = views.table.batch = self.batch
-        seed, centers = c.seed if self.dropout > 0 else None, camera_centers([v.camera for v in train], device)
-        self.learned = Learned(self.table, views, self.strategy, seed, centers)
+        seed, cameras = c.seed if self.dropout > 0 else None, TrainingCameras.of([v.camera for v in train], device)
+        self.learned = Learned(self.table, views, self.strategy, seed, cameras)
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(views.table.params)))
-        self.taker = StepTaker(self.learned, self.buffers, c.rule, self.background, self.batch, self.ranks)
+        self.taker = StepTaker(self.learned, self.buffers, self.context.render_options(), self.batch, self.ranks)
 
     def _begin(self, views: list[TrainingView]) -> None:
         """Train on these views, or on what early stopping leaves of them."""
@@ -163,7 +163,7 @@ class Trainer:
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
-        limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius)
+        limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
         return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits)
 
     def next_view(self) -> int:
@@ -321,7 +321,7 @@ class Trainer:
             self.messages.append(f"early stopping: held-out pixels no longer improve; {self.steps:,} steps in all")
             words = f"stopping: growth ended at step {step} with {len(self.table):,} Gaussians, because {stopping.why}"
             self.messages.append(Detail(f"{words}; all pixels are trained on from here"))
-        self.plan_of(self.step).limits.hold(self.table.params, self.learned.centers)
+        self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
 
     def show_learned(self) -> None:
         """Let the views show what view modules have learned by now."""
@@ -338,7 +338,7 @@ class Trainer:
             self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
             sums=self.taker.sums,
         )  # fmt: skip
-        most = most_instances(self.gaussians, [v.camera for v in shown], c.rule)
+        most = most_instances(self.gaussians, [v.camera for v in shown], self.context.render_options())
         self.memory, self.layout = plan(
             layout, count=len(self.table), instances=most, most=c.max_gaussians, limit=self.memory_limit,
             available=available_bytes(self.device), capacity_factor=CAPACITY_FACTOR,

@@ -22,7 +22,6 @@ from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.priors.sweep import SweepConfig, sweep_depths
-from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Camera, PointCloud, Prior, View
 
 STEPS = 3
@@ -72,7 +71,7 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
         sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
     fit = Trainer(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
     run(fit, lambda _: None, lambda _: None, stopped)
-    score(views[0], render_view(fit.gaussians, views[0], RasterizeOptions(rule=small.rule, background=fit.background))[0])
+    score(views[0], render_view(fit.gaussians, views[0], fit.context.render_options())[0])
     fit.taker.clear()  # their memory is for the fit that follows
     return fit
 
