@@ -5,6 +5,7 @@ import gzip
 import io
 import json
 import struct
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -16,9 +17,11 @@ from tests.gaussians import cloud
 from warpgs.errors import DataError, UsageError
 from warpgs.export import compressed_ply, gltf, sog, splat, spz
 from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
-from warpgs.export.formats import format_of, read_gaussians, suffixes, write_gaussians
+from warpgs.export.formats import format_of, read_file, read_gaussians, suffixes, write_gaussians
+from warpgs.export.ply import read_ply
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
+from warpgs.pipeline.runs.export_model import convert
 from warpgs.scene import Normalization
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -242,7 +245,6 @@ def test_counts_beyond_the_size_are_refused(tmp_path):
     refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 5, 0, 12, 0, 0) + bytes(10**6)), "it has more")
     bomb = gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 100_000, 0, 12, 0, 0) + bytes(20 * 100_000))
     refused(tmp_path / "a.spz", bomb, f"100000 Gaussians in {len(bomb)} bytes")
-    refused(tmp_path / "a.spz", gzip.compress(spz.HEADER.pack(spz.MAGIC, 3, 0, 0, 12, 1, 0)), "antialiasing")
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header\n"]
     refused(tmp_path / "a.compressed.ply", "\n".join(lines).encode(), "cut short")
@@ -286,7 +288,7 @@ def set_to(*keys, value):
         (set_to("count", value=10**12), "Gaussians in"),
         (set_to("count", value=1000), "pixels for 1000"),
         (set_to("version", value=1), "version 2"),
-        (set_to("model", value="antialiased"), "model 'antialiased'"),
+        (set_to("model", value="2dgs"), "model '2dgs'"),
         (set_to("means", "files", 0, value="../../etc/passwd"), "not in the archive"),
         (set_to("means", "mins", 0, value=1e300), "not finite"),
         (set_to("scales", "codebook", value=[1.0]), "codebook"),
@@ -360,15 +362,51 @@ def test_numbers_of_a_gltf_that_are_none(tmp_path):
     refused(tmp_path / "a.gltf", json.dumps(document).encode(), "means of Gaussian 0 is not finite")
 
 
-@pytest.mark.parametrize("comment,match", [("SplatRenderMode: mip", "'mip'"), ("antialiased 1", "antialiasing")])
 @pytest.mark.parametrize("suffix", [".ply", ".compressed.ply"])
-def test_other_ways_of_rendering_are_refused(suffix, comment, match, tmp_path):
+def test_other_ways_of_rendering_are_refused(suffix, tmp_path):
     path = tmp_path / f"a{suffix}"
     write_gaussians(path, model(), units="file")
     data = path.read_bytes()
     assert b"comment SplatRenderMode: default\ncomment antialiased 0\n" in data
-    line = b"comment " + comment.encode()
-    refused(path, data.replace(b"comment antialiased 0", line), match)
+    refused(path, data.replace(b"comment antialiased 0", b"comment SplatRenderMode: 2dgs"), "'2dgs'")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_files_say_that_they_are_antialiased(suffix, tmp_path):
+    """Those that can; reading them warns, once, and only then."""
+    for antialiased in (True, False):
+        path = tmp_path / f"{antialiased}{suffix}"
+        write_gaussians(path, model(), units="file", antialiased=antialiased)
+        expected = antialiased and format_of(path).declares
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            read_gaussians(path)
+            if suffix == ".ply":
+                read_ply(path)
+        assert [("antialiased=True" in str(w.message), w.filename) for w in caught] == [(True, __file__)] * len(caught)
+        assert len(caught) == expected * (1 + (suffix == ".ply"))
+        again = tmp_path / f"{antialiased}-again.spz"
+        convert(path, again)
+        assert read_file(again, None, "file")[1] is expected
+    declaring = {".ply", ".compressed.ply", ".spz", ".sog"}
+    assert format_of(path).declares == (suffix in declaring)
+
+
+@pytest.mark.parametrize("line,expected", [("SplatRenderMode: mip", True), ("antialiased 1", True), ("antialiased 0", False)])
+def test_comments_of_other_programs(line, expected, tmp_path):
+    """The last of them decides."""
+    path = tmp_path / "a.ply"
+    write_gaussians(path, model(), units="file")
+    before = b"comment antialiased 0"
+    path.write_bytes(path.read_bytes().replace(before, b"comment SplatRenderMode: mip\ncomment " + line.encode()))
+    assert read_file(path, None, "file")[1] is expected
+
+
+def test_spz_of_version_4_says_it_too(tmp_path):
+    pytest.importorskip("zstandard")
+    path = tmp_path / "a.spz"
+    write_gaussians(path, model(), units="file", format=spz.SPZ(spz.SPZConfig(version=4)), antialiased=True)
+    assert read_file(path, None, "file")[1]
 
 
 def test_rows_of_splat_that_make_no_sense(tmp_path):

@@ -11,18 +11,21 @@ from PIL import Image
 import warpgs
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
+from warpgs.export.cameras import write_cameras
+from warpgs.export.formats import read_file
 from warpgs.kernels.pixel_size import pixel_size
 from warpgs.pipeline.metrics.evaluate import score
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import LimitConfig, TrainingCameras
 from warpgs.pipeline.runs.failed_step import failed_step, repeated
+from warpgs.pipeline.runs.model_and_cameras import open_file
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.memory_plan import most_instances
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Scene
 from warpgs.synthetic.demo import write_demo
-from warpgs.viewer.content import content_of_run
+from warpgs.viewer.content import content_of_file, content_of_run
 
 CPU = torch.device("cpu")
 # points far below a pixel in size, so that every render with the filter is another than without
@@ -135,10 +138,23 @@ def test_no_axis_is_below_what_cameras_resolve():
     assert below[0] == 0 < below[1]
 
 
-def test_the_flag_and_the_file(tmp_path):
-    """`fit --antialiased` writes a file that says so; one without says that it is not."""
-    write_demo(tmp_path / "scene", views=5, width=40, height=32)
+def test_the_flag_and_the_files(tmp_path, capsys):
+    """Of the run, its exports and its pruned model: those that can say so do, of others the command tells."""
+    write_demo(tmp_path / "scene", views=8, width=40, height=32)
     flags = ["--preset", "3dgs", "--steps", "2", "--init.source", "random", "--init.random-count", "30", "--device", "cpu"]
     for name, own in (("with", ["--antialiased"]), ("without", [])):
         assert main(["fit", str(tmp_path / "scene"), "--out", str(tmp_path / name), *flags, *own]) == 0
         assert warpgs.open_run(tmp_path / name, "cpu").antialiased is bool(own)
+        data = (tmp_path / name / "point_cloud.ply").read_bytes()
+        assert (b"comment antialiased 1" in data[:500]) is bool(own)
+        for file in ("a.spz", "a.splat"):
+            assert main(["export", str(tmp_path / name), "--to", str(tmp_path / name / file), "--no-clean"]) == 0
+            assert read_file(tmp_path / name / file, None, "file")[1] is (bool(own) and file == "a.spz")
+        assert ("choose that mode where the file is shown" in capsys.readouterr().out) is bool(own)
+        assert content_of_file(tmp_path / name / "a.spz").model.options().antialiased is bool(own)
+        write_cameras(tmp_path / "cameras.json", ring(2))
+        opened, notes = open_file(tmp_path / name / "point_cloud.ply", tmp_path / "cameras.json", "exact", "cpu")
+        assert opened.antialiased is bool(own) and any("is antialiased" in note for note in notes) is bool(own)
+    assert main(["prune", str(tmp_path / "with"), "--keep-psnr", "1", "--device", "cpu"]) == 0
+    assert warpgs.open_run(tmp_path / "with-pruned", "cpu").antialiased
+    assert read_file(tmp_path / "with-pruned" / "point_cloud.ply", None, "file")[1]

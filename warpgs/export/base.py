@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -54,11 +55,15 @@ class Format:
     """Highest degree of spherical harmonics that it holds."""
     note: ClassVar[str] = ""
     """Sentence for users on its axes, where programs disagree on them."""
+    declares: ClassVar[bool] = False
+    """True where a file can say that its Gaussians are antialiased (`RasterizeOptions.antialiased`)."""
 
     def __init__(self, config: Any = None):
         """Take its options, an instance of ``Config``; None for their defaults."""
         self.config: Any = self.Config() if config is None and self.Config is not None else config
         """The options."""
+        self.antialiased = False
+        """True while an antialiased model is written."""
 
     def encode(self, arrays: Arrays) -> Iterable[bytes]:
         """Return the bytes of a file, in pieces.
@@ -83,6 +88,14 @@ class Format:
             UsageError: The format does not define it.
         """
         raise UsageError(f"{path}: {self.suffix} files are written here, not read: {type(self).__name__} defines no decode")
+
+    def is_antialiased(self, path: Path) -> bool:
+        """Return whether a file says that its Gaussians are antialiased; never where the format does not declare it.
+
+        Raises:
+            DataError: The file is missing or malformed.
+        """
+        return False
 
     def fits(self, path: str | os.PathLike[str]) -> bool:
         """Return whether a file's name ends as those of the format."""
@@ -121,6 +134,11 @@ class Format:
         except _BROKEN as e:
             raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
         return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
+
+
+def warn_of_antialiasing(path: Path) -> None:
+    """Warn the caller of a function that reads a file that its Gaussians are antialiased."""
+    warnings.warn(f"{path}: its Gaussians are antialiased; render them with RasterizeOptions(antialiased=True)", stacklevel=3)
 
 
 FORMATS: Registry[Format] = Registry("format", Format, __package__)

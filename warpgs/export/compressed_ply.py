@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.colors import base_coefficients, base_colors
+from warpgs.errors import DataError
 from warpgs.export.arrays import (
     SH_SIZES,
     SQRT2,
@@ -26,7 +27,8 @@ from warpgs.export.arrays import (
     smallest_three,
 )
 from warpgs.export.base import Format, register
-from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header
+from warpgs.export.ply_header import MAX_HEADER_BYTES, Element, is_antialiased, mode_comments, parse_header
+from warpgs.input_files import read_start, unread_reason
 
 CHUNK = 256
 """Gaussians that share bounds."""
@@ -38,8 +40,8 @@ _VERTEX_NAMES = ["packed_position", "packed_rotation", "packed_scale", "packed_c
 _BITS = (11, 10, 11)
 
 
-def encode(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of a file; harmonics beyond 4 are clamped."""
+def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
+    """Return the bytes of a file, whose header says whether it is antialiased; harmonics beyond 4 are clamped."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
     colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
@@ -58,13 +60,27 @@ def encode(arrays: Arrays) -> list[bytes]:
     rows = np.stack([position, rotation, scale, _pack(rgba, (8, 8, 8, 8))], 1).astype("<u4")
     rest = arrays["sh"][:, 1:].astype(np.float64).transpose(0, 2, 1).reshape(n, -1)
     harmonics = np.clip(np.floor((rest / SH_RANGE + 0.5) * 256), 0, 255).astype("u1")
-    lines = ["ply", "format binary_little_endian 1.0", *COMMENTS, f"element chunk {len(bounds[0])}"]
+    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), f"element chunk {len(bounds[0])}"]
     lines += [f"property float {name}" for name in _CHUNK_NAMES]
     lines += [f"element vertex {n}", *(f"property uint {name}" for name in _VERTEX_NAMES)]
     if k > 1:
         lines += [f"element sh {n}", *(f"property uchar f_rest_{i}" for i in range(3 * (k - 1)))]
     header = ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
     return [header, np.concatenate(bounds, 1).tobytes(), rows.tobytes(), harmonics.tobytes()]
+
+
+def start_of(path: Path) -> bytes:
+    """Return the bytes of a PLY file up to the longest header, which is checked.
+
+    Raises:
+        DataError: The file cannot be read, or is no PLY.
+    """
+    try:
+        head = read_start(path, MAX_HEADER_BYTES)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+    parse_header(path, head)
+    return head
 
 
 def is_compressed(path: Path, data: bytes) -> bool:
@@ -192,5 +208,17 @@ class CompressedPLY(Format):
     suffix = ".compressed.ply"
     description = "PlayCanvas: PLY of 8 to 11 bits within chunks of 256; SuperSplat"
     sorted = True
-    encode = staticmethod(encode)
+    declares = True
     decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file."""
+        return encode(arrays, self.antialiased)
+
+    def is_antialiased(self, path: Path) -> bool:
+        """Return whether the header says so.
+
+        Raises:
+            DataError: The file is missing or no PLY.
+        """
+        return is_antialiased(start_of(path))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 from pathlib import Path
 
 from warpgs.errors import UsageError
-from warpgs.export.base import FORMATS, Format
+from warpgs.export.base import FORMATS, Format, warn_of_antialiasing
 from warpgs.scene import Gaussians, Normalization
 
 
@@ -75,6 +76,7 @@ def write_gaussians(
     *,
     units: str = "scene",
     format: str | type[Format] | Format | None = None,
+    antialiased: bool = False,
 ) -> None:
     """Write Gaussians to a file, in the format of its suffix and in the units of the scene's files.
 
@@ -87,6 +89,7 @@ def write_gaussians(
         units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
         format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
             ``path/to/file.py:Class``. None for the one that the suffix says.
+        antialiased: True for Gaussians that are rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG say so.
 
     Raises:
         warpgs.errors.DataError: A tensor holds a NaN or an infinity, or a number that the format cannot hold.
@@ -94,7 +97,9 @@ def write_gaussians(
         warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units come without a
             normalization.
     """
-    format_of(path, format).write(Path(path), gaussians, normalization, units)
+    chosen = copy.copy(format_of(path, format))
+    chosen.antialiased = antialiased
+    chosen.write(Path(path), gaussians, normalization, units)
 
 
 def read_gaussians(
@@ -105,6 +110,8 @@ def read_gaussians(
     format: str | type[Format] | Format | None = None,
 ) -> Gaussians:
     """Read Gaussians from a file, in the format of its suffix; a .ply file may be compressed.
+
+    A file that declares antialiasing warns: render it with `RasterizeOptions.antialiased`.
 
     Args:
         path: The file.
@@ -121,4 +128,15 @@ def read_gaussians(
         warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units come without a
             normalization.
     """
-    return format_of(path, format).read(Path(path), normalization, units)
+    gaussians, antialiased = read_file(Path(path), normalization, units, format)
+    if antialiased:
+        warn_of_antialiasing(Path(path))
+    return gaussians
+
+
+def read_file(
+    path: Path, normalization: Normalization | None, units: str, format: str | type[Format] | Format | None = None
+) -> tuple[Gaussians, bool]:
+    """Return what `read_gaussians` does, and whether the file says that it is antialiased."""
+    chosen = format_of(path, format)
+    return chosen.read(path, normalization, units), chosen.is_antialiased(path)

@@ -19,11 +19,11 @@ import numpy as np
 from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError
 from warpgs.export.arrays import arrays_of, check_finite, parts
-from warpgs.export.base import Format, register
-from warpgs.export.compressed_ply import CompressedPLY, is_compressed
-from warpgs.export.ply_header import COMMENTS, MAX_HEADER_BYTES, Element, parse_header, ply_error
+from warpgs.export.base import Format, register, warn_of_antialiasing
+from warpgs.export.compressed_ply import CompressedPLY, is_compressed, start_of
+from warpgs.export.ply_header import MAX_HEADER_BYTES, Element, is_antialiased, mode_comments, parse_header, ply_error
 from warpgs.files import writing
-from warpgs.input_files import open_input, read_start, unread_reason
+from warpgs.input_files import open_input, unread_reason
 from warpgs.scene import Gaussians, Normalization
 
 CHUNK_ROWS = 65536
@@ -41,8 +41,9 @@ _REST_COUNTS = (0, 9, 24, 45)
 
 
 def write_ply(
-    path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *, units: str = "scene"
-) -> None:
+    path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *, units: str = "scene",
+    antialiased: bool = False,
+) -> None:  # fmt: skip
     """Write Gaussians to a PLY file, which is in the units of the scene's files.
 
     Means become ``mean / scale + offset`` [file units] and log scales ``log_scale - log(scale)``, computed in float64 and
@@ -56,6 +57,7 @@ def write_ply(
         normalization: Similarity from file to scene units, ``x_scene = scale * (x_file - offset)``: that of the scene that was
             fitted; needed where ``units`` is scene.
         units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
+        antialiased: True for Gaussians that are rendered with `RasterizeOptions.antialiased`; the header says so.
 
     Raises:
         warpgs.errors.DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates; or the
@@ -71,7 +73,7 @@ def write_ply(
         check_finite(path, arrays)
 
     n, k = arrays["sh"].shape[:2]
-    header = _header(n, 3 * (k - 1))
+    header = _header(n, 3 * (k - 1), antialiased)
     with writing(path, len(header) + 4 * n * (14 + 3 * k)) as file:
         file.write(header)
         for start in range(0, n, CHUNK_ROWS):
@@ -83,7 +85,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
 
     Properties and elements that are not part of the layout are ignored. Other programs write opacities of 0 and 1 as infinite
     logits, and axes of no length as infinite log scales: these become `OPAQUE` and `FLAT`, which look the same. The number of
-    rows is checked against the size of the file before memory is allocated.
+    rows is checked against the size of the file before memory is allocated. A file that declares antialiasing warns: render it
+    with `RasterizeOptions.antialiased`.
 
     Args:
         path: The file, written by `write_ply` or by another program of that layout.
@@ -100,6 +103,14 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         warpgs.errors.UsageError: The units are unknown, or scene units are asked for without a normalization.
     """
     path = Path(path)
+    gaussians = _read(path, normalization, units)
+    if is_antialiased(start_of(path)):
+        warn_of_antialiasing(path)
+    return gaussians
+
+
+def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussians:
+    """Return what `read_ply` does, without a warning."""
     normalization = checked_normalization(normalization, units, str(path))
     try:
         with open_input(path) as file:
@@ -133,9 +144,9 @@ def _names(rest: int) -> list[str]:
     return [*_POSITION, "nx", "ny", "nz", *_DC, *(f"f_rest_{i}" for i in range(rest)), "opacity", *_SCALE, *_ROTATION]
 
 
-def _header(n: int, rest: int) -> bytes:
+def _header(n: int, rest: int, antialiased: bool) -> bytes:
     """Return the header of a file with ``n`` Gaussians and ``rest`` coefficients above degree 0."""
-    lines = ["ply", "format binary_little_endian 1.0", *COMMENTS, f"element vertex {n}"]
+    lines = ["ply", "format binary_little_endian 1.0", *mode_comments(antialiased), f"element vertex {n}"]
     lines += [f"property float {name}" for name in _names(rest)]
     return ("\n".join([*lines, "end_header"]) + "\n").encode("ascii")
 
@@ -231,10 +242,11 @@ class PLY(Format):
     suffix = ".ply"
     description = "layout of Kerbl et al. 2023, float32; every tool"
     cleaned = False
+    declares = True
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""
-        write_ply(path, gaussians, normalization, units=units)
+        write_ply(path, gaussians, normalization, units=units, antialiased=self.antialiased)
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
         """Read Gaussians with `read_ply`, or as `CompressedPLY` where the header is of that.
@@ -242,10 +254,14 @@ class PLY(Format):
         Raises:
             DataError: The file is missing or malformed.
         """
-        try:
-            compressed = is_compressed(path, read_start(path, MAX_HEADER_BYTES))
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        if compressed:
+        if is_compressed(path, start_of(path)):
             return CompressedPLY().read(path, normalization, units)
-        return read_ply(path, normalization, units=units)
+        return _read(path, normalization, units)
+
+    def is_antialiased(self, path: Path) -> bool:
+        """Return whether the header says so.
+
+        Raises:
+            DataError: The file is missing or no PLY.
+        """
+        return is_antialiased(start_of(path))

@@ -10,8 +10,6 @@ from warpgs.errors import DataError
 
 MAX_HEADER_BYTES = 65536
 """Largest accepted header [bytes]: a real one has some two thousand."""
-COMMENTS = ("comment SplatRenderMode: default", "comment antialiased 0")
-"""Comments that say how Gaussians are to be rendered, as Brush and Postshot write them: as they are, without a filter."""
 REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
 
 _TYPES = {
@@ -44,6 +42,23 @@ class Element:
     """Pairs (name, numpy type) in file order."""
     has_list: bool = False
     """True where a property is a list, so that rows differ in length."""
+
+
+def mode_comments(antialiased: bool) -> tuple[str, str]:
+    """Return the comments that say whether Gaussians are to be antialiased, as Brush and Postshot write them."""
+    return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
+
+
+def is_antialiased(head: bytes) -> bool:
+    """Return whether a header that `parse_header` took says that its Gaussians are antialiased; the last comment decides."""
+    found = False
+    for line in head.partition(b"end_header")[0].decode("ascii").lower().replace(":", " ").splitlines():
+        match line.split():
+            case ["comment", "splatrendermode", mode]:
+                found = mode == "mip"
+            case ["comment", "antialiased", value]:
+                found = value in ("1", "true")
+    return found
 
 
 def ply_error(path: Path, what: str) -> DataError:
@@ -90,13 +105,8 @@ def _check_comment(path: Path, words: list[str]) -> None:
     """Raise a DataError where a comment says that the Gaussians are rendered in a way that this program does not know."""
     text = " ".join(words).lower().replace(":", " ").split()
     match text:
-        case ["splatrendermode", mode] if mode != "default":
+        case ["splatrendermode", mode] if mode not in ("default", "mip"):
             raise DataError(
                 f"{path}: its Gaussians are for the render mode {mode[:40]!r}, which this program does not have. Train or "
-                "export them in the mode 'default'."
-            )
-        case ["antialiased", "1" | "true"]:
-            raise DataError(
-                f"{path}: its Gaussians were trained with antialiasing (mip-splatting), which this program does not render. "
-                "Train or export them without it."
+                "export them in the mode 'default' or 'mip'."
             )

@@ -19,6 +19,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from warpgs.errors import DataError
 from warpgs.export.arrays import (
     SH_SIZES,
     SQRT2,
@@ -33,6 +34,7 @@ from warpgs.export.arrays import (
     smallest_three,
 )
 from warpgs.export.base import Format, register
+from warpgs.input_files import open_input, unread_reason
 
 LEVELS = 256
 """Entries of a codebook."""
@@ -55,12 +57,13 @@ bytes, and one pixel each. Beyond, images are bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
-def encode(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of a file."""
+def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
+    """Return the bytes of a file, whose meta.json says where it is antialiased."""
     n, k = arrays["sh"].shape[:2]
     width = 4 * math.ceil(math.sqrt(n) / 4)
     height = 4 * math.ceil(n / width / 4)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "warpgs"}, "count": n}
+    meta |= {"model": "antialiased"} if antialiased else {}
     files: dict[str, bytes] = {}
 
     def image(name: str, *columns: np.ndarray) -> None:
@@ -162,11 +165,9 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
     size = file.seek(0, os.SEEK_END)
     _check_contents(path, file, size)
     with zipfile.ZipFile(file) as archive:
-        meta = json.loads(_member(path, archive, "meta.json", MAX_META_BYTES))
-        n = meta.get("count") if isinstance(meta, dict) else None
-        if not isinstance(meta, dict) or meta.get("version") != 2:
-            raise malformed(path, "its meta.json is not of version 2")
-        if meta.get("model", "default") != "default":
+        meta = _meta(path, archive)
+        n = meta.get("count")
+        if meta.get("model", "default") not in ("default", "antialiased"):
             raise malformed(path, f"it is for the model {str(meta['model'])[:40]!r}, which this program does not render")
         if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
             raise malformed(path, f"{str(n)[:20]} Gaussians in {size} bytes")
@@ -184,6 +185,14 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         scales, book = pixels("scales", 0), _book(path, meta["scales"])
         log_scales = by_rows(n, (3,), lambda p: book[scales[p, :3]])
     return {"means": means, "quats": quats, "log_scales": log_scales, "logit_opacities": opacities, "sh": sh}
+
+
+def _meta(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+    """Return meta.json; DataError where it is of another version."""
+    meta = json.loads(_member(path, archive, "meta.json", MAX_META_BYTES))
+    if not isinstance(meta, dict) or meta.get("version") != 2:
+        raise malformed(path, "its meta.json is not of version 2")
+    return meta
 
 
 def _harmonics(
@@ -326,5 +335,21 @@ class SOG(Format):
     description = "PlayCanvas: images of 8-bit indices in a zip archive; SuperSplat"
     sorted = True
     archive = True
-    encode = staticmethod(encode)
+    declares = True
     decode = staticmethod(decode)
+
+    def encode(self, arrays: Arrays) -> list[bytes]:
+        """Return the bytes of a file."""
+        return encode(arrays, self.antialiased)
+
+    def is_antialiased(self, path: Path) -> bool:
+        """Return whether meta.json says so, of a file that `decode` takes.
+
+        Raises:
+            DataError: The file cannot be read.
+        """
+        try:
+            with open_input(path) as file, zipfile.ZipFile(file) as archive:
+                return _meta(path, archive).get("model") == "antialiased"
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e

@@ -37,6 +37,7 @@ from warpgs.export.arrays import (
     unit_quats,
 )
 from warpgs.export.base import Format, register
+from warpgs.input_files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are asked for."""
@@ -97,12 +98,13 @@ def _sections(a: Arrays, bits: int, version: int) -> list[bytes]:
     ]
 
 
-def encode(arrays: Arrays, version: int = VERSION) -> list[bytes]:
+def encode(arrays: Arrays, version: int = VERSION, antialiased: bool = False) -> list[bytes]:
     """Return the bytes of a file.
 
     Args:
         arrays: The Gaussians, in the axes of PLY.
         version: 2, 3 or 4.
+        antialiased: Whether the header says that the Gaussians are antialiased.
 
     Raises:
         DataError: A coordinate is too large for the format.
@@ -114,13 +116,13 @@ def encode(arrays: Arrays, version: int = VERSION) -> list[bytes]:
     bits, n = fractional_bits(a["means"]), len(a["means"])
     sections, degree = _sections(a, bits, version), math.isqrt(a["sh"].shape[1]) - 1
     if version < 4:
-        body = HEADER.pack(MAGIC, version, n, degree, bits, 0, 0) + b"".join(sections)
+        body = HEADER.pack(MAGIC, version, n, degree, bits, int(antialiased), 0) + b"".join(sections)
         return [gzip.compress(body, compresslevel=6, mtime=0)]
     compressor = _zstandard().ZstdCompressor(level=12)
     sections = [s for s in sections if s]
     streams = [compressor.compress(s) for s in sections]
     toc = b"".join(struct.pack("<QQ", len(c), len(s)) for c, s in zip(streams, sections))
-    return [HEADER_4.pack(MAGIC, 4, n, degree, bits, 0, len(streams), HEADER_4.size), toc, *streams]
+    return [HEADER_4.pack(MAGIC, 4, n, degree, bits, int(antialiased), len(streams), HEADER_4.size), toc, *streams]
 
 
 def decode(path: Path, data: bytes) -> Arrays:
@@ -135,14 +137,14 @@ def decode(path: Path, data: bytes) -> Arrays:
         head = _inflated(path, stream, HEADER.size)
         if len(head) < HEADER.size:
             raise malformed(path, "its header is cut short")
-        magic, version, n, degree, bits, flags, _ = HEADER.unpack(head)
-        sizes = _checked(path, len(data), (magic, version, n, degree, bits, flags), (2, 3))
+        magic, version, n, degree, bits, _, _ = HEADER.unpack(head)
+        sizes = _checked(path, len(data), (magic, version, n, degree, bits), (2, 3))
         sections = _parts_of_gzip(path, stream, n, sizes)
     else:
         if len(data) < HEADER_4.size:
             raise malformed(path, "its header is cut short")
-        magic, version, n, degree, bits, flags, count, place = HEADER_4.unpack_from(data)
-        sizes = _checked(path, len(data), (magic, version, n, degree, bits, flags), (4,))
+        magic, version, n, degree, bits, _, count, place = HEADER_4.unpack_from(data)
+        sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
         sections = _streams(path, data, sizes, count, place)
     arrays = _unpack(sections, n, degree, bits, version)
     next(sections, None)  # checks the end of the last one
@@ -181,7 +183,7 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
 
 def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
     """Return the sizes of the sections [bytes]; DataError where the header cannot be true of a file of ``size`` bytes."""
-    magic, version, n, degree, bits, flags = header
+    magic, version, n, degree, bits = header
     if magic != MAGIC:
         raise malformed(path, "it does not start as SPZ does")
     if version not in versions:
@@ -193,8 +195,6 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
     if sum(sizes) > MAX_RATIO * size + SMALL:
         raise malformed(path, f"{n} Gaussians in {size} bytes")
-    if flags & 1:
-        raise malformed(path, "it was trained with antialiasing (mip-splatting), which this program does not render")
     return sizes
 
 
@@ -298,6 +298,7 @@ class SPZ(Format):
     description = "Niantic: fixed point and 8 bits, gzip; Scaniverse, Babylon.js, SuperSplat"
     Config = SPZConfig
     sorted = True
+    declares = True
     note = (
         "SPZ has y up, as Niantic defines it; SuperSplat, splat-transform 3, gsply and gaussforge take its axes for those of "
         "PLY: --rotate 1,0,0,180 turns a file from them or for them"
@@ -306,4 +307,19 @@ class SPZ(Format):
 
     def encode(self, arrays: Arrays) -> list[bytes]:
         """Return the bytes of a file of the version that the options name."""
-        return encode(arrays, self.config.version)
+        return encode(arrays, self.config.version, self.antialiased)
+
+    def is_antialiased(self, path: Path) -> bool:
+        """Return whether the header says so.
+
+        Raises:
+            DataError: The file cannot be read.
+        """
+        try:
+            with open_input(path) as file:
+                packed = file.read(2) == b"\x1f\x8b"
+                file.seek(0)
+                head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
+        except OSError as e:
+            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+        return len(head) == HEADER.size and bool(HEADER.unpack(head)[5] & 1)

@@ -12,7 +12,7 @@ import torch
 
 from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError, WarpgsError
-from warpgs.export.formats import read_gaussians
+from warpgs.export.formats import read_file
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
@@ -83,7 +83,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     Raises:
         DataError: The file holds no Gaussians.
     """
-    stored = read_gaussians(path)
+    stored, antialiased = read_file(path, None, "file")
     if not len(stored):
         raise DataError(f"{path}: holds no Gaussian; export the model again")
     means = stored.means.double().numpy()
@@ -91,7 +91,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
     gaussians = convert_gaussians(stored, normalization, "file", "scene")
     gaussians = dataclasses.replace(gaussians, **{n: t.to(device) for n, t in gaussians.tensors().items()})
-    model = FittedModel(gaussians, normalization, {}, (), (), RULE, (0.0, 0.0, 0.0), 0)
+    model = FittedModel(gaussians, normalization, {}, (), (), RULE, (0.0, 0.0, 0.0), 0, antialiased=antialiased)
     return Content(path.name, model, path.with_suffix(""))
 
 

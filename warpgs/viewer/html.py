@@ -153,6 +153,8 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     with hold_folder(target.parent) as held:
         cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
         notes = write_html(target, gaussians, cameras, run.background)
+    if run.antialiased:
+        notes.append("the page shows the model without antialiasing: too bright from afar and in small windows")
     size = format_bytes(target.stat().st_size)
     last = f"{len(gaussians):,} Gaussians in {target}, {size}; open it in any browser, without a network"
     return [*run.notes(), *held, *lines, *notes, last]

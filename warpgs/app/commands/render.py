@@ -25,7 +25,8 @@ def run(arguments: list[str], about: str) -> int:
         rule: str | None = None
         """Cut-offs that a file of Gaussians was trained with: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
-        """Render a file of Gaussians that was trained with antialiasing, as by gsplat's rasterize_mode antialiased."""
+        """Render a file of Gaussians that was trained with antialiasing, as by gsplat's rasterize_mode antialiased, where
+        the file does not say so."""
         path: str = "auto"
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""

@@ -10,7 +10,7 @@ import torch
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format
 from warpgs.export.cameras import holds_cameras, write_cameras
-from warpgs.export.formats import find_format, format_of, read_gaussians, write_gaussians
+from warpgs.export.formats import find_format, format_of, read_file, write_gaussians
 from warpgs.io.camera_files import read_cameras
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.model.filters import limit_degree, select
@@ -58,7 +58,8 @@ def convert(
         format_of(target, unused)  # says that its name is another
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
-    lines = _written(read_gaussians(source, format=read), None, target, kind, filters)
+    gaussians, antialiased = read_file(source, None, "file", read)
+    lines = _written(gaussians, None, target, kind, filters, antialiased)
     return [read.note, *lines] if read.note and not kind.note else lines
 
 
@@ -84,10 +85,12 @@ def export(
         return _cameras_written(list(stored.cameras("file").values()), training_cameras(stored), target, filters)
     kind = format_of(target, format)
     stored = open_run(folder, torch.device("cpu"))
-    return _written(file_gaussians(stored), stored, target, kind, filters)
+    return _written(file_gaussians(stored), stored, target, kind, filters, stored.antialiased)
 
 
-def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind: Format, filters: Filters) -> list[str]:
+def _written(
+    gaussians: Gaussians, stored: StoredRun | None, target: Path, kind: Format, filters: Filters, antialiased: bool
+) -> list[str]:
     """Filter Gaussians in file units, and write them; returns lines for the user."""
     gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned)
     if not len(gaussians):
@@ -100,10 +103,12 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
         lines.append(f"the file does not hold the background colour of the fit, #{color}")
+    if antialiased and not kind.declares:
+        lines.append(f"{kind.suffix} files cannot say that the model is antialiased: choose that mode where the file is shown")
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:
-        write_gaussians(target, gaussians, units="file", format=kind)
+        write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
     lines += _changes(target, gaussians, kind) if type(kind).decode is not Format.decode else []
     lines += [kind.note] if kind.note else []
     return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {target.stat().st_size / 2**20:.2f} MiB"]
@@ -111,7 +116,7 @@ def _written(gaussians: Gaussians, stored: StoredRun | None, target: Path, kind:
 
 def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
     """Return a line on what the format rounded, from the file itself; none for what float32 rounds."""
-    back = read_gaussians(target, format=kind)
+    back, _ = read_file(target, None, "file", kind)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
     if moved == 0 and float(scales.max()) < ROUNDING:

@@ -269,7 +269,12 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
     given = cameras_of(job.scene)
     job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned.views))
     if job.out is not None:
-        write_ply(job.out / "point_cloud.ply", drop_unused_sh(trainer.gaussians), job.scene.normalization)
+        write_ply(
+            job.out / "point_cloud.ply",
+            drop_unused_sh(trainer.gaussians),
+            job.scene.normalization,
+            antialiased=job.config.antialiased,
+        )
     with ThreadPoolExecutor(1) as beside:
         # its process takes seconds, in which views are scored here
         overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from warpgs.constants import LOW_PASS
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
-from warpgs.export.formats import format_of, read_gaussians
+from warpgs.export.formats import format_of, read_file
 from warpgs.io.camera_files import colmap_folder, read_cameras
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
@@ -35,7 +36,7 @@ def open_file(
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
         rule: Name of the cut-offs that it was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
-        antialiased: True for a model that was trained so (`RasterizeOptions.antialiased`).
+        antialiased: True for a model that was trained so (`RasterizeOptions.antialiased`) and whose file does not say it.
 
     Raises:
         DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
@@ -56,14 +57,16 @@ def open_file(
             )
     # the unit stays that of the file, in which the near plane of a rule is given
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
-    gaussians = read_gaussians(path, normalization, units="scene")
+    gaussians, declared = read_file(path, normalization, "scene")
     gaussians = Gaussians(**{name: t.to(where) for name, t in gaussians.tensors().items()})
     notes += [note] if (note := format_of(path).note) else []
+    if declared:
+        notes.append(f"{path.name} is antialiased, and so are its renders, with a pixel filter of {LOW_PASS:g} px²")
     if rule is None:
         notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat-1.6 or gsplat-1.5 suits models of gsplat")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
     shown = (in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
-    model = FittedModel(gaussians, normalization, *shown, antialiased=antialiased)
+    model = FittedModel(gaussians, normalization, *shown, antialiased=antialiased or declared)
     return model, [*notes, f"{len(gaussians):,} Gaussians, {len(found)} cameras"]
 
 

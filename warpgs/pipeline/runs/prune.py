@@ -61,7 +61,8 @@ def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, 
         with filling(out) as temporary:
             write_json(temporary / CONFIG, record)
             save_checkpoint(temporary, tensors, {"step": step})
-            write_ply(temporary / "point_cloud.ply", made.gaussians, normalization)
+            antialiased = record["config"].get("antialiased", False)
+            write_ply(temporary / "point_cloud.ply", made.gaussians, normalization, antialiased=antialiased)
     return notes
 
 
