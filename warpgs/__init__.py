@@ -69,7 +69,8 @@ if TYPE_CHECKING:
     from warpgs.pipeline.train.strategies.base import Strategy
     from warpgs.pipeline.train.view_modules.base import ViewModule
     from warpgs.render.graphed import clear_graph_cache
-    from warpgs.render.rasterize import RasterizeOptions, rasterize
+    from warpgs.render.options import RasterizeOptions
+    from warpgs.render.rasterize import rasterize
     from warpgs.render.select_rule import select_rule
     from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
 
@@ -92,7 +93,8 @@ _HOMES = {
         "warpgs.pipeline.train.view_modules.base": ("ViewModule",),
         "warpgs.pipeline.train.step_report": ("StepReport",),
         "warpgs.render.graphed": ("clear_graph_cache",),
-        "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
+        "warpgs.render.options": ("RasterizeOptions",),
+        "warpgs.render.rasterize": ("rasterize",),
         "warpgs.render.select_rule": ("select_rule",),
         "warpgs.constants": ("Rule",),
         "warpgs.scene": ("ActivatedGaussians", "Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),

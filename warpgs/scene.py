@@ -37,7 +37,7 @@ class Camera:
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/python.md), or one of your own."""
     distortion: Array | None = None
     """Coefficients of the camera model, shape [P] or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4, k1 to k4;
-    None for a model without. No gradients flow into them."""
+    None for a model without. They have no gradient: those that require one are refused."""
 
     @property
     def center(self) -> np.ndarray:
@@ -268,7 +268,10 @@ class ActivatedGaussians:
 
 @dataclass(frozen=True)
 class Render:
-    """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C)."""
+    """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C).
+
+    With ``RasterizeOptions.pixels`` images have one axis P in place of H and W.
+    """
 
     rgb: torch.Tensor
     """Colour over the background, shape [..., H, W, 3]; not clamped. Of D channels where ``RasterizeOptions.colors`` has D."""
@@ -296,6 +299,15 @@ class Render:
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
 
+    heaviest_ids: torch.Tensor | None = None
+    """Numbers of the Gaussians of largest blending weight in each pixel, the heaviest first, the nearer one of a tie; -1 where
+    there are fewer. Int32, shape [..., H, W, k]; only where ``RasterizeOptions.heaviest`` is k."""
+    heaviest_weights: torch.Tensor | None = None
+    """Blending weights of ``heaviest_ids``, 0 where there is none, shape [..., H, W, k]. To take a gradient of them is an
+    error."""
+    blend_counts: torch.Tensor | None = None
+    """Number of Gaussians blended in each pixel, whose weights sum to ``alpha``; int32, shape [..., H, W]; only where
+    ``RasterizeOptions.heaviest`` is set."""
     absgrad: bool = False
     """True where ``RasterizeOptions.absgrad`` was set."""
 

@@ -30,7 +30,8 @@ from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.loop import train_views
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.runtime.ranks import Ranks, join
 from warpgs.scene import Camera, PointCloud, View
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 

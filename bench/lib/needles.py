@@ -21,7 +21,8 @@ import torch
 from tests.reference.low_precision import Frame, Inputs, ProjectedGaussians, layers, pixel_centers, projected_of
 from warpgs.constants import RULES
 from warpgs.kernels.project import project
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 LENGTHS = (1, 3, 10, 30, 100, 300, 1000, 3000, 10000)

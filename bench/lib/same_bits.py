@@ -31,7 +31,8 @@ from warpgs.pipeline.train.step import total_loss
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.semantics import classical_maps
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Scene, View
 from warpgs.synthetic.demo import split_spec, write_demo
 

@@ -9,7 +9,8 @@ import torch
 
 from warpgs.constants import RULES, Rule
 from warpgs.kernels.project import project
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]

@@ -24,7 +24,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
 from warpgs.pipeline.train.warmup import warm_up
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.ranks import ALONE
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 

@@ -12,7 +12,8 @@ from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.bound_scenes import HEIGHT, KINDS, WIDTH, bound_scene
 from warpgs.constants import RULES
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 
 CPU = torch.device("cpu")

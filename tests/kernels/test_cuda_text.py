@@ -5,7 +5,7 @@ import itertools
 import pytest
 import warp as wp
 
-from warpgs.kernels import blend_channels, blend_cuda, median_depth, project
+from warpgs.kernels import blend_channels, blend_cuda, heaviest, median_depth, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.pipeline.runs.precompile import fit_kernels
 
@@ -16,7 +16,7 @@ ARCHITECTURE = 75
 def modules() -> dict[str, wp.Module]:
     """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
     kernels = [k for k, _ in fit_kernels(True)]
-    kernels += [median_depth.make_native(size) for size in (8, 16)]
+    kernels += [make(size) for make in (median_depth.make_native, heaviest.make_native) for size in (8, 16)]
     for variant in ((True, False), (False, True), (True, True)):  # activated, antialiased
         kernels += [make(wp.float32, True, "pinhole", *variant) for make in (project.make_forward, project.make_backward)]
     for channels in blend_channels.WIDTHS:

@@ -32,6 +32,7 @@ CUDA_FUNCTIONS = {
         "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
     ),
     "warpgs/kernels/adam.py": ("make_scheduled_kernel",),
+    "warpgs/kernels/heaviest.py": ("make_native",),
     "warpgs/kernels/median_depth.py": ("make_native",),
     "warpgs/kernels/ssim.py": ("make_kernels", "_Launcher.padded", "_Launcher.launch"),
 }  # fmt: skip
@@ -61,6 +62,7 @@ OPS = {
     "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],
     "knn": ["kernels/test_knn.py", LIMITS],
     "allocator": ["runtime/test_allocator.py", "runtime/test_cuda_graph.py", "render/test_graphed.py"],
+    "heaviest": ["kernels/test_heaviest.py"],
     "median_depth": ["kernels/test_median_depth.py", "kernels/test_blend.py"],
     "native": [
         "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,

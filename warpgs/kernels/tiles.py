@@ -261,6 +261,7 @@ def _sort_by_tile(
 def bin_tiles(
     projected: torch.Tensor, tile_counts: torch.Tensor, *, width: int, height: int, rule: Rule, tile_size: int = TILE_SIZE,
     origin: tuple[int, int] = (0, 0), memory: InstanceMemory = AS_NEEDED, slotted: bool = True,
+    listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
     """Return for every tile the Gaussians that touch it, front to back. Not differentiable.
 
@@ -274,6 +275,7 @@ def bin_tiles(
         origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
         memory: Memory of the instances; M is its capacity where it has one.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
+        listed: Tiles that get their instances, bool, shape [C * tiles]: the others stay empty. None for all.
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
@@ -306,6 +308,9 @@ def bin_tiles(
         ]  # fmt: skip
         threads = -(-visible // 256) * 256 if native else visible
         interop.launch(make_emit(real, native, slotted), threads, inputs, device, cost=10)
+        if listed is not None:
+            own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
+            own.masked_fill_(~kept[own.long()], no_tile)
         ids = _sort_by_tile(keys, slots, owners, ranges, total, slotted)
     own_slots = slots[: total if slotted else 0]
     return Tiles(tile_size, ranges, ids, own_slots, starts, counts, keys[:total], ends[-1:], visible)

@@ -13,7 +13,7 @@ from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integra
 from warpgs.mesh.grid import MAX_RESOLUTION, MIN_RESOLUTION, GridPlan, check_memory, plan_grid
 from warpgs.mesh.surface_views import DEPTHS, SAMPLES, sample_surface, surface_views
 from warpgs.mesh.triangles import decimate, extract, remove_small_parts
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
 
 COLOR_TOLERANCE = 1.0

@@ -11,7 +11,8 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, pinhole_of
 from warpgs.kernels.tsdf import face_cosines
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 DEPTHS = ("median", "mean")

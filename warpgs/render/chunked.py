@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from warpgs.kernels.heaviest import without_gradient
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.render.compose import Images, bin_and_blend, bin_projected, median_depth_of, weights_of
+from warpgs.render.compose import Images, bin_and_blend, bin_projected, heaviest_of, median_depth_of, weights_of
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.runtime.derivatives import first_order
 
@@ -153,6 +154,32 @@ def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: P
             projected, bin_projected(projected, counts, settings, slotted=False), settings
         )
     return depths
+
+
+def heaviest_chunked(
+    projected: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs, k: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Find the k heaviest Gaussians of each pixel chunk by chunk: the same bits as `heaviest` gives.
+
+    Args:
+        projected: Result of `project` for the frame's window, shape [C, N, 12].
+        frame: Settings.
+        inputs: The tensors that ``projected`` was projected from.
+        k: Number of Gaussians.
+
+    Returns:
+        Numbers and weights [C, H, W, k], and the number blended [C, H, W].
+    """
+    _, _, width, height = frame.settings.window
+    shape = (len(projected), height, width)
+    ids, counts = (projected.new_empty(s, dtype=torch.int32) for s in ((*shape, k), shape))
+    weights, own = projected.new_empty(*shape, k), projected.detach()
+    for settings, tile_counts in chunks(frame, inputs.detached()):
+        rows, columns = _place(frame, settings.window)
+        parts = heaviest_of(own, bin_projected(own, tile_counts, settings, slotted=False), settings, k)
+        for image, part in zip((ids, weights, counts), parts, strict=True):
+            image[:, rows, columns] = part
+    return ids, without_gradient(weights, projected), counts
 
 
 def blend_chunked(

@@ -15,6 +15,7 @@ import torch
 from warpgs.kernels import blend as blending
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.blend_channels import blend_channels
+from warpgs.kernels.heaviest import heaviest
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
@@ -80,7 +81,7 @@ def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> Render
 
 def bin_projected(
     projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
-    slotted: bool = True,
+    slotted: bool = True, listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
     """Return the instances of each tile of the window.
 
@@ -90,13 +91,13 @@ def bin_projected(
         settings: Settings of the render.
         memory: Memory of the instances.
         slotted: True for gradients and `weights_of`; False is faster (`bin_tiles`).
+        listed: Tiles that get their instances, bool, shape [C * tiles]; None for all.
 
     Raises:
         ResourceError: There are more than memory allows.
     """
-    return bin_tiles(
-        projected, tile_counts, tile_size=settings.tile_size, memory=memory, slotted=slotted, **settings.of_window()
-    )
+    named = {"memory": memory, "slotted": slotted, "listed": listed, **settings.of_window()}
+    return bin_tiles(projected, tile_counts, tile_size=settings.tile_size, **named)
 
 
 def compose(
@@ -165,6 +166,13 @@ def weights_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) 
 def median_depth_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> torch.Tensor:
     """Return the z-depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
     return median_depth(projected, tiles, **settings.of_window())
+
+
+def heaviest_of(
+    projected: torch.Tensor, tiles: Tiles, settings: RenderSettings, k: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return numbers and weights [C, H, W, k] of the k heaviest Gaussians, and the number blended [C, H, W] (`heaviest`)."""
+    return heaviest(projected, tiles, k, **settings.of_window())
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,16 +10,16 @@ import torch
 
 from warpgs.constants import FAR, K_TOLERANCE, Rule
 from warpgs.errors import ResourceError, UsageError
-from warpgs.field_docs import document_fields
 from warpgs.kernels.blend_records import WIDTHS
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.kernels.tiles import InstanceMemory
 from warpgs.render import graphed
-from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, median_depth_chunked
+from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
 from warpgs.render.compose import (
     bin_projected,
+    heaviest_of,
     images_of,
     inputs_of,
     median_depth_of,
@@ -27,6 +27,8 @@ from warpgs.render.compose import (
     settings_of,
     weights_of,
 )  # fmt: skip
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.pixels import at_pixels, checked_pixels, listed_tiles, window_of
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.rules import rule_named
 from warpgs.runtime import interop
@@ -41,81 +43,6 @@ BOUND_ROUNDING = 2.0**-29
 """Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
 colour is off by at most 2 e: an alpha moves its weight between its own colour and those behind, and the weights sum to 1. The
 unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
-
-
-@document_fields
-@dataclass(frozen=True)
-class RasterizeOptions:
-    """Options of `rasterize`; the defaults are exact."""
-
-    rule: str | Rule = "exact"
-    """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
-    near: float | None = None
-    """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. A Gaussian
-    has the depth of its mean, along the camera's z axis or, of a fisheye, the distance, and is left out as a whole."""
-    far: float | None = None
-    """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the rule's, 1e10."""
-    sh_degree: int | None = None
-    """Spherical-harmonics degree used; None for all that is stored."""
-    background: torch.Tensor | None = None
-    """Colour behind the scene, shape [3] or [C, 3], with ``colors`` [D] or [C, D]; None for black. Gradients flow into it."""
-    colors: torch.Tensor | None = None
-    """Colours instead of those of the spherical harmonics, shape [N, D], or [C, N, D] for each camera its own: any number of
-    channels D, finite values of any sign and size, never clamped. `Render.rgb` then has D channels. Gradients flow into it,
-    and none into ``sh``. None for the spherical harmonics."""
-    features: torch.Tensor | None = None
-    """Channels to render beside the colours, shape [N, D] or [C, N, D], as free as ``colors``: `Render.features` holds them,
-    blended with the same weights. Gradients flow into it."""
-    feature_background: torch.Tensor | None = None
-    """Features behind the scene, shape [D] or [C, D]; None for zeros. Gradients flow into it."""
-    tile_size: int = 16
-    """Side of a tile [px]: 8 or 16. The image does not depend on it."""
-    contributions: bool = False
-    """True to report sum and maximum of each Gaussian's blending weight, too."""
-    median_depth: bool = False
-    """True to render the depth at which transmittance falls to one half, too."""
-    error_bound: bool = False
-    """True to bound the error of ``rgb`` against rule `exact`, too: for each pixel the distance of this render from one under
-    `exact` in float64, plus the rounding of float64. So it covers cut-offs and float32 together. It costs a render in float64,
-    several times the time of one in float32 (docs/trade.md). Not with ``capacity``."""
-    memory_budget: int | None = None
-    """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
-    deterministic: bool = True
-    """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
-    absgrad: bool = False
-    """True to sum magnitudes of the gradients of projected means over pixels, too: ``Render.means2d.absgrad``. At most 11
-    channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
-    antialiased: bool = False
-    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting: Gaussians
-    below a pixel lose the brightness that widening by ``Rule.low_pass`` adds. For models that were trained so."""
-    opacity_factors: torch.Tensor | None = None
-    """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
-    capacity: int | None = None
-    """Number of (Gaussian, tile) instances to allocate memory for; None for as many as there are. With a number nothing is read
-    back from the device, so the call can be captured in a CUDA graph; check `Render.overflow` before using the result."""
-    window: tuple[int, int, int, int] | None = None
-    """Left, top, width and height [px] of the part to render: the images are the crop of the whole ones, to the bit. Edges lie
-    at multiples of ``tile_size`` or at the image's edges. None for all."""
-    max_instances: int | None = None
-    """Most (Gaussian, tile) instances at a time: an image of more is rendered in chunks, and each chunk again for its
-    gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
-    record: bool = True
-    """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
-    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth, error bound and
-    limits (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
-    torch.cuda.synchronize does."""
-
-    def repeatable(self) -> bool:
-        """Return whether calls with these options may be captured as CUDA graphs."""
-        others = (self.colors, self.features, self.opacity_factors, self.memory_budget, self.capacity, self.max_instances)
-        extra = self.contributions or self.median_depth or self.absgrad or self.error_bound
-        return self.record and self.deterministic and not extra and all(o is None for o in others)
-
-
-def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> RenderSettings:
-    """Return the settings by which a fit renders whole images: cut-offs and antialiasing are those of the options."""
-    rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
-    return settings_of(camera, degree, rule, antialiased=options.antialiased)
 
 
 ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
@@ -140,8 +67,12 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     channels = 0 if options.colors is None else options.colors.shape[-1]
     if options.absgrad and (options.features is not None or channels > WIDTHS[-1]):
         raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
+    if options.heaviest < 0:
+        raise UsageError(f"heaviest must be a number of Gaussians, or 0 for none, not {options.heaviest}")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
+    if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
+        raise UsageError("pixels do not go with window, contributions and capacity: leave those out")
     if options.error_bound and options.capacity is not None:
         raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
     return replace(rule, near=near, far=far)
@@ -222,9 +153,10 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     return values if values.ndim == 3 else values[None]
 
 
-def _check_memory(window: Window, layers: list[_Layer], like: torch.Tensor) -> None:
+def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: torch.Tensor) -> None:
     """Raise ResourceError where the images [C, H, W, D] of the layers need more memory than the device of ``like`` has free."""
     channels = sum(layer.backgrounds.shape[1] + 4 for layer in layers)  # and alpha, depth, transmittance, sum of weights
+    channels += 2 * heaviest
     needed = len(layers[0].backgrounds) * window[2] * window[3] * channels * like.element_size()
     if needed < installed_bytes(like.device) // 20:  # asking for what is free takes 0.1 ms
         return
@@ -284,7 +216,8 @@ def rasterize(
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range.
+            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range, or a pixel
+            outside the image.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
@@ -297,7 +230,11 @@ def rasterize(
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
     named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
-    named |= {"window": _checked_window(camera, options), "activated": isinstance(gaussians, ActivatedGaussians)}
+    pixels = None
+    if options.pixels is not None:
+        pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
+    window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
+    named |= {"window": window, "activated": isinstance(gaussians, ActivatedGaussians)}
     settings = settings_of(camera, degree, rule, **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
@@ -309,9 +246,12 @@ def rasterize(
     layers = [_layer("background", options.background, colors, inputs)]
     if features is not None:
         layers.append(_layer("feature_background", options.feature_background, features, inputs))
-    _check_memory(settings.window, layers, inputs.means)
-    *found, features_found, median = _rasterize(inputs, layers, settings, options)
-    render = _as_render(camera, *found, features=features_found, median_depth=median)
+    _check_memory(settings.window, layers, options.heaviest, inputs.means)
+    images, *found, maps = _rasterize(inputs, layers, settings, options, pixels)
+    if pixels is not None:
+        images = tuple(at_pixels(image, pixels, window) for image in images)
+        maps = {name: None if image is None else at_pixels(image, pixels, window) for name, image in maps.items()}
+    render = _as_render(camera, images, *found, **maps)
     bound = _error_bound(render.rgb.detach(), gaussians, camera, options) if options.error_bound else None
     return replace(render, absgrad=options.absgrad, error_bound=bound)
 
@@ -324,9 +264,10 @@ def _error_bound(
 
     def doubled(holder: Any) -> dict[str, Any]:
         values = {f.name: getattr(holder, f.name) for f in fields(holder)}
-        return {n: v.double() if isinstance(v, torch.Tensor) else v for n, v in values.items()}
+        return {n: v.double() if isinstance(v, torch.Tensor) and v.is_floating_point() else v for n, v in values.items()}
 
-    only_rgb = {"features": None, "feature_background": None, "contributions": False, "median_depth": False, "absgrad": False}
+    only_rgb: dict[str, Any] = {"features": None, "feature_background": None, "contributions": False, "median_depth": False}
+    only_rgb |= {"heaviest": 0, "absgrad": False}
     reference = RasterizeOptions(**doubled(options) | only_rgb | {"rule": "exact", "error_bound": False, "record": False})
     found = rasterize(type(gaussians)(**doubled(gaussians)), Camera(**doubled(camera)), reference)
     colors = found.projected[..., 6:9] if reference.colors is None else reference.colors
@@ -337,11 +278,12 @@ def _error_bound(
 
 
 def _rasterize(
-    inputs: ProjectInputs, layers: list[_Layer], settings: RenderSettings, options: RasterizeOptions
-) -> tuple[Any, ...]:
+    inputs: ProjectInputs, layers: list[_Layer], settings: RenderSettings, options: RasterizeOptions,
+    pixels: torch.Tensor | None,
+) -> tuple[Any, ...]:  # fmt: skip
     """Return the images of the first layer as one tuple, and the further fields of `Render`, by kernels launched one by one.
 
-    The last two are the features, shape [C, H, W, D], and the median depth, shape [C, H, W]; or None.
+    The last is what was requested beside them by name: further maps [C, H, W, ...].
     """
     projected, tile_counts = project_inputs(inputs, settings.projection())
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)
@@ -350,17 +292,21 @@ def _rasterize(
         images = [blend_chunked(projected, layer.backgrounds, frame, inputs, layer.colors) for layer in layers]
         weights = contributions_chunked(projected, frame, inputs) if options.contributions else (None, None)
         median = median_depth_chunked(projected, frame, inputs) if options.median_depth else None
+        heavy = heaviest_chunked(projected, frame, inputs, options.heaviest) if options.heaviest else ()
     else:
         memory = InstanceMemory(options.memory_budget, options.capacity, overflow)
         leaves = [projected, *(t for layer in layers for t in (layer.backgrounds, layer.colors) if t is not None)]
         slotted = options.contributions or needs_slots(leaves)
-        tiles = bin_projected(projected, tile_counts, settings, memory, slotted)
+        listed = None if pixels is None else listed_tiles(pixels, settings, len(projected))
+        tiles = bin_projected(projected, tile_counts, settings, memory, slotted, listed)
         order = options.deterministic
         images = [images_of(projected, tiles, layer.backgrounds, settings, order, layer.colors) for layer in layers]
         weights = weights_of(projected, tiles, settings) if options.contributions else (None, None)
         median = median_depth_of(projected, tiles, settings) if options.median_depth else None
-    features = images[1][0] if len(images) > 1 else None
-    return images[0], projected, tile_counts, *weights, overflow, features, median
+        heavy = heaviest_of(projected, tiles, settings, options.heaviest) if options.heaviest else ()
+    maps = {"features": images[1][0] if len(images) > 1 else None, "median_depth": median}
+    maps |= dict(zip(("heaviest_ids", "heaviest_weights", "blend_counts"), heavy))
+    return images[0], projected, tile_counts, *weights, overflow, maps
 
 
 def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **maps: torch.Tensor | None) -> Render:

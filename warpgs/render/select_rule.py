@@ -9,7 +9,8 @@ from dataclasses import replace
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 FASTEST_FIRST = ("fast", "balanced", "exact")

@@ -11,7 +11,8 @@ import torch
 from warpgs.geometry import matmul
 from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views
 from warpgs.pipeline.metrics.coverage_scores import classes_of
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.report.coverage_image import coverage_image
 from warpgs.report.images import depth_map, error_map
 from warpgs.scene import Camera, Gaussians

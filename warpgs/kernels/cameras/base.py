@@ -60,7 +60,8 @@ def check_camera(camera: Camera) -> type[CameraModel]:
     """Return the model of a camera, or of a batch.
 
     Raises:
-        UsageError: The model is unknown, or the camera has another number of coefficients than it takes.
+        UsageError: The model is unknown, or the camera has another number of coefficients than it takes, or they require
+            gradients, which there are none of.
     """
     model = CAMERA_MODELS.find(camera.model)
     found = 0 if camera.distortion is None else camera.distortion.shape[-1]
@@ -68,5 +69,9 @@ def check_camera(camera: Camera) -> type[CameraModel]:
         raise UsageError(
             f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
             "Camera.distortion the shape [P] or [C, P]"
+        )
+    if getattr(camera.distortion, "requires_grad", False):
+        raise UsageError(
+            "coefficients of a lens have no gradient, and Camera.distortion requires one: detach it; pose and K have theirs"
         )
     return model

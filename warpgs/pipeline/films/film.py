@@ -19,7 +19,8 @@ from warpgs.pipeline.films.plan import FilmPlan, FilmSettings, plan_film
 from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views
 from warpgs.pipeline.metrics.coverage_scores import classes_of
 from warpgs.pipeline.model.model_file import FittedModel
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.report.coverage_image import coverage_image
 from warpgs.report.film import SUFFIXES, write_film
 from warpgs.report.images import frame_sheet, png, straight_alpha

@@ -15,7 +15,8 @@ from warpgs.pipeline.films.keyframes import read_keyframes, through
 from warpgs.pipeline.films.rig import Rig, rig_of
 from warpgs.pipeline.films.view_tour import tour_of
 from warpgs.pipeline.model.model_file import FittedModel
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.report.image_names import image_names
 from warpgs.scene import Camera, Gaussians
 from warpgs.suggestion import did_you_mean

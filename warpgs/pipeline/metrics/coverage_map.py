@@ -10,7 +10,8 @@ import torch
 
 from warpgs.constants import NEAR
 from warpgs.geometry import check_pinhole, pinhole_of, relative_pose
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02

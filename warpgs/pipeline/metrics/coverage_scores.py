@@ -15,7 +15,7 @@ from warpgs.pipeline.metrics.evaluate import over_white, render_view, to_8_bit
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.priors.pinhole_views import pinhole_view
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.terminal import counted
 from warpgs.scene import Gaussians, View
 

@@ -13,7 +13,8 @@ from warpgs.kernels.ssim import ssim
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, View
 
 VARIANTS = {

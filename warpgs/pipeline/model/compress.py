@@ -11,7 +11,7 @@ from warpgs.pipeline.model.coverage import Coverage, coverage, fisher
 from warpgs.pipeline.model.merge import Merges, merges
 from warpgs.pipeline.model.sh_degrees import truncated
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
 
 ROUNDS = 5

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255

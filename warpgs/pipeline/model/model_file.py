@@ -16,7 +16,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
 from warpgs.input_files import read_input, unread_reason
 from warpgs.pipeline.metrics.evaluate import options_for
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Normalization
 from warpgs.version import __version__
 

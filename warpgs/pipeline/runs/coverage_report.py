@@ -11,7 +11,7 @@ import numpy as np
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.io.decoding import decode
 from warpgs.pipeline.metrics.coverage_scores import CLASSES, score_by_coverage
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.report.coverage_image import LEGEND, coverage_image
 from warpgs.report.images import png, webp
 from warpgs.report.page import CoverageReport

@@ -19,7 +19,7 @@ from warpgs.pipeline.train.setup import terms_of
 from warpgs.pipeline.train.step import Forward, StepBuffers, StepPlan, eager_renderer, forward
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Gaussians
 
 FILE = "not_finite.safetensors"

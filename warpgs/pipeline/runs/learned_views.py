@@ -9,7 +9,7 @@ from typing import Any
 from warpgs.io.splits import Split
 from warpgs.pipeline.train.learned_views import LearnedViews
 from warpgs.pipeline.train.view_modules.base import FittedViews
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Scene, View
 
 

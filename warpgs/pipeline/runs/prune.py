@@ -24,7 +24,7 @@ from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import CONFIG, StoredRun, camera_values, open_run
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.report.progress import waiting
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder

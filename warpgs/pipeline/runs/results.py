@@ -27,7 +27,7 @@ from warpgs.pipeline.metrics.evaluate import (
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.runs.coverage_report import coverage_section
 from warpgs.pipeline.runs.request import NO_SCORES
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
 from warpgs.report.image_names import image_names

@@ -14,7 +14,8 @@ import torch
 from warpgs.constants import TILE_SIZE
 from warpgs.lenses import MODELS
 from warpgs.pipeline.metrics.psnr import psnr_of
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 from warpgs.scene import Camera, Gaussians, View
 

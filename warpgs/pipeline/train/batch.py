@@ -23,7 +23,7 @@ from warpgs.pipeline.train.step import (
     view_gradients,
 )
 from warpgs.pipeline.train.views import Kind, ViewStack
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3

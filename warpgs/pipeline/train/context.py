@@ -11,7 +11,7 @@ import torch
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.schedule import Phases
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Gaussians
 
 T = TypeVar("T")

@@ -12,7 +12,8 @@ import torch
 
 from warpgs.pipeline.metrics.psnr import psnr_of
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 FLOOR = (2 / 255) ** 2

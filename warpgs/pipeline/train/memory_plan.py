@@ -24,7 +24,7 @@ from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.view_modules.base import ViewModule
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.compose import count_instances, inputs_of
-from warpgs.render.rasterize import RasterizeOptions, image_settings
+from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes, add_needs
 from warpgs.runtime.terminal import Detail

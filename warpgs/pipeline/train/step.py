@@ -26,7 +26,8 @@ from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of,
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
 from warpgs.render.compose import compose, count_instances, inputs_of
-from warpgs.render.rasterize import RasterizeOptions, image_settings, rasterize
+from warpgs.render.options import RasterizeOptions, image_settings
+from warpgs.render.rasterize import rasterize
 from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
 from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render

@@ -8,7 +8,7 @@ from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.slots import Tree
 from warpgs.pipeline.train.step import Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
 from warpgs.pipeline.train.views import Kind, ViewStack
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.ranks import Ranks
 
 

@@ -24,7 +24,8 @@ from warpgs.pipeline.train.strategies.sampler import (
     valid_pixels,
 )
 from warpgs.pipeline.train.views import TrainingView, half_size_camera
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Prior, ViewDepth
 
 FINE = 1

@@ -10,7 +10,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.plugins import Registry
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 

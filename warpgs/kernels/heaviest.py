@@ -1,0 +1,197 @@
+"""The k heaviest Gaussians of each pixel with their blending weights, and the number of Gaussians that were blended.
+
+A pass of its own beside `blend`, which pays nothing for it. It decides alpha by the same operations as blending does. The list
+of a pixel is kept in its place of the result, in order; a Gaussian that is heavier than the last one moves up.
+"""
+
+import functools
+
+import torch
+import warp as wp
+
+from warpgs.constants import Rule
+from warpgs.errors import UsageError
+from warpgs.kernels.blend import check_tiles, is_native, tile_inputs
+from warpgs.kernels.blend_cuda import SCALE
+from warpgs.kernels.blend_settings import BlendSettings, make_struct
+from warpgs.kernels.compiler import ROLLED
+from warpgs.kernels.falloff import STRIP, make_functions
+from warpgs.kernels.project import PROJECTED_SIZE
+from warpgs.kernels.tiles import Tiles
+from warpgs.runtime import interop
+from warpgs.runtime.cuda_source import source
+
+
+@functools.cache
+def make_kernel(real, tile_size: int):
+    """Make the generic kernel, one task per tile, for one scalar type and tile size."""
+    f = make_functions(real)
+    tile_reals = wp.types.vector(tile_size * tile_size, real)
+    strip_reals = wp.types.vector(STRIP, real)
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+
+    @wp.func
+    def insert(
+        weight: real, i: wp.int32, first: wp.int32, k: wp.int32, weights: wp.array(dtype=real), ids: wp.array(dtype=wp.int32)
+    ):
+        """Put a Gaussian into the list of k that begins at ``first``, behind those of its weight."""
+        if weight > weights[first + k - 1]:
+            j = first + k - 1
+            while j > first and weights[j - 1] < weight:
+                weights[j] = weights[j - 1]
+                ids[j] = ids[j - 1]
+                j -= 1
+            weights[j] = weight
+            ids[j] = i
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def heaviest(
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
+        # outputs
+        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+    ):  # fmt: skip
+        tile = begin + wp.tid()
+        place = f.place_of(tile, side, settings)
+        camera = place[0]
+        left = place[1]
+        top = place[2]
+        rows = wp.min(side, settings.height - top)
+        lanes = wp.min(side, settings.width - left)
+        ramp = strip_reals()
+        t = tile_reals()  # transmittance; 0 once a pixel is finished, and outside the image
+        for row in range(rows):
+            for lane in range(lanes):
+                t[row * side + lane] = real(1.0)
+        unfinished = rows * lanes
+        instance = ranges[tile, 0]
+        while instance < ranges[tile, 1] and unfinished > 0:
+            i = gaussian_ids[instance]
+            instance += 1
+            u11 = projected[i, 2]
+            bounds = f.bounds_of(
+                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
+            )
+            for lane in range(strip):
+                ramp[lane] = f.apart(u11 * real(lane))
+            for row in range(side):
+                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
+                e2 = projected[i, 4] * dy
+                e12 = f.apart(projected[i, 3] * dy)
+                e22 = f.apart(e2 * e2)
+                for part in range(parts):
+                    x = real(settings.origin_x + left + part * strip) + real(0.5)
+                    start = f.apart(u11 * (x - projected[i, 0])) + e12
+                    if f.reaches(start, u11, e22, bounds[0], bounds[1]):
+                        for lane in range(strip):
+                            p = row * side + part * strip + lane
+                            e1 = start + ramp[lane]
+                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
+                            if alpha >= settings.alpha_cut and t[p] > real(0.0):
+                                after = t[p] * (real(1.0) - alpha)
+                                if settings.inclusive != 0 or after >= settings.stop:
+                                    pixel = (camera * settings.height + top + row) * settings.width + left + part * strip + lane
+                                    counts[pixel] += 1
+                                    insert(alpha * t[p], i - camera * per_camera, pixel * k, k, weights, ids)
+                                finished = after < settings.stop
+                                t[p] = wp.where(finished, real(0.0), after)
+                                unfinished -= wp.where(finished, 1, 0)
+
+    return heaviest
+
+
+@functools.cache
+def make_native(tile_size: int):
+    """Make the CUDA kernel in float32 for one tile size, a thread block per tile."""
+    Blending = make_struct(wp.float32)
+
+    @wp.func_native(source("heaviest.cu", SIDE=tile_size, SCALE=SCALE, STRIDE=PROJECTED_SIZE))
+    def body(
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int, weights: wp.array(dtype=float), ids: wp.array(dtype=int),
+        counts: wp.array(dtype=int),
+    ): ...  # fmt: skip
+
+    threads = wp.constant(tile_size * tile_size)
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=f"warpgs.kernels.heaviest.{tile_size}")
+    def heaviest(
+        begin: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
+        # outputs
+        weights: wp.array(dtype=float), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+    ):  # fmt: skip
+        body(
+            wp.tid() // threads, settings, projected, ranges, gaussian_ids, per_camera, k, weights, ids, counts,
+        )  # fmt: skip
+
+    return heaviest
+
+
+class _WithoutGradient(torch.autograd.Function):
+    """Weights that hang on what they were made from, so that a gradient through them is refused and not dropped."""
+
+    @staticmethod
+    def forward(ctx, weights, projected):
+        return weights.view_as(weights)
+
+    @staticmethod
+    def backward(ctx, v_weights):
+        raise UsageError(
+            "weights of the heaviest Gaussians have no gradient: detach them, or take rgb, alpha, depth or features"
+        )
+
+
+def without_gradient(weights: torch.Tensor, projected: torch.Tensor) -> torch.Tensor:
+    """Return weights [..., k], through which a gradient is an error where ``projected`` [C, N, 12] requires gradients."""
+    if not projected.requires_grad:
+        return weights
+    found: torch.Tensor = _WithoutGradient.apply(weights, projected)
+    return found
+
+
+def heaviest(
+    projected: torch.Tensor, tiles: Tiles, k: int, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the k Gaussians of largest blending weight alpha * T in each pixel, the heaviest first; the nearer one of a tie.
+
+    Weights have no gradient, and a gradient through them is an error. Bitwise repeatable, whatever the number of threads.
+
+    Args:
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
+        tiles: Instances of `bin_tiles` for the same image size.
+        k: Number of Gaussians, at least 1.
+        width: Image width [px].
+        height: Image height [px].
+        rule: Cut-offs.
+        origin: Left and top [px] of the window that the tiles were made for.
+
+    Returns:
+        Numbers of Gaussians from 0 to N - 1, int32, shape [C, H, W, k], -1 where fewer than k have a weight above 0; their
+        weights, shape [C, H, W, k], 0 there; and the number of all that were blended, int32, shape [C, H, W].
+
+    Raises:
+        TypeError: The scalar type is neither float32 nor float64.
+        ValueError: A shape disagrees, the tiles belong to another image size, or ``k`` is below 1.
+    """
+    check_tiles(projected, tiles, width, height)
+    if k < 1:
+        raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
+    detached = projected.detach().contiguous()
+    real, device, (cameras, per_camera) = interop.real_of(detached), detached.device, detached.shape[:2]
+    settings, shape = BlendSettings(origin, width, height, rule), (cameras, height, width)
+    weights = detached.new_zeros(*shape, k)
+    ids = torch.full((*shape, k), -1, dtype=torch.int32, device=device)
+    counts = torch.zeros(shape, dtype=torch.int32, device=device)
+    outputs = [interop.view(weights.view(-1), real), *(interop.view(t.view(-1), wp.int32) for t in (ids, counts))]
+    own, rest = settings.struct(tiles.size, real), [per_camera, k, *outputs]
+    if is_native(detached):
+        lists = [interop.view(t.view(-1), wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
+        inputs, pixels = [own, interop.view(detached.view(-1), real), *lists, *rest], tiles.size * tiles.size
+        interop.launch(make_native(tiles.size), len(tiles.ranges) * pixels, inputs, device, block_dim=pixels)
+    else:
+        inputs = [own, *tile_inputs(detached, tiles, real), *rest]
+        interop.launch(make_kernel(real, tiles.size), len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
+    return ids, without_gradient(weights, projected), counts

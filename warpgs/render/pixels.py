@@ -1,0 +1,66 @@
+"""Pixels instead of an image: the window that holds them, the tiles that they lie in, and their values."""
+
+from __future__ import annotations
+
+import torch
+
+from warpgs.kernels.tiles import grid
+from warpgs.render.settings import RenderSettings, Window
+from warpgs.scene import Camera
+
+INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+"""Types of pixel numbers."""
+
+
+def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
+    """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
+
+    Raises:
+        TypeError: They are no tensor of whole numbers.
+        ValueError: The shape is another.
+    """
+    if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
+        found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
+        raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
+    if pixels.ndim not in (2, 3) or pixels.shape[-1] != 2 or (pixels.ndim == 3 and len(pixels) != cameras):
+        raise ValueError(f"pixels must have shape [P, 2] or [{cameras}, P, 2], not {list(pixels.shape)}")
+    found = pixels.to(device, torch.int64)
+    return found if found.ndim == 3 else found[None]
+
+
+def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
+    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; this reads them from the device.
+
+    Raises:
+        ValueError: A pixel lies outside the image.
+    """
+    if not pixels.shape[-2]:
+        return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)
+    flat = pixels.reshape(-1, 2)
+    (left, top), (right, bottom) = torch.stack([flat.amin(0), flat.amax(0)]).tolist()
+    if left < 0 or top < 0 or right >= camera.width or bottom >= camera.height:
+        raise ValueError(
+            f"pixels reach from column {left} to {right} and from row {top} to {bottom}, beyond the image of "
+            f"{camera.width} x {camera.height} px"
+        )
+    x, y = left // tile_size * tile_size, top // tile_size * tile_size
+    width = min((right // tile_size + 1) * tile_size, camera.width) - x
+    height = min((bottom // tile_size + 1) * tile_size, camera.height) - y
+    return x, y, width, height
+
+
+def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -> torch.Tensor:
+    """Return for each tile of C cameras whether pixels [1, P, 2] or [C, P, 2] lie in it, as `bin_tiles` takes it, shape [T]."""
+    (x, y, width, height), size = settings.window, settings.tile_size
+    columns, rows = grid(width, height, size)
+    places = (pixels[..., 1] - y) // size * columns + (pixels[..., 0] - x) // size  # the edge of a window lies on tiles
+    places = places + columns * rows * torch.arange(cameras, device=pixels.device)[:, None]
+    listed = torch.zeros(cameras * columns * rows, dtype=torch.bool, device=pixels.device)
+    listed[places.reshape(-1)] = True
+    return listed
+
+
+def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torch.Tensor:
+    """Return the values [C, P, ...] of images [C, H, W, ...] of a window at pixels [1, P, 2] or [C, P, 2]. Differentiable."""
+    cameras = torch.arange(len(image), device=image.device)[:, None]
+    return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]
