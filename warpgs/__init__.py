@@ -18,6 +18,7 @@ __all__ = [
     "PRESETS",
     "ActivatedGaussians",
     "Camera",
+    "CovarianceGaussians",
     "FitConfig",
     "FitResult",
     "Format",
@@ -71,7 +72,17 @@ if TYPE_CHECKING:
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
     from warpgs.render.select_rule import select_rule
-    from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
+    from warpgs.scene import (
+        ActivatedGaussians,
+        Camera,
+        CovarianceGaussians,
+        Gaussians,
+        Normalization,
+        PointCloud,
+        Render,
+        Scene,
+        View,
+    )
 
 _HOMES = {
     name: module
@@ -95,7 +106,17 @@ _HOMES = {
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
         "warpgs.render.select_rule": ("select_rule",),
         "warpgs.constants": ("Rule",),
-        "warpgs.scene": ("ActivatedGaussians", "Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
+        "warpgs.scene": (
+            "ActivatedGaussians",
+            "Camera",
+            "CovarianceGaussians",
+            "Gaussians",
+            "Normalization",
+            "PointCloud",
+            "Render",
+            "Scene",
+            "View",
+        ),
     }.items()
     for name in names
 }

@@ -24,6 +24,7 @@ from warpgs.render.compose import (
     inputs_of,
     median_depth_of,
     needs_slots,
+    parameters_of,
     settings_of,
     weights_of,
 )  # fmt: skip
@@ -32,7 +33,7 @@ from warpgs.rules import rule_named
 from warpgs.runtime import interop
 from warpgs.runtime.derivatives import refuse_transforms
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Render
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
 
 TILE_SIZES = (8, 16)
 """Sides of a tile that the kernels can be made for [px]."""
@@ -112,7 +113,7 @@ class RasterizeOptions:
         return self.record and self.deterministic and not extra and all(o is None for o in others)
 
 
-ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
+ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
@@ -141,7 +142,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     return replace(rule, near=near, far=far)
 
 
-def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions) -> None:
+def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
     Nothing is read from a GPU: a K there is taken as it is, other values are not checked, and a Gaussian that is not finite is
@@ -155,7 +156,7 @@ def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, 
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             order = "the order is rasterize(gaussians, camera, options)"
-            wanted = " or ".join(kind.__name__ for kind in kinds)
+            wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
         raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
@@ -252,19 +253,18 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
-def rasterize(
-    gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()
-) -> Render:
+def rasterize(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
     """Render Gaussians as one camera, or each camera of a batch, sees them.
 
-    Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
+    Differentiable in the tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
     tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
     backgrounds are moved to the type and device of ``gaussians.means``. There are no second derivatives, torch.func is refused,
     and torch.compile breaks its graph here.
 
     Args:
-        gaussians: N Gaussians: by log scales and logits (`Gaussians`), or by scales and opacities (`ActivatedGaussians`).
+        gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
+            covariances and opacities (`CovarianceGaussians`).
         camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
         options: Options.
 
@@ -291,7 +291,7 @@ def rasterize(
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
     degree = degree if options.colors is None else 0  # as little as can be of what is not shown
     named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
-    named |= {"window": _checked_window(camera, options), "activated": isinstance(gaussians, ActivatedGaussians)}
+    named |= {"window": _checked_window(camera, options), "parameters": parameters_of(gaussians)}
     settings = settings_of(camera, degree, rule, **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
@@ -311,9 +311,7 @@ def rasterize(
 
 
 @torch.no_grad()
-def _error_bound(
-    rgb: torch.Tensor, gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions
-) -> torch.Tensor:
+def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
     """Return the bound of the error of colours [..., H, W, D], shape [..., H, W]; see `RasterizeOptions.error_bound`."""
 
     def doubled(holder: Any) -> dict[str, Any]:
