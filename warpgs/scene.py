@@ -211,7 +211,7 @@ class Gaussians:
     logit_opacities: torch.Tensor
     """Inverse sigmoid of the opacity, shape [N]."""
     sh: torch.Tensor
-    """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16}."""
+    """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""

@@ -168,7 +168,11 @@ def test_arguments_of_another_type_or_shape_are_named():
         ),
         (TypeError, "camera.width must be a whole number of pixels, not 8.0", (gaussians, dataclasses.replace(cam, width=8.0))),
         (ValueError, r"background .*not \[4\]", (gaussians, cam, RasterizeOptions(background=torch.zeros(4)))),
-        (ValueError, r"K is 1, 4, 9 or 16, not \[3, 5, 3\]", (dataclasses.replace(gaussians, sh=torch.zeros(3, 5, 3)), cam)),
+        (
+            ValueError,
+            r"K is 1, 4, 9, 16 or 25, not \[3, 5, 3\]",
+            (dataclasses.replace(gaussians, sh=torch.zeros(3, 5, 3)), cam),
+        ),
     ]
     for kind, words, arguments in wrong:
         with pytest.raises(kind, match=words):

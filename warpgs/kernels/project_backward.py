@@ -8,19 +8,20 @@ import warp as wp
 from warpgs.kernels import sh
 from warpgs.kernels.covariance import make_covariance
 from warpgs.kernels.functions import make_projection
+from warpgs.kernels.native import make_color
 from warpgs.kernels.native import make_functions as make_native
 
 
 @functools.cache
-def make_functions(real, camera_model: str, parameters: str = "stored", antialiased: bool = False):
+def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int):
     """Make the functions that take the gradients of one projected Gaussian to those of its parameters."""
     m = make_projection(real, camera_model, parameters)
     vec2 = m.vec2
     vec3 = m.vec3
     vec4 = m.vec4
-    vec16 = sh.make_functions(real).vec16
+    values = sh.make_functions(real, bases).values
     mat33 = m.mat33
-    basis_backward = sh.make_functions(real).basis_backward
+    basis_backward = sh.make_functions(real, bases).basis_backward
     c = make_covariance(real)
 
     @wp.struct
@@ -149,7 +150,7 @@ def make_functions(real, camera_model: str, parameters: str = "stored", antialia
         return v_color
 
     @wp.func
-    def centered(d: vec4, w: vec16) -> vec3:
+    def centered(d: vec4, w: values) -> vec3:
         """Return the gradient of the mean by way of its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
         v_centered = vec3()
         if d[3] > real(0.0):
@@ -169,7 +170,9 @@ def make_functions(real, camera_model: str, parameters: str = "stored", antialia
 
 
 @functools.cache
-def make_backward(real, native: bool, camera_model: str, parameters: str = "stored", antialiased: bool = False):
+def make_backward(
+    real, native: bool, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
+):  # fmt: skip
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
     Args:
@@ -179,22 +182,23 @@ def make_backward(real, native: bool, camera_model: str, parameters: str = "stor
         camera_model: Name of the camera model, whose functions are compiled in.
         parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
         antialiased: True where opacities were multiplied by `compensation`.
+        bases: Number of basis values that a colour may have (`sh.bases_for`).
     """
     m = make_projection(real, camera_model, parameters)
-    f = make_functions(real, camera_model, parameters, antialiased)
+    f = make_functions(real, camera_model, parameters, antialiased, bases)
     c = make_covariance(real)
-    functions = sh.make_functions(real)
+    functions = sh.make_functions(real, bases)
     vec3 = m.vec3
     vec4 = m.vec4
-    vec16 = functions.vec16
+    values = functions.values
     mat33 = m.mat33
     compact = make_native().compact if native else None
     clear_rows = make_native().clear_rows if native else None
-    color_backward = make_native().color_backward if native else None
+    color_backward = make_color(bases).color_backward if native else None
 
     # four blocks to a multiprocessor
     registers = {"cuda_max_registers": 128} if native else {}
-    variant = f".{parameters}{'.antialiased' * antialiased}"
+    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
     module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}{variant}"
 
     @wp.kernel(enable_backward=False, module=module, **registers)
@@ -260,12 +264,12 @@ def make_backward(real, native: bool, camera_model: str, parameters: str = "stor
                 d = m.direction(means[n], view)
                 basis = functions.basis(vec3(d[0], d[1], d[2]))
                 v_color = f.color(projected, v_projected, i)
-                w = vec16()
+                w = values()
                 if wp.static(native):
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
                     stored += 1
                 else:
-                    for k in range(16):
+                    for k in range(wp.static(bases)):
                         if k < sh_count:
                             v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
                             w[k] = wp.dot(coefficients[n, k], v_color)

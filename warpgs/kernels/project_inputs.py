@@ -9,6 +9,7 @@ import torch
 
 from warpgs.constants import Rule
 from warpgs.errors import UsageError
+from warpgs.kernels import sh
 from warpgs.runtime import interop
 from warpgs.runtime.derivatives import first_order
 
@@ -37,6 +38,10 @@ class ProjectSettings:
     (as `packed_covariances` returns them) and opacities."""
     antialiased: bool = False
     """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)) (docs/project.md)."""
+
+    def variant(self) -> tuple[str, str, bool, int]:
+        """Return what the kernels are compiled for."""
+        return self.camera_model, self.parameters, self.antialiased, sh.bases_for(self.sh_count)
 
 
 class ProjectInputs(NamedTuple):

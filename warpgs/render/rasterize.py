@@ -183,7 +183,7 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
         raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
-        raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
+        raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
