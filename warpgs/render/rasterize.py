@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ from warpgs.render.compose import (
     settings_of,
     weights_of,
 )  # fmt: skip
+from warpgs.render.lists import for_each
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.rules import rule_named
 from warpgs.runtime import interop
@@ -155,7 +157,8 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     """
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
-            order = "the order is rasterize(gaussians, camera, options)"
+            listed = isinstance(given, (list, tuple))
+            order = "a list needs a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
             wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
@@ -253,8 +256,18 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
-def rasterize(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()) -> Render:
-    """Render Gaussians as one camera, or each camera of a batch, sees them.
+@overload
+def rasterize(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions = ...) -> Render: ...
+@overload
+def rasterize(
+    gaussians: RasterizedGaussians | Sequence[RasterizedGaussians], camera: Sequence[Camera],
+    options: RasterizeOptions | Sequence[RasterizeOptions] = ...,
+) -> list[Render]: ...  # fmt: skip
+def rasterize(
+    gaussians: RasterizedGaussians | Sequence[RasterizedGaussians], camera: Camera | Sequence[Camera],
+    options: RasterizeOptions | Sequence[RasterizeOptions] = RasterizeOptions(),
+) -> Render | list[Render]:  # fmt: skip
+    """Render Gaussians as one camera, or each camera of a batch, sees them; for a list of cameras, one by one.
 
     Differentiable in the tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
@@ -265,12 +278,13 @@ def rasterize(gaussians: RasterizedGaussians, camera: Camera, options: Rasterize
     Args:
         gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
             covariances and opacities (`CovarianceGaussians`).
-        camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
+        camera: One camera ([4, 4], [3, 3]), or C of them with images of one size ([C, 4, 4], [C, 3, 3]). Or a list of such, of
+            any sizes: ``gaussians`` and ``options`` are then one for all, or lists of the same length.
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera. ``render.means2d``, read before the backward
-        pass, holds the gradients of the projected means after it.
+        The images, without a leading axis for a single camera; a list of renders for a list of cameras. ``render.means2d``,
+        read before the backward pass, holds the gradients of the projected means after it.
 
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than there is.
@@ -278,12 +292,21 @@ def rasterize(gaussians: RasterizedGaussians, camera: Camera, options: Rasterize
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range.
+            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range. Or lists
+            differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
-        eager: Render = torch.compiler.disable(rasterize)(gaussians, camera, options)
+        eager: Render | list[Render] = torch.compiler.disable(rasterize)(gaussians, camera, options)
         return eager
+    if isinstance(camera, (list, tuple)):
+        return [_render(*each) for each in for_each(camera, gaussians=gaussians, options=options)]
+    one: tuple[Any, ...] = (gaussians, camera, options)
+    return _render(*one)
+
+
+def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Render:
+    """Return what `rasterize` returns for one camera or a batch [C, ...] of them."""
     refuse_transforms()
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
