@@ -12,7 +12,7 @@ if (size % 4 == 0) {
     // AHEAD loads before the stores that use them: the compiler cannot know that rows are apart, and would wait for each
     constexpr int AHEAD = 6;
     #pragma unroll
-    for (int first = 0; first < 12; first += AHEAD) {
+    for (int first = 0; first < (3 * BASES + 3) / 4; first += AHEAD) {
         float4 held[AHEAD];
         #pragma unroll
         for (int k = 0; k < AHEAD; ++k)
@@ -44,4 +44,7 @@ if (size % 4 == 0) {
             } else if (!add && k < size)
                 v_row[3 * k + channel] = 0.0f;
 }
+if (!add)
+    for (int i = 3 * BASES; i < 3 * size; ++i)
+        v_row[i] = 0.0f;
 return w;

@@ -2,7 +2,7 @@
 // count is loaded along, and not used: it may be anything, a NaN too.
 if (size % 4 == 0) {
     #pragma unroll
-    for (int q = 0; q < 12; ++q)
+    for (int q = 0; q < (3 * BASES + 3) / 4; ++q)
         if (4 * q < 3 * count) {
             const float4 v = reinterpret_cast<const float4*>(row)[q];
             take(4 * q, v.x);
