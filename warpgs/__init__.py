@@ -18,6 +18,7 @@ __all__ = [
     "PRESETS",
     "ActivatedGaussians",
     "Camera",
+    "CovarianceGaussians",
     "FitConfig",
     "FitResult",
     "Format",
@@ -72,7 +73,17 @@ if TYPE_CHECKING:
     from warpgs.render.options import RasterizeOptions
     from warpgs.render.rasterize import rasterize
     from warpgs.render.select_rule import select_rule
-    from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
+    from warpgs.scene import (
+        ActivatedGaussians,
+        Camera,
+        CovarianceGaussians,
+        Gaussians,
+        Normalization,
+        PointCloud,
+        Render,
+        Scene,
+        View,
+    )
 
 _HOMES = {
     name: module
@@ -97,7 +108,17 @@ _HOMES = {
         "warpgs.render.rasterize": ("rasterize",),
         "warpgs.render.select_rule": ("select_rule",),
         "warpgs.constants": ("Rule",),
-        "warpgs.scene": ("ActivatedGaussians", "Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
+        "warpgs.scene": (
+            "ActivatedGaussians",
+            "Camera",
+            "CovarianceGaussians",
+            "Gaussians",
+            "Normalization",
+            "PointCloud",
+            "Render",
+            "Scene",
+            "View",
+        ),
     }.items()
     for name in names
 }

@@ -44,6 +44,10 @@ SHORTEST_QUAT = 1e-15
 """Length of the shortest quaternion that gives a rotation; the longest has 1 / SHORTEST_QUAT. Its gradient is divided by its
 length."""
 
+COVARIANCE_TOLERANCE = 1e-5
+"""Largest negative eigenvalue of a covariance that counts as 0, as a fraction of its largest variance: 80 roundings of float32.
+A covariance with a lower one is culled."""
+
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""
 

@@ -245,8 +245,14 @@ def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) 
 
     Returns:
         Unit normals in the axes of the world, shape [N, 3], or [C, N, 3] for C cameras.
+
+    Raises:
+        TypeError: Gaussians are given by covariances.
     """
     import torch
+
+    if not isinstance(gaussians, (Gaussians, ActivatedGaussians)):
+        raise TypeError("gaussian_normals needs quats and scales: torch.linalg.eigh gives the axes of covariances")
 
     means, quats, scales, *_ = gaussians.tensors().values()
     axes = rotation_matrices(quats / quats.norm(dim=-1, keepdim=True))

@@ -211,7 +211,7 @@ class Gaussians:
     logit_opacities: torch.Tensor
     """Inverse sigmoid of the opacity, shape [N]."""
     sh: torch.Tensor
-    """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16}."""
+    """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
 
     def __len__(self) -> int:
         """Return the number of Gaussians."""
@@ -264,6 +264,40 @@ class ActivatedGaussians:
         """Return the same N Gaussians by log scales and logits; scale 0 becomes -inf and opacity 1 inf, which no file takes."""
         means, quats, scales, opacities, sh = self.tensors().values()
         return Gaussians(means, quats, scales.log(), opacities.logit(), sh)
+
+
+@dataclass(frozen=True)
+class CovarianceGaussians:
+    """A set of N Gaussians by covariance matrices and opacities, for `rasterize` alone; fits and files hold `Gaussians`."""
+
+    means: torch.Tensor
+    """World positions [u], shape [N, 3]."""
+    covars: torch.Tensor
+    """Covariances [u^2], positive semi-definite, shape [N, 3, 3]. Of a matrix that is not symmetric its symmetric part counts.
+    Eigenvalues below 0 count as 0 down to 1e-5 times the largest variance; a matrix with a lower one, or one that is not
+    finite, is not rendered. Zeros render as a point, as wide as the pixel filter."""
+    opacities: torch.Tensor
+    """Opacities in [0, 1], shape [N]."""
+    sh: torch.Tensor | None = None
+    """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical-harmonics degree given; 0 without."""
+        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Return the four tensors by field name, in a fixed order; ``sh`` of None as zeros [N, 1, 3]."""
+        sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
+        return {"means": self.means, "covars": self.covars, "opacities": self.opacities, "sh": sh}
+
+
+RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
+"""All that `rasterize` takes as Gaussians."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ PROPERTIES = [f"property float {n}" for n in NAMES]
 ROW = np.arange(1, 15, dtype="<f4").tobytes()
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_round_trip_is_exact(tmp_path, degree, n):
     model = make(n, degree)

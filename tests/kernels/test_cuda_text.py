@@ -17,7 +17,8 @@ def modules() -> dict[str, wp.Module]:
     """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
     kernels = [k for k, _ in fit_kernels(True)]
     kernels += [make(size) for make in (median_depth.make_native, heaviest.make_native) for size in (8, 16)]
-    for variant in ((True, False), (False, True), (True, True)):  # activated, antialiased
+    variants = list(itertools.product(("stored", "activated", "covariances"), (True, False)))  # parameters, antialiased
+    for variant in [*variants, ("stored", False, 25)]:
         kernels += [make(wp.float32, True, "pinhole", *variant) for make in (project.make_forward, project.make_backward)]
     for channels in blend_channels.WIDTHS:
         kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]

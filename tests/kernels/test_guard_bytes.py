@@ -43,15 +43,15 @@ class Guarded(TorchDispatchMode):
         return all(bool((end.isnan() if end.is_floating_point() else end == self.whole).all()) for end in ends)
 
 
-def rendering(device, cameras, deterministic=True):
+def rendering(device, cameras, deterministic=True, degree=1):
     """Return all results of a render, and the gradients of Gaussians, cameras and projected Gaussians."""
-    g = leaves(cloud(60, device=device, degree=1))
+    g = leaves(cloud(60, device=device, degree=degree))
     cam = camera(200, 30, cameras=cameras, dtype=torch.float32, device=device)
     size, side = {"width": 200, "height": 30, "rule": RULES["exact"]}, {"tile_size": 8}
     with torch.no_grad():
         g.log_scales[::4] += 2.0  # more tiles than a thread lists or sums alone
     views, Ks = cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()
-    projected, counts = project(*g.tensors().values(), views, Ks, degree=1, **size, **side)
+    projected, counts = project(*g.tensors().values(), views, Ks, degree=degree, **size, **side)
     made = bin_tiles(projected, counts, **size, **side)
     memory = InstanceMemory(capacity=len(made.slots) + 5, overflow=torch.zeros(1, dtype=torch.int32, device=device))
     spare = bin_tiles(projected, counts, **size, **side, memory=memory)
@@ -71,6 +71,11 @@ def rendering(device, cameras, deterministic=True):
         *of_all,
         *of_rgb,
     ]
+
+
+def of_degree_4(device, cameras):
+    """Return what `rendering` does, with rows of 25 coefficients."""
+    return rendering(device, cameras, degree=4)
 
 
 def similarity(device, cameras):
@@ -98,7 +103,7 @@ def steps(device, number):
 
 @pytest.mark.parametrize("whole", [2**30, -(2**30)])
 @pytest.mark.parametrize("number", [1, 2])
-@pytest.mark.parametrize(("work", "guarded"), [(rendering, 20), (similarity, 20), (steps, 4)])
+@pytest.mark.parametrize(("work", "guarded"), [(rendering, 20), (of_degree_4, 20), (similarity, 20), (steps, 4)])
 def test_nothing_beside_a_tensor_is_written_or_used(device, work, guarded, number, whole):
     """The bits are those without guard bytes, whatever these hold, and the guard bytes do not change."""
     wanted = work(device, number)

@@ -281,7 +281,7 @@ def test_one_gaussian_takes_its_factor(device):
     assert run(gaussians, cam, SMOOTH, opacity_factors=torch.zeros(1, device=device))[1].tolist() == [[0]]
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_unseen_gaussians_have_zero_gradients(device, degree):
     """Memory full of NaN is overwritten for rows of every length, of Gaussians seen by one camera, both or none."""
     gaussians, cam = cloud(300, torch.float32, device, degree=degree), camera(cameras=2, dtype=torch.float32, device=device)
@@ -308,7 +308,7 @@ def test_unseen_gaussians_have_zero_gradients(device, degree):
         assert float((a.double() - b).norm()) <= 1e-4 * float(b.norm())
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_colour_gradients_of_every_degree(device, degree):
     """Rows of coefficients that are a multiple of 16 bytes long and such that are not: as in float64, one camera or two."""
     for cameras in (1, 2):

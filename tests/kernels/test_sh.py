@@ -18,7 +18,7 @@ COUNT = 24
 def inputs(dtype, device, count=COUNT):
     """Return coefficients, unit directions, and for each direction a camera at the origin that looks along it."""
     generator = torch.Generator().manual_seed(1)
-    coefficients = torch.randn(count, 16, 3, generator=generator, dtype=torch.float64)
+    coefficients = torch.randn(count, 25, 3, generator=generator, dtype=torch.float64)
     coefficients[:, 0] += 8 / sh.C0  # no colour is clamped at zero
     dirs = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1)
     up = np.array([0.3, 0.5, 0.8])
@@ -39,7 +39,7 @@ def colors(coefficients, means, viewmats, degree):
     return projected[rows, rows, 6:9]
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_values_equal_scipy(device, dtype, degree):
     """Every basis function has scipy's value, up to the sign convention."""
     coefficients, dirs, viewmats = inputs(dtype, device)
@@ -53,23 +53,23 @@ def test_each_basis_function_equals_scipy(device):
     """One coefficient at a time gives its basis function, so that none hides behind another."""
     coefficients, dirs, viewmats = inputs(torch.float64, device)
     basis = basis_reference(dirs)
-    for k in range(16):
+    for k in range(25):
         alone = torch.zeros_like(coefficients)
         alone[:, 0] = 2 / sh.C0
         alone[:, k] += 1
         wanted = (2.5 + basis[:, k])[:, None].expand(-1, 3)
-        close("sh", colors(alone, 3 * dirs, viewmats, 3), wanted)
+        close("sh", colors(alone, 3 * dirs, viewmats, 4), wanted)
 
 
 def test_the_torch_references_equal_scipy():
     """The two that other tests and measurements use are themselves right."""
     coefficients, dirs, _ = inputs(torch.float64, "cpu")
     wanted = torch.einsum("nk,nkc->nc", basis_reference(dirs), coefficients)
-    assert torch.allclose(colors_reference(coefficients, dirs, 3), wanted, atol=1e-12)
+    assert torch.allclose(colors_reference(coefficients, dirs, 4), wanted, atol=1e-12)
     assert torch.allclose(sh.basis(dirs), basis_reference(dirs), atol=1e-14)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_gradcheck(device, degree):
     """Finite differences agree with the backward kernel for coefficients, and for means by way of their directions."""
     coefficients, dirs, viewmats = inputs(torch.float64, device, 4)
@@ -79,7 +79,7 @@ def test_gradcheck(device, degree):
     )
 
 
-@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_gradient_of_each_basis_function(device, degree):
     """The gradient of the direction, one coefficient at a time, equals autograd's on the polynomials."""
     coefficients, dirs, viewmats = inputs(torch.float64, device)
@@ -104,6 +104,6 @@ def test_unused_coefficients_get_no_gradient(device):
 
 def test_a_degree_out_of_range_is_refused():
     """The error names the range."""
-    for degree in (-1, 4):
-        with pytest.raises(ValueError, match="degree must be 0 to 3"):
+    for degree in (-1, 5):
+        with pytest.raises(ValueError, match="degree must be 0 to 4"):
             sh.coefficient_count(degree)

@@ -49,7 +49,7 @@ def test_colours_and_shapes_turn_with_the_scene(degree):
 
 def test_rotations_of_harmonics_are_orthogonal_and_compose():
     first, second = harmonics_rotation(TURN), harmonics_rotation(TURN @ TURN)
-    assert torch.allclose(first @ first.T, torch.eye(16, dtype=torch.float64), atol=1e-13)
+    assert torch.allclose(first @ first.T, torch.eye(25, dtype=torch.float64), atol=1e-13)
     assert torch.allclose(first @ first, second, atol=1e-13)
 
 
@@ -103,8 +103,8 @@ def test_what_disturbs_is_counted_once():
 
 def test_degrees():
     assert limit_degree(cloud(5, degree=3), 1).sh.shape[1] == 4
-    with pytest.raises(UsageError, match="degrees 0 to 3"):
-        limit_degree(cloud(5), 4)
+    with pytest.raises(UsageError, match="degrees 0 to 4"):
+        limit_degree(cloud(5), 5)
 
 
 def test_convert_says_what_it_did(tmp_path):

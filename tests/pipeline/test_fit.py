@@ -12,6 +12,7 @@ import warpgs
 from warpgs.app.cli import main
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
+from warpgs.export.formats import read_gaussians
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.request import NO_SCORES
 from warpgs.runtime.terminal import Detail
@@ -143,3 +144,23 @@ def test_a_run_of_a_scene_from_python_is_complete_but_for_the_scene(folder, tmp_
         warpgs.fit(scene, few, out=tmp_path / "x", resume=True)
     again = warpgs.fit(scene, few, out=tmp_path / "run", device="cpu", resume=True, verbose=False)
     assert torch.equal(again.gaussians().means, result.gaussians().means)
+
+
+def test_degree_4_is_fitted_and_stored(folder, tmp_path, capsys):
+    """All five degrees learn; the run, the model file and PLY hold them, SPZ holds degree 3, and the output says so."""
+    config, scene, out = (
+        dataclasses.replace(CONFIG, sh_degree=4, sh_every=2),
+        warpgs.load_scene(folder / "scene"),
+        tmp_path / "run",
+    )
+    result = warpgs.fit(scene, config, split=SPLIT, device="cpu", out=out, verbose=False)
+    made = result.gaussians()
+    assert made.sh.shape[1] == 25 and bool(made.sh[:, 16:].any())
+    warpgs.save(tmp_path / "model.safetensors", made, scene.normalization)
+    stored = warpgs.open_run(out, "cpu").gaussians(), warpgs.load(tmp_path / "model.safetensors").gaussians()
+    assert all(torch.equal(g.sh, made.sh) for g in stored)
+    for suffix, count in ((".ply", 25), (".spz", 16)):
+        capsys.readouterr()
+        assert main(["export", str(out), "--to", str(tmp_path / f"a{suffix}"), "--no-clean", "--rotate", "0,0,1,30"]) == 0
+        assert ("harmonics above degree 3 are dropped" in capsys.readouterr().out) == (count == 16)
+        assert read_gaussians(tmp_path / f"a{suffix}").sh.shape[1] == count

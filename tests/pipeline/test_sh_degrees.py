@@ -16,11 +16,12 @@ from warpgs.scene import Gaussians
 
 def test_coefficients_above_the_degree_vanish():
     """Band by band for every degree; what is left has that degree."""
-    sh = 1 + torch.rand(4, 16, 3)
-    cut = truncated(sh, torch.tensor([0, 1, 2, 3]))
-    for d, count in enumerate((1, 4, 9, 16)):
+    sh = 1 + torch.rand(5, 25, 3)
+    cut = truncated(sh, torch.tensor([0, 1, 2, 3, 4]))
+    for d, count in enumerate((1, 4, 9, 16, 25)):
         assert torch.equal(cut[d, :count], sh[d, :count]) and not bool(cut[d, count:].any())
-    assert stored_degrees(cut).tolist() == [0, 1, 2, 3]
+    assert stored_degrees(cut).tolist() == [0, 1, 2, 3, 4]
+    assert torch.equal(unpack(pack(cut, stored_degrees(cut)), stored_degrees(cut)), cut)
     assert stored_degrees(torch.zeros(2, 1, 3)).tolist() == [0, 0]
 
 

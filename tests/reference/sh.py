@@ -6,11 +6,11 @@ from scipy.special import sph_harm_y
 
 
 def basis_reference(dirs: torch.Tensor) -> torch.Tensor:
-    """Values [N, 16] at unit directions [N, 3], float64, no gradient."""
+    """Values [N, 25] at unit directions [N, 3], float64, no gradient."""
     x, y, z = dirs.detach().cpu().double().numpy().T
     polar, azimuth = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
     columns = []
-    for degree in range(4):
+    for degree in range(5):
         for order in range(-degree, degree + 1):
             value = sph_harm_y(degree, abs(order), polar, azimuth)
             if order == 0:

@@ -24,6 +24,15 @@ def colors_reference(sh: torch.Tensor, dirs: torch.Tensor, degree: int) -> torch
             (-sqrt(21 / (32 * pi)), x * (4 * z**2 - x**2 - y**2)), (sqrt(105 / (16 * pi)), z * (x**2 - y**2)),
             (-sqrt(35 / (32 * pi)), x * (x**2 - 3 * y**2)),
         ],
+        [
+            (sqrt(315 / (16 * pi)), x * y * (x**2 - y**2)), (-sqrt(315 / (32 * pi)), y * z * (3 * x**2 - y**2)),
+            (sqrt(45 / (16 * pi)), x * y * (6 * z**2 - x**2 - y**2)),
+            (-sqrt(45 / (32 * pi)), y * z * (4 * z**2 - 3 * x**2 - 3 * y**2)),
+            (sqrt(9 / (256 * pi)), 8 * z**4 - 24 * z**2 * (x**2 + y**2) + 3 * (x**2 + y**2) ** 2),
+            (-sqrt(45 / (32 * pi)), x * z * (4 * z**2 - 3 * x**2 - 3 * y**2)),
+            (sqrt(45 / (64 * pi)), (x**2 - y**2) * (6 * z**2 - x**2 - y**2)),
+            (-sqrt(315 / (32 * pi)), x * z * (x**2 - 3 * y**2)), (sqrt(315 / (256 * pi)), x**4 - 6 * x**2 * y**2 + y**4),
+        ],
     ]  # fmt: skip
     values = [c * p for row in rows[: degree + 1] for c, p in row]
     # a plain sum, not einsum, whose order and roundings a library chooses by the processor

@@ -149,7 +149,7 @@ def test_arguments_of_another_type_or_shape_are_named():
     skewed, large = np.array([[9.0, 0.1, 4], [0, 9, 4], [0, 0, 1]]), dataclasses.replace(cam, width=10**6, height=10**6)
     learned = RasterizeOptions(opacity_factors=torch.ones(3, requires_grad=True))
     wrong = [
-        (TypeError, "gaussians must be of Gaussians or ActivatedGaussians, not Camera", (cam, gaussians)),
+        (TypeError, "gaussians must be of Gaussians, ActivatedGaussians or CovarianceGaussians, not Camera", (cam, gaussians)),
         (TypeError, "options must be of RasterizeOptions, not str", (gaussians, cam, "fast")),
         (TypeError, "means must be a tensor, not ndarray", (dataclasses.replace(gaussians, means=np.zeros((3, 3))), cam)),
         (ValueError, r"camera.K must have shape \[3, 3\] or", (gaussians, dataclasses.replace(cam, K=torch.eye(4)))),
@@ -168,7 +168,11 @@ def test_arguments_of_another_type_or_shape_are_named():
         ),
         (TypeError, "camera.width must be a whole number of pixels, not 8.0", (gaussians, dataclasses.replace(cam, width=8.0))),
         (ValueError, r"background .*not \[4\]", (gaussians, cam, RasterizeOptions(background=torch.zeros(4)))),
-        (ValueError, r"K is 1, 4, 9 or 16, not \[3, 5, 3\]", (dataclasses.replace(gaussians, sh=torch.zeros(3, 5, 3)), cam)),
+        (
+            ValueError,
+            r"K is 1, 4, 9, 16 or 25, not \[3, 5, 3\]",
+            (dataclasses.replace(gaussians, sh=torch.zeros(3, 5, 3)), cam),
+        ),
     ]
     for kind, words, arguments in wrong:
         with pytest.raises(kind, match=words):

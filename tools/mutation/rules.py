@@ -58,6 +58,7 @@ OPS = {
     "compiler": ["kernels/test_blend.py"],
     "camera_reach": ["kernels/test_camera_reach.py"],
     "dropout": ["kernels/test_dropout.py"],
+    "covariance": ["render/test_covariances.py"],
     "falloff": [SPANS, "kernels/test_blend.py", LIMITS_BLEND],
     "functions": ["kernels/test_project.py", SPANS, LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_window.py"],
     "knn": ["kernels/test_knn.py", LIMITS],

@@ -105,7 +105,7 @@ class Format:
         """Write Gaussians as `warpgs.export.formats.write_gaussians` is asked to.
 
         Raises:
-            DataError: There is none, or a number is not finite or cannot be held.
+            DataError: There is none, or a number is not finite or cannot be held, or harmonics are of a higher degree.
         """
         if not len(gaussians):
             raise DataError(f"{path}: not written, the model holds no Gaussian. Use .ply for an empty model")
@@ -115,6 +115,12 @@ class Format:
             check_finite(path, arrays)
         if self.max_degree == 0:
             arrays["sh"] = arrays["sh"][:, :1]
+        elif gaussians.sh_degree > self.max_degree:
+            raise DataError(
+                f"{path}: not written, {self.suffix} files hold harmonics up to degree {self.max_degree}, not "
+                f"{gaussians.sh_degree}. Drop those above with --sh-degree {self.max_degree}, in Python with "
+                f"sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
+            )
         write_bytes(path, *self.encode(arrays))
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:

@@ -37,7 +37,7 @@ _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALE = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-_REST_COUNTS = (0, 9, 24, 45)
+_REST_COUNTS = (0, 9, 24, 45, 72)
 
 
 def write_ply(
@@ -53,7 +53,7 @@ def write_ply(
     Args:
         path: The file; an existing one is replaced.
         gaussians: N Gaussians, on any device: means [N, 3], quats wxyz of any length [N, 4], log scales [N, 3], logit opacities
-            [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16}.
+            [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
         normalization: Similarity from file to scene units, ``x_scene = scale * (x_file - offset)``: that of the scene that was
             fitted; needed where ``units`` is scene.
         units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
@@ -95,7 +95,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
 
     Returns:
         N Gaussians, torch float32 tensors on the CPU: means [N, 3], quats wxyz as stored [N, 4], log scales [N, 3], logit
-        opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16}.
+        opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
         warpgs.errors.DataError: The file is missing, malformed, cut short, or holds a NaN, another infinity or a rotation
@@ -183,7 +183,7 @@ def _check_properties(path: Path, vertex: Element) -> int:
         raise ply_error(path, f"property {twice[:40]!r} appears twice")
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:
-        raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 3 have 0, 9, 24 or 45")
+        raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
     # Normals carry nothing, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
     if missing == ["scale_2"]:
@@ -243,6 +243,7 @@ class PLY(Format):
     description = "layout of Kerbl et al. 2023, float32; every tool"
     cleaned = False
     declares = True
+    max_degree = 4
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
         """Write Gaussians with `write_ply`."""

@@ -7,6 +7,7 @@ import warp as wp
 
 from warpgs.constants import FARTHEST_PIXEL, LARGEST_AXIS, SHORTEST_QUAT, SMALLEST_DETERMINANT
 from warpgs.kernels.cameras.base import CAMERA_MODELS
+from warpgs.kernels.covariance import make_covariance
 
 
 @functools.cache
@@ -74,15 +75,16 @@ def make_types(real):
 
 
 @functools.cache
-def make_projection(real, camera_model: str, activated: bool = False):
+def make_projection(real, camera_model: str, parameters: str = "stored"):
     """Make the steps of the projection that forward and backward share (derivation: docs/project.md).
 
     Args:
         real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
-        activated: True for scales and opacities themselves; False for their logarithms and logits.
+        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
     """
     r = make_rotations(real)
+    factor = make_covariance(real).factor
     camera = CAMERA_MODELS.find(camera_model).make_functions(real)
     t = make_types(real)
     vec2 = t.vec2
@@ -102,7 +104,7 @@ def make_projection(real, camera_model: str, activated: bool = False):
         quat: vec4  # unit
         quat_length: real
         scales: vec3  # [u]
-        axes: mat33  # camera rotation times Gaussian rotation times scales [u]
+        axes: mat33  # camera rotation times Gaussian rotation times scales [u], or times the factor of the covariance
         m1: vec3  # rows of Jacobian times axes, times shrink
         m2: vec3
         shrink: real  # power of two that keeps the squares in range
@@ -124,13 +126,13 @@ def make_projection(real, camera_model: str, activated: bool = False):
 
     @wp.func
     def scales_of(stored: vec3) -> vec3:
-        if wp.static(activated):
+        if wp.static(parameters == "activated"):
             return stored
         return vec3(wp.exp(stored[0]), wp.exp(stored[1]), wp.exp(stored[2]))
 
     @wp.func
     def opacity_of(stored: real) -> real:
-        if wp.static(activated):
+        if wp.static(parameters != "stored"):
             return stored
         return sigmoid(stored)
 
@@ -151,16 +153,19 @@ def make_projection(real, camera_model: str, activated: bool = False):
         pixel = camera.pixel_of(e.position, K, lens)
         if not (wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)):
             return e
-        e.quat_length = r.quat_length(q)
-        if not (e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)):
-            return e
-        e.quat = q / e.quat_length
-        e.scales = scales_of(log_scale)
-        if not finite3(e.scales):  # the logarithm of 0 is -inf, and no error
-            return e
         e.pixel = pixel
         e.expansion_point = camera.expansion_point(pixel, width, height)
-        e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
+        if wp.static(parameters == "covariances"):
+            e.axes = rotation * factor(q, log_scale)  # NaN where there is none, which is culled below
+        else:
+            e.quat_length = r.quat_length(q)
+            if not (e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)):
+                return e
+            e.quat = q / e.quat_length
+            e.scales = scales_of(log_scale)
+            if not finite3(e.scales):  # the logarithm of 0 is -inf, and no error
+                return e
+            e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
         rows = camera.project_axes(e.position, K, lens, e.expansion_point, e.axes)
         m1 = rows.first
         m2 = rows.second
@@ -218,7 +223,7 @@ def make_projection(real, camera_model: str, activated: bool = False):
 
     return SimpleNamespace(
         Ellipse=Ellipse, ellipse=ellipse, compensation=compensation, sigmoid=sigmoid, opacity_of=opacity_of,
-        direction=direction, finite3=finite3,
+        direction=direction, finite3=finite3, project_axes=camera.project_axes,
         rotation=r.rotation, rotation_backward=r.rotation_backward,
         depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
         vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,

@@ -13,8 +13,8 @@ BLOCK = 128
 
 @functools.cache
 def make_functions():
-    """Make the functions, for CUDA; those on colours are for float32."""
-    vec12, vec16 = wp.types.vector(12, wp.float32), wp.types.vector(16, wp.float32)
+    """Make the functions, for CUDA; `make_color` has those on colours."""
+    vec12 = wp.types.vector(12, wp.float32)
 
     @wp.func_native(source("native_compact.cu", BLOCK=BLOCK))
     def compact(item: int, wanted: int) -> int:
@@ -54,26 +54,28 @@ def make_functions():
         """Return the first lane of the warp whose running sum exceeds ``item``; the last lane where none does."""
         ...
 
-    @wp.func_native(source("native_color.cu"))
-    def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16) -> wp.vec4:
+    return SimpleNamespace(
+        compact=compact, store_row=store_row, clear_rows=clear_rows, broadcast=broadcast,
+        running_sum=running_sum, whole_sum=whole_sum, holder=holder,
+    )  # fmt: skip
+
+
+@functools.cache
+def make_color(bases: int):
+    """Make the functions on colours, for CUDA and float32, and for a number of basis values (`sh.bases_for`)."""
+    values = wp.types.vector(bases, wp.float32)
+
+    @wp.func_native(source("native_color.cu", BASES=bases))
+    def color(sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: values) -> wp.vec4:
         """Return the weighted sum of the first ``count`` coefficients of row n, and their largest magnitude (ignoring NaN)."""
         ...
 
-    @wp.func_native(source("native_color_backward.cu"))
+    @wp.func_native(source("native_color_backward.cu", BASES=bases))
     def color_backward(
-        sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: vec16, v: wp.vec3, add: int,
+        sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: values, v: wp.vec3, add: int,
         v_sh: wp.array2d(dtype=wp.vec3),
-    ) -> vec16:  # fmt: skip
+    ) -> values:  # fmt: skip
         """Return the weights' gradient of `color` for upstream ``v``; store (0 past ``count``) or add that of the row."""
         ...
 
-    @wp.func_native(source("native_color_weights.cu"))
-    def color_weights(sh: wp.array2d(dtype=float), n: int, count: int, upstream: wp.vec3) -> vec16:
-        """Return the weights' gradient alone, of flat rows: sh [N, 3 K]."""
-        ...
-
-    return SimpleNamespace(
-        compact=compact, store_row=store_row, clear_rows=clear_rows, broadcast=broadcast,
-        running_sum=running_sum, whole_sum=whole_sum, holder=holder, color=color, color_backward=color_backward,
-        color_weights=color_weights,
-    )  # fmt: skip
+    return SimpleNamespace(color=color, color_backward=color_backward)

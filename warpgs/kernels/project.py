@@ -12,7 +12,7 @@ from warpgs.errors import UsageError
 from warpgs.kernels import sh
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.functions import make_projection, make_spans, make_types
-from warpgs.kernels.native import BLOCK
+from warpgs.kernels.native import BLOCK, make_color
 from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_backward import make_backward
 from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
@@ -40,21 +40,24 @@ def step_bytes(sizes: StepSizes) -> Needs:
 
 
 @functools.cache
-def make_forward(real, native: bool, camera_model: str, activated: bool = False, antialiased: bool = False):
+def make_forward(
+    real, native: bool, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
+):  # fmt: skip
     """Make the forward kernel.
 
     Args:
         real: wp.float32 or wp.float64.
         native: True for CUDA and float32.
         camera_model: Name of the camera model, whose functions are compiled in.
-        activated: True for scales and opacities themselves; False for their logarithms and logits.
+        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
         antialiased: True to multiply opacities by `compensation`.
+        bases: Number of basis values that a colour may have (`sh.bases_for`).
     """
-    m = make_projection(real, camera_model, activated)
+    m = make_projection(real, camera_model, parameters)
     s = make_spans(real)
-    basis = sh.make_functions(real).basis
+    basis = sh.make_functions(real, bases).basis
     vec3 = m.vec3
-    color_of = make_native().color if native else None
+    color_of = make_color(bases).color if native else None
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
@@ -63,7 +66,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False,
             projected[i, k] = values[k]
 
     store = make_native().store_row if native else store_values
-    variant = f"{'.activated' * activated}{'.antialiased' * antialiased}"
+    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
     module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}{variant}"
 
     @wp.func
@@ -128,7 +131,7 @@ def make_forward(real, native: bool, camera_model: str, activated: bool = False,
             color += vec3(shaded[0], shaded[1], shaded[2])
             largest = shaded[3]
         else:
-            for k in range(16):
+            for k in range(wp.static(bases)):
                 if k < sh_count:
                     color += y[k] * coefficients[n, k]
                     largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
@@ -214,7 +217,7 @@ def project_tensors(
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    kernel = make_forward(real, _native(means), settings.camera_model, settings.activated, settings.antialiased)
+    kernel = make_forward(real, _native(means), *settings.variant())
     interop.launch(kernel, cameras * count, arguments, means.device, cost=5)
     return projected, tile_counts
 
@@ -282,7 +285,7 @@ def project_gradients(
         int(wants_camera), *outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33),
     ]  # fmt: skip
     threads = -(-count // BLOCK) * BLOCK if native else count
-    kernel = make_backward(real, native, settings.camera_model, settings.activated, settings.antialiased)
+    kernel = make_backward(real, native, *settings.variant())
     interop.launch(kernel, threads, arguments, device, cost=10 * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]
@@ -326,7 +329,7 @@ def project(
         Ks: Intrinsics [px] with zero skew, shape [C, 3, 3].
         width: Image width [px].
         height: Image height [px].
-        degree: Spherical-harmonics degree used, 0 to 3.
+        degree: Spherical-harmonics degree used, 0 to 4.
         rule: Cut-offs.
         tile_size: Side of a tile [px].
         opacity_factors: Factors of the opacities, at least 0, shape [N]; None for 1. Not differentiable.
@@ -368,7 +371,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
         ValueError: A shape or device disagrees; the message names argument, wanted and found.
     """
     model = CAMERA_MODELS.find(settings.camera_model)
-    scales, opacities = ("scales", "opacities") if settings.activated else ("log_scales", "logit_opacities")
+    scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")
     sizes = interop.check(
         means=(inputs.means, "N 3"), quats=(inputs.quats, "N 4"),
         **{scales: (inputs.log_scales, "N 3"), opacities: (inputs.logit_opacities, "N")}, sh=(inputs.sh, "N K 3"),

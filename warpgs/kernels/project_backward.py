@@ -6,20 +6,23 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.kernels import sh
+from warpgs.kernels.covariance import make_covariance
 from warpgs.kernels.functions import make_projection
+from warpgs.kernels.native import make_color
 from warpgs.kernels.native import make_functions as make_native
 
 
 @functools.cache
-def make_functions(real, camera_model: str, activated: bool = False, antialiased: bool = False):
+def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int):
     """Make the functions that take the gradients of one projected Gaussian to those of its parameters."""
-    m = make_projection(real, camera_model, activated)
+    m = make_projection(real, camera_model, parameters)
     vec2 = m.vec2
     vec3 = m.vec3
     vec4 = m.vec4
-    vec16 = sh.make_functions(real).vec16
+    values = sh.make_functions(real, bases).values
     mat33 = m.mat33
-    basis_backward = sh.make_functions(real).basis_backward
+    basis_backward = sh.make_functions(real, bases).basis_backward
+    c = make_covariance(real)
 
     @wp.struct
     class ShapeGradient:
@@ -29,9 +32,35 @@ def make_functions(real, camera_model: str, activated: bool = False, antialiased
         quat: vec4
         log_scale: vec3
         position: vec3  # of the position in the camera
-        turned: mat33  # of camera rotation times Gaussian rotation
-        unit: vec4  # no gradient: the quaternion at length 1
+        turned: mat33  # of camera rotation times Gaussian rotation, or times the factor of the covariance
+        unit: vec4  # no gradient: the quaternion at length 1; not of covariances
         K: mat33
+
+    @wp.func
+    def covariance_2d(
+        e: m.Ellipse, projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, low_pass: real
+    ) -> vec3:  # fmt: skip
+        """Return the gradients of xx, of each xy and of yy of the projected covariance [px^2] (section 9)."""
+        u11 = projected[i, 2]
+        u12 = projected[i, 3]
+        u22 = projected[i, 4]
+        h11 = v_projected[i, 2] * u11 + v_projected[i, 3] * u12
+        h12 = v_projected[i, 3] * u22
+        h22 = v_projected[i, 4] * u22
+        V = real(-0.5) * vec3(
+            h11 * u11 * u11,
+            (h11 * u12 + h12 * u22) * u11,
+            (h11 * u12 + real(2.0) * h12 * u22) * u12 + h22 * u22 * u22,
+        )
+        if wp.static(antialiased):
+            compensation = m.compensation(e)
+            if compensation > real(0.0):
+                aa = wp.dot(e.m1, e.m1)
+                cc = wp.dot(e.m2, e.m2)
+                by_opacity = real(0.5) * v_projected[i, 5] * (projected[i, 5] / compensation) / compensation
+                by_opacity *= low_pass * e.shrink * e.shrink * e.shrink * e.shrink / e.det
+                V += by_opacity * (vec3(cc * e.c + e.b * e.b, -e.b * (cc + e.a), aa * e.a + e.b * e.b) / e.det)
+        return V
 
     @wp.func
     def shape(
@@ -81,26 +110,34 @@ def make_functions(real, camera_model: str, activated: bool = False, antialiased
         g0 = vec3(v_axes[0, 0], v_axes[0, 1], v_axes[0, 2])
         g1 = vec3(v_axes[1, 0], v_axes[1, 1], v_axes[1, 2])
         g2 = vec3(v_axes[2, 0], v_axes[2, 1], v_axes[2, 2])
-        if wp.static(activated):  # the axes divided by the scales, which may be 0
+        if wp.static(parameters == "activated"):  # the axes divided by the scales, which may be 0
             turned = rotation * m.rotation(e.quat)
             axes0 = vec3(turned[0, 0], turned[0, 1], turned[0, 2])
             axes1 = vec3(turned[1, 0], turned[1, 1], turned[1, 2])
             axes2 = vec3(turned[2, 0], turned[2, 1], turned[2, 2])
-        g.log_scale = wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
-        v_turned = v_axes * wp.diag(e.scales)  # gradient of camera rotation times Gaussian rotation
-        v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
-        g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
+        v_turned = v_axes  # gradient of camera rotation times Gaussian rotation, or of camera rotation times factor
+        if wp.static(parameters == "covariances"):
+            V = covariance_2d(e, projected, v_projected, i, low_pass)
+            rows = m.project_axes(e.position, K, lens, e.expansion_point, rotation)
+            packed = c.gradient(rows.first, rows.second, V[0], V[1], V[2])
+            g.quat = packed.off
+            g.log_scale = packed.diagonal
+        else:
+            g.log_scale = wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
+            v_turned = v_axes * wp.diag(e.scales)
+            v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
+            g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
 
         # mean in the image, Jacobian and depth -> position in the camera (section 3)
         v_pixel = vec2(v_projected[i, 0], v_projected[i, 1])
-        c = m.position_backward(
+        p = m.position_backward(
             e.position, K, lens, e.pixel, e.expansion_point, e.axes, v_m1, v_m2, v_pixel, v_projected[i, 9]
         )  # fmt: skip
-        g.position = c.v_position
+        g.position = p.v_position
         g.mean = wp.transpose(rotation) * g.position
         g.turned = v_turned
         g.unit = e.quat
-        g.K = c.v_K
+        g.K = p.v_K
         return g
 
     @wp.func
@@ -113,7 +150,7 @@ def make_functions(real, camera_model: str, activated: bool = False, antialiased
         return v_color
 
     @wp.func
-    def centered(d: vec4, w: vec16) -> vec3:
+    def centered(d: vec4, w: values) -> vec3:
         """Return the gradient of the mean by way of its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
         v_centered = vec3()
         if d[3] > real(0.0):
@@ -125,7 +162,7 @@ def make_functions(real, camera_model: str, activated: bool = False, antialiased
     @wp.func
     def logit(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
         """Return the gradient of the opacity's logit, or of the opacity itself (section 6)."""
-        if wp.static(activated):
+        if wp.static(parameters != "stored"):
             return v_projected[i, 5] * (projected[i, 5] / logit_opacity)  # the factor of the opacity, or 1
         return v_projected[i, 5] * projected[i, 5] * m.sigmoid(-logit_opacity)
 
@@ -133,7 +170,9 @@ def make_functions(real, camera_model: str, activated: bool = False, antialiased
 
 
 @functools.cache
-def make_backward(real, native: bool, camera_model: str, activated: bool = False, antialiased: bool = False):
+def make_backward(
+    real, native: bool, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
+):  # fmt: skip
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
     Args:
@@ -141,23 +180,25 @@ def make_backward(real, native: bool, camera_model: str, activated: bool = False
         native: True for CUDA and float32. The Gaussians that some camera sees are then dealt to the first threads of each
             block.
         camera_model: Name of the camera model, whose functions are compiled in.
-        activated: True for scales and opacities themselves; False for their logarithms and logits.
+        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
         antialiased: True where opacities were multiplied by `compensation`.
+        bases: Number of basis values that a colour may have (`sh.bases_for`).
     """
-    m = make_projection(real, camera_model, activated)
-    f = make_functions(real, camera_model, activated, antialiased)
-    functions = sh.make_functions(real)
+    m = make_projection(real, camera_model, parameters)
+    f = make_functions(real, camera_model, parameters, antialiased, bases)
+    c = make_covariance(real)
+    functions = sh.make_functions(real, bases)
     vec3 = m.vec3
     vec4 = m.vec4
-    vec16 = functions.vec16
+    values = functions.values
     mat33 = m.mat33
     compact = make_native().compact if native else None
     clear_rows = make_native().clear_rows if native else None
-    color_backward = make_native().color_backward if native else None
+    color_backward = make_color(bases).color_backward if native else None
 
     # four blocks to a multiprocessor
     registers = {"cuda_max_registers": 128} if native else {}
-    variant = f"{'.activated' * activated}{'.antialiased' * antialiased}"
+    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
     module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}{variant}"
 
     @wp.kernel(enable_backward=False, module=module, **registers)
@@ -223,12 +264,12 @@ def make_backward(real, native: bool, camera_model: str, activated: bool = False
                 d = m.direction(means[n], view)
                 basis = functions.basis(vec3(d[0], d[1], d[2]))
                 v_color = f.color(projected, v_projected, i)
-                w = vec16()
+                w = values()
                 if wp.static(native):
                     w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
                     stored += 1
                 else:
-                    for k in range(16):
+                    for k in range(wp.static(bases)):
                         if k < sh_count:
                             v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
                             w[k] = wp.dot(coefficients[n, k], v_color)
@@ -242,9 +283,11 @@ def make_backward(real, native: bool, camera_model: str, activated: bool = False
                         view[2, 0], view[2, 1], view[2, 2],
                     )  # fmt: skip
                     t = vec3(view[0, 3], view[1, 3], view[2, 3])
-                    v_rotation = (
-                        wp.outer(g.position, means[n]) + wp.outer(t, v_centered) + g.turned * wp.transpose(m.rotation(g.unit))
-                    )
+                    if wp.static(parameters == "covariances"):
+                        turning = c.factor(quats[n], log_scales[n])
+                    else:
+                        turning = m.rotation(g.unit)
+                    v_rotation = wp.outer(g.position, means[n]) + wp.outer(t, v_centered) + g.turned * wp.transpose(turning)
                     v_t = g.position + rotation * v_centered
                     v_view = m.mat44()
                     for row in range(3):

@@ -9,7 +9,12 @@ import torch
 
 from warpgs.constants import Rule
 from warpgs.errors import UsageError
+from warpgs.kernels import sh
 from warpgs.runtime import interop
+from warpgs.runtime.derivatives import first_order
+
+OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
+"""Rows and columns of the entries of a covariance above the diagonal, in the order in which they are packed."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +33,15 @@ class ProjectSettings:
     """Side of a tile [px]."""
     camera_model: str
     """Name of the camera model."""
-    activated: bool = False
-    """True where ``log_scales`` and ``logit_opacities`` of `ProjectInputs` hold scales and opacities themselves."""
+    parameters: str = "stored"
+    """Parameters in `ProjectInputs`: ``stored`` log scales and logits, ``activated`` scales and opacities, or ``covariances``
+    (as `packed_covariances` returns them) and opacities."""
     antialiased: bool = False
     """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)) (docs/project.md)."""
+
+    def variant(self) -> tuple[str, str, bool, int]:
+        """Return what the kernels are compiled for."""
+        return self.camera_model, self.parameters, self.antialiased, sh.bases_for(self.sh_count)
 
 
 class ProjectInputs(NamedTuple):
@@ -40,9 +50,9 @@ class ProjectInputs(NamedTuple):
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""
     quats: torch.Tensor
-    """Rotations wxyz, shape [N, 4]."""
+    """Rotations wxyz, or entries xy, xz, yz of covariances and a 0 (`ProjectSettings.parameters`), shape [N, 4]."""
     log_scales: torch.Tensor
-    """Logarithm of the axis lengths [u], or the lengths (`ProjectSettings.activated`), shape [N, 3]."""
+    """Logarithm of the axis lengths [u], the lengths, or the diagonals of covariances, shape [N, 3]."""
     logit_opacities: torch.Tensor
     """Inverse sigmoid of the opacity, or the opacity, shape [N]."""
     sh: torch.Tensor
@@ -79,3 +89,33 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
     if factors.requires_grad and torch.is_grad_enabled():
         raise UsageError("opacity_factors have no gradient: detach them, or multiply the opacities themselves")
     return factors.detach()
+
+
+class _PackedCovariances(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, covars):
+        off = covars.new_zeros(len(covars), 4)
+        for k, (i, j) in enumerate(OFF_DIAGONAL):
+            off[:, k] = 0.5 * covars[:, i, j] + 0.5 * covars[:, j, i]
+        return off, covars.diagonal(dim1=1, dim2=2).contiguous()
+
+    @staticmethod
+    @first_order
+    def backward(ctx, v_off, v_diagonal):
+        v_covars = torch.diag_embed(v_diagonal)
+        for k, (i, j) in enumerate(OFF_DIAGONAL):
+            v_covars[:, i, j] = v_covars[:, j, i] = 0.5 * v_off[:, k]
+        return (v_covars,)
+
+
+def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the symmetric part of covariances as `ProjectInputs` holds them. Differentiable.
+
+    Args:
+        covars: Covariances [u^2], shape [N, 3, 3].
+
+    Returns:
+        Entries xy, xz, yz and a 0, shape [N, 4], and the diagonals, shape [N, 3].
+    """
+    found: tuple[torch.Tensor, torch.Tensor] = _PackedCovariances.apply(covars)
+    return found

@@ -18,10 +18,11 @@ from warpgs.kernels.blend_channels import blend_channels
 from warpgs.kernels.heaviest import heaviest
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.project_inputs import ProjectInputs, checked_factors
+from warpgs.kernels.project_inputs import ProjectInputs, checked_factors, packed_covariances
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians
+from warpgs.runtime import interop
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
@@ -49,9 +50,7 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
     return tensor[None] if tensor.ndim == axes else tensor
 
 
-def inputs_of(
-    gaussians: Gaussians | ActivatedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None
-) -> ProjectInputs:
+def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
     """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
 
     Args:
@@ -60,7 +59,8 @@ def inputs_of(
         opacity_factors: Factors of the opacities, shape [N]; None for 1.
 
     Raises:
-        ValueError: The factors have another shape.
+        TypeError: The scalar types of means and covariances, or of the factors, differ.
+        ValueError: The covariances or the factors have another shape, or are on another device.
     """
     means = gaussians.means
     viewmats, Ks = as_batch(camera.viewmat, means), as_batch(camera.K, means)
@@ -69,7 +69,18 @@ def inputs_of(
     else:
         distortion = as_batch(camera.distortion, means, 1)
     factors = checked_factors(means, opacity_factors)
+    if isinstance(gaussians, CovarianceGaussians):
+        interop.check(means=(means, "N 3"), covars=(gaussians.covars, "N 3 3"))
+        _, covars, opacities, sh = gaussians.tensors().values()
+        return ProjectInputs(means, *packed_covariances(covars), opacities, sh, viewmats, Ks, distortion, factors)
     return ProjectInputs(*gaussians.tensors().values(), viewmats, Ks, distortion, factors)
+
+
+def parameters_of(gaussians: RasterizedGaussians) -> str:
+    """Return the kind of the Gaussians' parameters (`ProjectSettings.parameters`)."""
+    if isinstance(gaussians, CovarianceGaussians):
+        return "covariances"
+    return "activated" if isinstance(gaussians, ActivatedGaussians) else "stored"
 
 
 def settings_of(camera: Camera, degree: int, rule: Any, **others: Any) -> RenderSettings:

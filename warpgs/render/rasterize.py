@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 import torch
@@ -24,9 +25,11 @@ from warpgs.render.compose import (
     inputs_of,
     median_depth_of,
     needs_slots,
+    parameters_of,
     settings_of,
     weights_of,
 )  # fmt: skip
+from warpgs.render.lists import for_each
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.pixels import at_pixels, checked_pixels, listed_tiles, window_of
 from warpgs.render.settings import RenderSettings, Window
@@ -34,7 +37,7 @@ from warpgs.rules import rule_named
 from warpgs.runtime import interop
 from warpgs.runtime.derivatives import refuse_transforms
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Render
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
 
 TILE_SIZES = (8, 16)
 """Sides of a tile that the kernels can be made for [px]."""
@@ -45,7 +48,7 @@ colour is off by at most 2 e: an alpha moves its weight between its own colour a
 unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
 
 
-ARGUMENTS = ((Gaussians, ActivatedGaussians), (Camera,), (RasterizeOptions,))
+ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
@@ -78,7 +81,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     return replace(rule, near=near, far=far)
 
 
-def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions) -> None:
+def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
     Nothing is read from a GPU: a K there is taken as it is, other values are not checked, and a Gaussian that is not finite is
@@ -91,8 +94,9 @@ def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, 
     """
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
-            order = "the order is rasterize(gaussians, camera, options)"
-            wanted = " or ".join(kind.__name__ for kind in kinds)
+            listed = isinstance(given, (list, tuple))
+            order = "a list needs a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
+            wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
         raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
@@ -119,7 +123,7 @@ def _check_arguments(gaussians: Gaussians | ActivatedGaussians, camera: Camera, 
         raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
-        raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9 or 16, not {list(sh.shape)}")
+        raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
@@ -190,25 +194,35 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
+@overload
+def rasterize(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions = ...) -> Render: ...
+@overload
 def rasterize(
-    gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions = RasterizeOptions()
-) -> Render:
-    """Render Gaussians as one camera, or each camera of a batch, sees them.
+    gaussians: RasterizedGaussians | Sequence[RasterizedGaussians], camera: Sequence[Camera],
+    options: RasterizeOptions | Sequence[RasterizeOptions] = ...,
+) -> list[Render]: ...  # fmt: skip
+def rasterize(
+    gaussians: RasterizedGaussians | Sequence[RasterizedGaussians], camera: Camera | Sequence[Camera],
+    options: RasterizeOptions | Sequence[RasterizeOptions] = RasterizeOptions(),
+) -> Render | list[Render]:  # fmt: skip
+    """Render Gaussians as one camera, or each camera of a batch, sees them; for a list of cameras, one by one.
 
-    Differentiable in the five tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
+    Differentiable in the tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
     require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
     tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
     backgrounds are moved to the type and device of ``gaussians.means``. There are no second derivatives, torch.func is refused,
     and torch.compile breaks its graph here.
 
     Args:
-        gaussians: N Gaussians: by log scales and logits (`Gaussians`), or by scales and opacities (`ActivatedGaussians`).
-        camera: One camera ([4, 4], [3, 3]) or C of them ([C, 4, 4], [C, 3, 3]).
+        gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
+            covariances and opacities (`CovarianceGaussians`).
+        camera: One camera ([4, 4], [3, 3]), or C of them with images of one size ([C, 4, 4], [C, 3, 3]). Or a list of such, of
+            any sizes: ``gaussians`` and ``options`` are then one for all, or lists of the same length.
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera. ``render.means2d``, read before the backward
-        pass, holds the gradients of the projected means after it.
+        The images, without a leading axis for a single camera; a list of renders for a list of cameras. ``render.means2d``,
+        read before the backward pass, holds the gradients of the projected means after it.
 
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than there is.
@@ -217,12 +231,20 @@ def rasterize(
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
             a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range, or a pixel
-            outside the image.
+            outside the image. Or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
-        eager: Render = torch.compiler.disable(rasterize)(gaussians, camera, options)
+        eager: Render | list[Render] = torch.compiler.disable(rasterize)(gaussians, camera, options)
         return eager
+    if isinstance(camera, (list, tuple)):
+        return [_render(*each) for each in for_each(camera, gaussians=gaussians, options=options)]
+    one: tuple[Any, ...] = (gaussians, camera, options)
+    return _render(*one)
+
+
+def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> Render:
+    """Return what `rasterize` returns for one camera or a batch [C, ...] of them."""
     refuse_transforms()
     _check_arguments(gaussians, camera, options)
     rule = _checked_rule(camera, options)
@@ -234,7 +256,7 @@ def rasterize(
     if options.pixels is not None:
         pixels = checked_pixels(options.pixels, len(inputs.viewmats), inputs.means.device)
     window = _checked_window(camera, options) if pixels is None else window_of(pixels, camera, options.tile_size)
-    named |= {"window": window, "activated": isinstance(gaussians, ActivatedGaussians)}
+    named |= {"window": window, "parameters": parameters_of(gaussians)}
     settings = settings_of(camera, degree, rule, **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
@@ -257,9 +279,7 @@ def rasterize(
 
 
 @torch.no_grad()
-def _error_bound(
-    rgb: torch.Tensor, gaussians: Gaussians | ActivatedGaussians, camera: Camera, options: RasterizeOptions
-) -> torch.Tensor:
+def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
     """Return the bound of the error of colours [..., H, W, D], shape [..., H, W]; see `RasterizeOptions.error_bound`."""
 
     def doubled(holder: Any) -> dict[str, Any]:

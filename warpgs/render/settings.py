@@ -32,8 +32,8 @@ class RenderSettings:
     """Side of a tile [px]."""
     camera_model: str = "pinhole"
     """Name of the camera model."""
-    activated: bool = False
-    """True where scales and opacities are given themselves (`ProjectSettings.activated`)."""
+    parameters: str = "stored"
+    """Kind of the Gaussians' parameters (`ProjectSettings.parameters`)."""
     absgrad: bool = False
     """True to sum magnitudes of the gradients of projected means, too (`BlendSettings.absgrad`)."""
     antialiased: bool = False
@@ -42,7 +42,7 @@ class RenderSettings:
     def projection(self) -> ProjectSettings:
         """Return what the projection takes."""
         size, count = (self.width, self.height), sh.coefficient_count(self.degree)
-        variant = (self.camera_model, self.activated, self.antialiased)
+        variant = (self.camera_model, self.parameters, self.antialiased)
         return ProjectSettings(size, self.window, count, self.rule, self.tile_size, *variant)
 
     def of_window(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 const int size = sh.shape[1];
 const float* row = reinterpret_cast<const float*>(sh.data) + 3ll * size * n;
 float* v_row = reinterpret_cast<float*>(v_sh.data) + 3ll * size * n;
-wp::vec_t<16, float> w;
+wp::vec_t<BASES, float> w;
 auto give = [&](int i, float c, float& sum) {
     if (i < 3 * count) {
         w[i / 3] += c * v[i % 3];
@@ -12,7 +12,7 @@ if (size % 4 == 0) {
     // AHEAD loads before the stores that use them: the compiler cannot know that rows are apart, and would wait for each
     constexpr int AHEAD = 6;
     #pragma unroll
-    for (int first = 0; first < 12; first += AHEAD) {
+    for (int first = 0; first < (3 * BASES + 3) / 4; first += AHEAD) {
         float4 held[AHEAD];
         #pragma unroll
         for (int k = 0; k < AHEAD; ++k)
@@ -36,7 +36,7 @@ if (size % 4 == 0) {
     }
 } else {
     #pragma unroll
-    for (int k = 0; k < 16; ++k)
+    for (int k = 0; k < BASES; ++k)
         for (int channel = 0; channel < 3; ++channel)
             if (k < count) {
                 w[k] += row[3 * k + channel] * v[channel];
@@ -44,4 +44,7 @@ if (size % 4 == 0) {
             } else if (!add && k < size)
                 v_row[3 * k + channel] = 0.0f;
 }
+if (!add)
+    for (int i = 3 * BASES; i < 3 * size; ++i)
+        v_row[i] = 0.0f;
 return w;

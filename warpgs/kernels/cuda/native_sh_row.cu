@@ -1,8 +1,8 @@
-// Hand each number of a row of K x 3 floats to `take`. Rows are a multiple of 16 bytes for K = 4 and 16. What lies past the
+// Hand each number of a row of K x 3 floats to `take`. Rows are a multiple of 16 bytes for K = 4 and 16, not for 25. What lies past the
 // count is loaded along, and not used: it may be anything, a NaN too.
 if (size % 4 == 0) {
     #pragma unroll
-    for (int q = 0; q < 12; ++q)
+    for (int q = 0; q < (3 * BASES + 3) / 4; ++q)
         if (4 * q < 3 * count) {
             const float4 v = reinterpret_cast<const float4*>(row)[q];
             take(4 * q, v.x);
@@ -12,7 +12,7 @@ if (size % 4 == 0) {
         }
 } else {
     #pragma unroll
-    for (int i = 0; i < 48; ++i)
+    for (int i = 0; i < 3 * BASES; ++i)
         if (i < 3 * count)
             take(i, row[i]);
 }

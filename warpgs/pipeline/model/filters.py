@@ -14,7 +14,7 @@ import torch
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import matmul, quaternions, rotation_matrices
 from warpgs.input_files import read_input, unread_reason
-from warpgs.kernels.sh import basis
+from warpgs.kernels.sh import MAX_DEGREE, basis
 from warpgs.pipeline.model.coverage import SEEN
 from warpgs.pipeline.model.scale_limits import NEEDLE, ROUNDING, long_axes
 from warpgs.scene import Gaussians
@@ -26,10 +26,10 @@ NEEDLE_LENGTH = 0.2
 and edges of a good model. Of a tenth they cost up to 0.08 dB on held-out views (docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
 """Largest file of a box that is read [bytes]."""
-_NODES = ((-0.8611363115940526, 0.34785484513745385), (-0.33998104358485626, 0.6521451548625461))
-"""Nodes and weights of Gauss and Legendre's rule with four points, the other two mirrored: exact to degree 7."""
-_AZIMUTHS = 8
-"""Points of the rule around the axis, exact to order 7; products of harmonics of degree 3 have degree 6."""
+_NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
+"""Nodes and weights of Gauss and Legendre's rule with five points, the last two also mirrored: exact to degree 9."""
+_AZIMUTHS = 10
+"""Points of the rule around the axis, exact to order 9; products of harmonics of degree 4 have degree 8."""
 
 
 @dataclass(frozen=True)
@@ -151,22 +151,22 @@ def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:
     """Return the same Gaussians without the harmonics above a degree.
 
     Raises:
-        UsageError: The degree is not 0 to 3.
+        UsageError: The degree is not 0 to 4.
     """
-    if not 0 <= degree <= 3:
-        raise UsageError(f"--sh-degree {degree}: harmonics have degrees 0 to 3")
+    if not 0 <= degree <= MAX_DEGREE:
+        raise UsageError(f"--sh-degree {degree}: harmonics have degrees 0 to {MAX_DEGREE}")
     return replace(gaussians, sh=gaussians.sh[:, : (degree + 1) ** 2].contiguous())
 
 
 def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
-    """Return the matrix that turns coefficients with the scene, float64 [16, 16] (Wigner's D for degrees 0 to 3, real).
+    """Return the matrix that turns coefficients with the scene, float64 [25, 25] (Wigner's D for degrees 0 to 4, real).
 
-    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), which a product rule of 32 points takes exactly.
+    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), which a product rule of 50 points takes exactly.
 
     Args:
         rotation: The rotation, shape [3, 3].
     """
-    nodes = [*_NODES, *((-z, w) for z, w in _NODES)]
+    nodes = [*_NODES, *((-z, w) for z, w in _NODES[1:])]
     points, weights = [], []
     for z, weight in nodes:
         for i in range(_AZIMUTHS):

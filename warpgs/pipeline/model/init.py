@@ -363,7 +363,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, sh_degree: int, ext
     Args:
         cloud: At least one point.
         config: Opacity, and the factor of the widths.
-        sh_degree: Degree of the spherical harmonics, 0 to 3.
+        sh_degree: Degree of the spherical harmonics, 0 to 4.
         extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
         device: Device of the tensors, float32.
 

@@ -21,7 +21,7 @@ from warpgs.scene import Camera, Gaussians, Normalization
 from warpgs.version import __version__
 
 FORMAT = "warpgs-model-1"
-SH_COUNTS = (1, 4, 9, 16)
+SH_COUNTS = (1, 4, 9, 16, 25)
 """Numbers of coefficients that a set of Gaussians may have."""
 
 
@@ -164,7 +164,7 @@ def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussi
         if tuple(t.shape) != shape or t.dtype != kind or kind not in (torch.float32, torch.float64):
             raise DataError(
                 f"{where}: {name} has shape {list(t.shape)} and type {t.dtype}, where {count} Gaussians have "
-                f"{str(list(shape)).replace(chr(39), '')} and one type of float32 and float64, with K of 1, 4, 9 or 16; "
+                f"{str(list(shape)).replace(chr(39), '')} and one type of float32 and float64, with K of 1, 4, 9, 16 or 25; "
                 "restore it, or write it again"
             )
         if not bool(torch.isfinite(t).all()):

@@ -57,7 +57,8 @@ class FitConfig:
     """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md). None: by the number
     of views."""
     sh_degree: int | None = 3
-    """Highest spherical-harmonics degree of the colours, 0 to 3. None: by the number of views."""
+    """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files hold degree 4. None: by the number of
+    views."""
     sh_every: int = 1000
     """Number of steps after which the spherical-harmonics degree in use rises by one."""
     dropout: float = 0.0
