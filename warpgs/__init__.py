@@ -22,6 +22,7 @@ __all__ = [
     "FitResult",
     "Format",
     "Gaussians",
+    "GivenDepth",
     "LossTerm",
     "Model",
     "Normalization",
@@ -71,7 +72,7 @@ if TYPE_CHECKING:
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.rasterize import RasterizeOptions, rasterize
     from warpgs.render.select_rule import select_rule
-    from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Normalization, PointCloud, Render, Scene, View
+    from warpgs.scene import ActivatedGaussians, Camera, Gaussians, GivenDepth, Normalization, PointCloud, Render, Scene, View
 
 _HOMES = {
     name: module
@@ -95,8 +96,18 @@ _HOMES = {
         "warpgs.render.rasterize": ("RasterizeOptions", "rasterize"),
         "warpgs.render.select_rule": ("select_rule",),
         "warpgs.constants": ("Rule",),
-        "warpgs.scene": ("ActivatedGaussians", "Camera", "Gaussians", "Normalization", "PointCloud", "Render", "Scene", "View"),
-    }.items()
+        "warpgs.scene": (
+            "ActivatedGaussians",
+            "Camera",
+            "Gaussians",
+            "GivenDepth",
+            "Normalization",
+            "PointCloud",
+            "Render",
+            "Scene",
+            "View",
+        ),
+    }.items()  # fmt: skip
     for name in names
 }
 """Module of each public name: they load on first use, since torch and Warp cost seconds that `warpgs --help` must not pay."""
