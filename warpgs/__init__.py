@@ -107,7 +107,7 @@ _HOMES = {
             "Scene",
             "View",
         ),
-    }.items()  # fmt: skip
+    }.items()
     for name in names
 }
 """Module of each public name: they load on first use, since torch and Warp cost seconds that `warpgs --help` must not pay."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.io.decoding import MAX_PIXELS, decode
-from warpgs.io.given_maps import NOTHING_NAMED, GivenMaps, Named
+from warpgs.io.given_maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, list_images, load_image
 from warpgs.io.inside import inside, is_below
 from warpgs.io.readers import ReadOptions
@@ -103,7 +103,7 @@ class SceneFolder:
         downscale: int | None = None,
         mask: np.ndarray | None = None,
         background: tuple[float, float, float] = BLACK,
-        named: Named = NOTHING_NAMED,
+        named: NamedMaps = NOTHING_NAMED,
     ) -> LoadedImage:
         """Load an image of the scene as `load_image` does, and its maps of depth and normals.
 

@@ -19,7 +19,7 @@ DEPTHS, NORMALS = "--depths", "--normals"
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedMaps:
     """Maps that a scene itself names for an image."""
 
     depth: Path | None = None
@@ -30,7 +30,7 @@ class Named:
     """Length of one unit of the depth map in units of the cameras, where the scene has it."""
 
 
-NOTHING_NAMED = Named()
+NOTHING_NAMED = NamedMaps()
 """No maps."""
 
 
@@ -50,7 +50,7 @@ class GivenMaps:
 
         self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
 
-    def attached(self, loaded: LoadedImage, image: Path, named: Named = NOTHING_NAMED) -> LoadedImage:
+    def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
         """Return an image with its maps, in its own pixels; a folder of the user's comes before what the scene names.
 
         Raises:
@@ -127,24 +127,20 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
             raise MapFolder(path, flag, allow_outside).unmatched()
         if not having:
             continue
-        where = f"from {path}" if path is not None else f"named by the scene; {flag} none leaves them out"
+        where = f"from {path}" if path is not None else f"named by the scene ({flag} none leaves them out)"
         what = "normals" if name == "normals" else "depth maps"
-        notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)} ({where})")
+        notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)}, {where}")
     return notes
 
 
 def _about(name: str, views: Sequence[View], options: MapOptions) -> str:
     """Return words on the values of the maps, for a note."""
     if name == "normals":
-        return f"in {'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
+        return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
     share = float(np.mean([(v.depth.values > 0).mean() for v in views if v.depth is not None]))
-    kinds = {
-        "metric": "lengths along the camera's axis", "relative": "lengths of unknown scale and shift",
-        "disparity": "inverse lengths of unknown scale and shift",
+    unit = "a unit is 0.001 in whole numbers, else 1" if options.depth_unit is None else f"a unit is {options.depth_unit:g}"
+    words = {
+        "metric": f"metric ({unit}; change it with --depth-unit)", "relative": "depth of unknown scale and shift",
+        "disparity": "inverse depth of unknown scale and shift",
     }  # fmt: skip
-    unit = ""
-    if options.depth_kind == "metric":
-        given = options.depth_unit
-        unit = f", one unit is {given:g}" if given is not None else ", a unit is 0.001 in whole numbers, 1 in others"
-        unit += " of the cameras' units (--depth-unit)"
-    return f"{kinds[options.depth_kind]} at {share:.1%} of the pixels{unit}"
+    return f"{share:.1%} of their pixels, {words[options.depth_kind]}"

@@ -12,7 +12,7 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name_of
-from warpgs.io.given_maps import Named
+from warpgs.io.given_maps import NamedMaps
 from warpgs.io.images import BLACK, SUFFIXES, Lens
 from warpgs.io.map_files import SUFFIXES as MAPS
 from warpgs.io.pose_matrices import from_camera_to_world
@@ -183,7 +183,7 @@ class _Reading:
             return self.scene.mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"))
         return self.scene.find_mask(path, self.root / "images")
 
-    def named(self, file: Path, shared: dict, frame: dict, where: str) -> Named:
+    def named(self, file: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
         """Return the maps that a frame names, as nerfstudio does."""
 
         def path(key: str, flag: str) -> Path | None:
@@ -202,7 +202,7 @@ class _Reading:
                 raise ValueError(f"depth_unit_scale_factor is {unit}, not above 0")
         except ValueError as e:
             raise DataError(f"{where}: {e}") from e
-        return Named(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
+        return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
 
     def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
         where = f"{file}, frame {number}"
