@@ -173,5 +173,17 @@ def test_depth_by_a_network_takes_the_same_way():
         PriorConfig(depth_guides=True)
 
 
+@pytest.mark.cuda
+@pytest.mark.parametrize("batch", [1, 2])
+def test_recorded_steps_equal_single_steps(batch):
+    """On CUDA: maps are taken from the stacks by number, and the bits are those of steps one by one."""
+    config, device = dataclasses.replace(CONFIG, batch=batch), torch.device("cuda", 0)
+    fits = [Trainer(mapped(), seeds(), dataclasses.replace(config, cuda_graph=g), device) for g in (True, False)]
+    for fit in fits:
+        while fit.step < 24:
+            fit.advance(24 - fit.step)
+    assert same_bits(*fits)
+
+
 def test_names_of_the_terms_are_registered():
     assert LOSS_TERMS.find("given_depth") is GivenDepthDifference and LOSS_TERMS.find("given_normals") is GivenNormalsDifference
