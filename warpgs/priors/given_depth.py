@@ -25,6 +25,8 @@ NEAR = 0.05
 """Relative difference of depths up to which they count as one surface."""
 GOOD, MIN_GOOD = 0.1, 0.5
 """Relative difference of a fitted map from a reference that counts as good, and the least fraction of good ones."""
+EXACT = 0.015
+"""Median difference up to which a fitted map is taken for as good as a metric one; a network's is larger."""
 MIN_CONFIDENCE = 0.5
 """Confidence from which a given depth may place Gaussians."""
 ROUNDS = 20
@@ -144,6 +146,11 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     return made
 
 
+def exact(given: GivenDepth, made: Alignment | None) -> bool:
+    """Return whether a map is better than searched depth: a metric one, or one that fits it closely."""
+    return given.kind == "metric" or (made is not None and made.difference <= EXACT)
+
+
 def votes(
     views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -181,9 +188,9 @@ def with_given_depth(
 ) -> tuple[list[ViewDepth], list[str]]:
     """Return the depth of each view with what is given in it, and notes.
 
-    A metric depth counts unless more views look through it than confirm it, and comes before a searched one. A fitted depth
-    counts where another view confirms it and no searched one is there. ``ViewDepth.given`` has all depths of the maps that are
-    used, in scene units, without those that are contradicted.
+    A depth of an `exact` map counts unless more views look through it than confirm it, and comes before a searched one.
+    Another counts where a view confirms it and the search found nothing or something else. ``ViewDepth.given`` has all depths
+    of the maps that are used, in scene units, without those that are contradicted.
 
     Args:
         views: Training views, pinholes.
@@ -214,8 +221,9 @@ def with_given_depth(
         own = (given[i] > 0) & (through <= confirm)
         removed, total = removed + int(((given[i] > 0) & ~own).sum()), total + int((given[i] > 0).sum())
         placing = own if view.depth.confidence is None else own & (view.depth.confidence >= MIN_CONFIDENCE)
-        if view.depth.kind != "metric":
-            placing = placing & (confirm > 0) & ~d.valid
+        if not exact(view.depth, made[i]):
+            outlier = np.abs(d.depth - given[i]) > NEAR * given[i]
+            placing = placing & (confirm > 0) & (~d.valid | outlier)
         after.append(replace(
             d, depth=np.where(placing, given[i], d.depth).astype(np.float32), valid=d.valid | placing,
             sensitivity=np.where(placing, 0, d.sensitivity).astype(np.float32), given=np.where(own, given[i], 0),

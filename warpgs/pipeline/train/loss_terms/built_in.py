@@ -23,7 +23,7 @@ class LossConfig:
     alpha_weight: float = 1.0
     """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
 
-    depth_weight: float = 0.1
+    depth_weight: float = 0.3
     """Weight of the difference of rendered and given inverse depth, in views with given depth, in [0, 1000]; 0 for no such
     term."""
     normal_weight: float = 0.1

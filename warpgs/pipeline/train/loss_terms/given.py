@@ -53,7 +53,7 @@ class GivenDepthDifference(LossTerm):
     """The weighted difference of rendered and given inverse depth, 0 in views without given depth."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
-    weight: float = 0.1
+    weight: float = 0.3
     """Weight of the term, in [0, 1000]."""
 
     def __post_init__(self) -> None:
