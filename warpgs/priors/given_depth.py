@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from warpgs import geometry
-from warpgs.errors import DataError
+from warpgs.errors import DataError, UsageError
 from warpgs.priors.epipolar import nearest_views
-from warpgs.scene import GivenDepth, PointCloud, View, ViewDepth
+from warpgs.scene import DEPTH_KINDS, GivenDepth, PointCloud, View, ViewDepth
 
 MIN_OVERLAP = 50
 """Fewest references of a view that a map is compared with or fitted to."""
@@ -67,6 +67,32 @@ class Alignment:
 def any_given(views: Sequence[View]) -> bool:
     """Return whether depth is given of a view."""
     return any(v.depth is not None for v in views)
+
+
+def check_given(views: Sequence[View]) -> None:
+    """Check the given maps of views that were made in Python; those that `load_scene` read are right.
+
+    Raises:
+        UsageError: A map has another size than its image, an unknown kind, or values that no depth or normal has.
+    """
+    for v in views:
+        size = v.image.shape[:2]
+        maps = {} if v.depth is None else {"depth": v.depth.values, "confidence": v.depth.confidence}
+        for name, found in {**maps, "normals": v.normals}.items():
+            if found is None:
+                continue
+            wanted = (*size, 3) if name == "normals" else size
+            if found.shape != wanted:
+                raise UsageError(
+                    f"view {v.name}: the map of {name} has shape {list(found.shape)}, the image needs {list(wanted)}"
+                )
+            low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
+            if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
+                raise UsageError(
+                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; 0 stands for none"
+                )
+        if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
+            raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
 
 
 def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:

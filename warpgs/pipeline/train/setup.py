@@ -22,7 +22,7 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.sampling_event import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
-from warpgs.priors.given_depth import any_given, with_given_depth
+from warpgs.priors.given_depth import any_given, check_given, with_given_depth
 from warpgs.priors.pinhole_views import lens_depth, pinhole_view
 from warpgs.priors.view_prior import view_priors
 from warpgs.runtime.terminal import Detail
@@ -61,13 +61,15 @@ def prepare(
 
     Raises:
         DataError: There is nothing to start from.
-        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. Or the start or
+        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. A given map is of
+            another size or not finite. Or the start or
             the strategy compares views, and a camera is no pinhole.
     """
     for view in train:
         check_camera(view.camera)
     _check_models(train, config)  # before anything takes time
     check_points(train, points, config.init)
+    check_given(train)
     where = device if config.memory_limit is None else torch.device("cpu")
 
     def usable() -> torch.device:
