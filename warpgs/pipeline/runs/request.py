@@ -59,8 +59,8 @@ class SceneRequest:
     """Treatment of lens distortion: undistort (images become those of a pinhole) or native (the model is rendered through the
     lens; the only way to read fisheyes)."""
     depths: str | None = None
-    """Folder of depth maps, 16-bit PNG or NPY, named as the images are; they place the first Gaussians and guide the fit. None
-    for those that transforms.json names, none for none at all."""
+    """Folder of depth maps, 16-bit PNG or NPY, named as the images are; they place the first Gaussians and guide the fit. By
+    default those that transforms.json names; the word none ignores them."""
     normals: str | None = None
     """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, likewise."""
     depth_kind: str = "metric"

@@ -26,7 +26,7 @@ class LossConfig:
     depth_weight: float = 0.3
     """Weight of the difference of rendered and given inverse depth, in views with given depth, in [0, 1000]; 0 for no such
     term."""
-    normal_weight: float = 0.1
+    normal_weight: float = 0.03
     """Weight of 1 - cos between given normals and those of rendered depth, in views with given normals, in [0, 1000]; 0 for no
     such term."""
 

@@ -104,7 +104,7 @@ class GivenNormalsDifference(LossTerm):
     """The weighted 1 - cos between given normals and those of rendered depth, 0 in views without; for pinholes."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
-    weight: float = 0.1
+    weight: float = 0.03
     """Weight of the term, in [0, 1000]."""
 
     def __post_init__(self) -> None:
