@@ -47,6 +47,22 @@ class Camera:
         return center
 
 
+DEPTH_KINDS = ("metric", "relative", "disparity")
+"""Meanings of a given depth map: lengths; lengths up to a scale and a shift; inverse lengths up to a scale and a shift."""
+
+
+@dataclass(frozen=True)
+class GivenDepth:
+    """Depth of the pixels of one view from outside the photographs: a sensor, a laser scan or a network."""
+
+    values: np.ndarray
+    """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 where there is none."""
+    kind: str = "metric"
+    """Unit of the values, one of `DEPTH_KINDS`: metric [u], or an unknown scale and shift of each view."""
+    confidence: np.ndarray | None = None
+    """Confidence in each value, in [0, 1], float32, shape [H, W]; None for 1 everywhere."""
+
+
 @dataclass(frozen=True)
 class View:
     """An image with its camera."""
@@ -67,6 +83,11 @@ class View:
     alpha_estimated: bool = False
     """True where ``alpha`` was estimated from a black background: it says where Gaussians start and what is scored. The loss
     does not use it, since dark parts of the object may be taken for background."""
+    depth: GivenDepth | None = None
+    """Depth from outside, for the start and the loss of a fit; None where none is given."""
+    normals: np.ndarray | None = None
+    """Normals from outside, unit vectors towards the camera in its axes (+x right, +y down, +z forward), float32, shape
+    [H, W, 3]; 0 where there is none. None where none are given."""
 
 
 @dataclass(frozen=True)
@@ -191,6 +212,8 @@ class ViewDepth:
     """Messages for the user: pairs left out, files missing, nothing found."""
     searched: bool = True
     """False where the view's depth was not looked for, because there are others enough."""
+    given: np.ndarray | None = None
+    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 where there is none; None without a map."""
 
     @property
     def coverage(self) -> float:

@@ -19,7 +19,7 @@ from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 
 BASE = ["SCENE", "--out", "RUN"]
-SCENE_FIELDS = {"split", "downscale", "max_side", "masks"}
+SCENE_FIELDS = {"split", "downscale", "max_side", "masks", "depths"}
 
 
 def printed(capsys, *words):

@@ -13,7 +13,7 @@ from tests.faults.bombs import many_rows, rarely
 from tests.faults.mutations import Change, json_value, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
-from warpgs.io import colmap, dtu, llff, load, middlebury, transforms
+from warpgs.io import colmap, dtu, given_maps, llff, load, map_files, middlebury, transforms
 from warpgs.scene import Scene
 
 MAX_PIXELS = 10_000
@@ -129,6 +129,56 @@ add("transforms", FRAMES, (transforms,), (rarely(many_rows, json_value), json_va
 add("llff", {"a": scenes.write_llff}, (llff,), (matrices_changed,))
 add("dtu", {"a": write_dtu}, (dtu,), (matrices_changed,))
 add("middlebury", {"a": scenes.write_middlebury}, (middlebury,), TEXT)
+
+
+def write_maps(folder: Path) -> list[Path]:
+    """Write maps of every kind for the images of a scene each."""
+    shape = (scenes.HEIGHT, scenes.WIDTH)
+    x = np.broadcast_to(np.linspace(-0.4, 0.4, scenes.WIDTH), shape)
+    normals = np.stack([x, 0 * x, -np.sqrt(1 - x**2)], -1).astype(np.float32)
+    metres = np.linspace(1, 3, x.size, dtype=np.float32).reshape(shape)
+    for kind in ("png", "npy"):
+        scenes.write_colmap(folder / kind)
+        for name in ("depths", "normals"):
+            (folder / kind / name).mkdir()
+    scenes.save(folder / "png" / "depths" / "photo1.png", (1000 * metres).astype(np.uint16))
+    scenes.save(folder / "png" / "depths" / "photo1.confidence.png", np.full(shape, 200, np.uint8))
+    scenes.save(folder / "png" / "normals" / "photo1.png", np.round((normals + 1) * 127.5).astype(np.uint8))
+    np.save(folder / "npy" / "depths" / "photo1.npy", metres)
+    np.save(folder / "npy" / "depths" / "photo1.confidence.npy", metres / 3)
+    np.save(folder / "npy" / "normals" / "photo1.npy", normals)
+    return sorted(p for kind in ("png", "npy") for name in ("depths", "normals") for p in (folder / kind / name).iterdir())
+
+
+def read_mapped(folder: Path, path: Path) -> Scene:
+    root = folder / path.relative_to(folder).parts[0]
+    return load.load_scene(root, max_pixels=MAX_PIXELS, depths=root / "depths", normals=root / "normals")
+
+
+def nonsense_of_maps(scene: Scene) -> str:
+    """Say what of the maps no part of a fit should have to check."""
+    for v in scene.views:
+        depth, size = v.depth, (v.camera.height, v.camera.width)
+        sure = None if depth is None else depth.confidence
+        if bad := not_finite(depth=None if depth is None else depth.values, confidence=sure, normals=v.normals):
+            return bad
+        if depth is not None and not (depth.values.shape == size and depth.values.min() >= 0 and depth.values.any()):
+            return "a depth map is none"
+        if sure is not None and not (sure.shape == size and sure.min() >= 0 and sure.max() <= 1):
+            return "a confidence is none"
+        if v.normals is not None:
+            lengths = np.linalg.norm(v.normals, axis=-1)
+            if v.normals.shape != (*size, 3) or not ((lengths == 0) | (np.abs(lengths - 1) < 1e-4)).all():
+                return "normals are none"
+    return nonsense(scene)
+
+
+register(
+    Target(
+        "given maps", write_maps, read_mapped, (map_files, given_maps), (matrices_changed,), nonsense=nonsense_of_maps,
+        lines=0.7,
+    )
+)  # fmt: skip
 
 
 def write_masked(folder: Path) -> list[Path]:

@@ -35,6 +35,7 @@ READERS = {
     "io/dtu.py": {"_read_matrices": "dtu"},
     "io/image_formats/avif.py": {"open_image": "avif"},
     "io/llff.py": {"read_rows": "llff"},
+    "io/map_files.py": {"_read_array": "given maps"},
     "io/middlebury.py": {"read_rows": "middlebury"},
     "io/transforms.py": {"read_json": "transforms"},
     "pipeline/farm/ensure_run.py": {"_scores": "scores"},

@@ -13,6 +13,7 @@ FLAGS = (
     ("--seed", "N", "0", "seed of every random choice"),
     ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
     ("--masks", "HOW", "ignore", "masked out: ignore it, or cutout: transparent"),
+    ("--depths", "FOLDER", "", "depth maps, named as the images (docs/scenes.md)"),
     ("--resume", "", "False", "continue the run in --out from its last checkpoint"),
     ("--view", "", "False", "watch in a browser while it trains"),
 )

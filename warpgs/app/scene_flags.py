@@ -6,6 +6,7 @@ from typing import Any
 
 from warpgs.app.flags import flags_of, settings_of
 from warpgs.app.own_code import load_own
+from warpgs.io.map_files import NONE
 from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import SceneRequest
 
@@ -35,5 +36,6 @@ def scene_of(flags: Any, path: str) -> SceneRequest:
     if asked.reader is not None:
         reader = asked.reader
         load_own(READERS.kind, reader, lambda: READERS.load(reader))
-    masks = None if asked.score_masks is None else os.path.realpath(asked.score_masks)
-    return dataclasses.replace(asked, path=path, score_masks=masks)
+    named = {n: getattr(asked, n) for n in ("score_masks", "depths", "normals")}
+    found = {n: p if p is None or (p == NONE and n != "score_masks") else os.path.realpath(p) for n, p in named.items()}
+    return dataclasses.replace(asked, path=path, **found)

@@ -9,7 +9,7 @@ import numpy as np
 
 from warpgs.errors import DataError, ResourceError
 from warpgs.input_files import read_input, read_start, unread_reason
-from warpgs.io.image_formats import avif, jpeg
+from warpgs.io.image_formats import avif, jpeg, png
 from warpgs.io.image_formats.kinds import format_of
 from warpgs.io.unread_formats import unread_format
 
@@ -96,6 +96,20 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
 def _too_large(path: Path, pixels: int) -> str:
     needed = BYTES_PER_PIXEL * pixels / 2**30
     return f"{path}: {needed:.1f} GiB to decode the image are not free; shrink it, or end other programs"
+
+
+def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Decode a PNG to its numbers as stored, uint8 or uint16, shape [H, W] or [H, W, C] with colours in RGB order.
+
+    Raises:
+        DataError: The file is missing, no PNG, too large, or damaged.
+        ResourceError: There is not enough memory for it.
+    """
+    data = read_image_file(path, max_pixels)
+    if not data.startswith(png.SIGNATURE):
+        raise DataError(f"{path}: is not a PNG, whatever its name says; save it as 16-bit PNG or NPY")
+    raw = _raster(path, data, max_pixels)
+    return raw if raw.ndim == 2 else np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[2]]])
 
 
 def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:

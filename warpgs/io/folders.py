@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import posixpath
 from collections import Counter
 from collections.abc import Callable
@@ -13,7 +12,9 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.io.decoding import MAX_PIXELS, decode
+from warpgs.io.given_maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, list_images, load_image
+from warpgs.io.inside import inside, is_below
 from warpgs.io.readers import ReadOptions
 from warpgs.io.unread_formats import unread_note
 from warpgs.scene import Camera, View
@@ -53,7 +54,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
     path = folder / name
     if "\\" in name and not path.is_file():
         path = folder / name.replace("\\", "/")  # written on Windows
-    if not allow_outside and not _is_below(path, root or folder):
+    if not allow_outside and not is_below(path, root or folder):
         raise DataError(f"{where}: {name!r} leads out of the scene folder; move the file inside, or pass --allow-outside")
     return path
 
@@ -80,6 +81,7 @@ class SceneFolder:
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
         self._reduced = False
+        self._maps = GivenMaps(options.maps, options.max_pixels, options.allow_outside)
 
     def inside(self, path: Path) -> Path:
         """Return a path after a check that no link on it leads out of the scene folder, unless that is allowed.
@@ -101,8 +103,9 @@ class SceneFolder:
         downscale: int | None = None,
         mask: np.ndarray | None = None,
         background: tuple[float, float, float] = BLACK,
+        named: NamedMaps = NOTHING_NAMED,
     ) -> LoadedImage:
-        """Load an image of the scene as `load_image` does.
+        """Load an image of the scene as `load_image` does, and its maps of depth and normals.
 
         Args:
             path: The image file.
@@ -110,6 +113,7 @@ class SceneFolder:
             downscale: Factor by which both sides shrink, where a ready-made folder leaves another than the user's.
             mask: How far a pixel is kept, in [0, 1], shape [H, W], as the method `mask` reads it.
             background: Colour in [0, 1] behind transparent pixels.
+            named: Maps that the scene names for it.
 
         Returns:
             The image, float32, shape [H, W, 3], with intrinsics for its size.
@@ -125,7 +129,7 @@ class SceneFolder:
             native=self.options.lenses == "native",
         )  # fmt: skip
         self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
-        return loaded
+        return self._maps.attached(loaded, path, named)
 
     def mask(self, path: Path) -> np.ndarray:
         """Return a mask file of the scene, how far it keeps each pixel: float32 [H, W], 0 not at all, 1 wholly."""
@@ -183,22 +187,6 @@ def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) ->
     return gray if keeps == "white" else 1 - gray
 
 
-def inside(path: Path, root: Path, noun: str) -> Path:
-    """Return a path after a check that no link on it leads out of ``root``, which messages call ``noun``.
-
-    Raises:
-        DataError: One does.
-    """
-    if not _is_below(path, root):
-        raise DataError(f"{path}: a link leads out of {noun}; put the files inside of it, or pass --allow-outside")
-    return path
-
-
-def _is_below(path: Path, root: Path) -> bool:
-    """Return True where a path lies below ``root``, links followed; a link that leads round in circles is where it lies."""
-    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))
-
-
 def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str]:
     ready = root / f"{base}_{downscale}"
     if downscale > 1 and ready.is_dir() and list_images(ready):
@@ -244,7 +232,8 @@ class ViewList:
         """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
         height, width = loaded.image.shape[:2]
         camera = Camera(viewmat, loaded.K, width, height, loaded.camera_model, loaded.distortion)
-        self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha))
+        maps = {"depth": loaded.depth, "normals": loaded.normals}
+        self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha, **maps))
         self._done.update(loaded.done)
         if loaded.kept is not None:
             self._kept[name] = loaded.kept

@@ -13,6 +13,7 @@ from warpgs import lenses
 from warpgs.errors import DataError, UsageError
 from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
 from warpgs.io.exif import read_exif
+from warpgs.scene import GivenDepth
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
@@ -87,6 +88,16 @@ class LoadedImage:
     """Camera model of the pixels, as `Camera.model`."""
     distortion: np.ndarray | None = None
     """Coefficients of the camera model, as `Camera.distortion`."""
+    orientation: int = 1
+    """EXIF orientation by which the stored raster was turned, 1 to 8; 1 for not at all."""
+    full_size: tuple[int, int] = (0, 0)
+    """Height and width [px] before the image was resized, upright."""
+    undone: Lens | None = None
+    """Lens whose distortion was undone at that size; None for none."""
+    depth: GivenDepth | None = None
+    """Given depth of its pixels, a metric one in units of the file; None for none."""
+    normals: np.ndarray | None = None
+    """Given normals of its pixels, as `View.normals`; None for none."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -133,14 +144,30 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
     return 1 / largest if largest > MIN_FOLD else np.inf
 
 
+def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns and rows of the stored raster that the pixels of a pinhole [H, W] show, as OpenCV counts them.
+
+    Args:
+        K: Intrinsics [px] of both at this size, shape [3, 3].
+        lens: Lens with the distortion.
+        width: Width [px].
+        height: Height [px].
+    """
+    import cv2
+
+    K = K.copy()
+    K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
+    return cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
+
+
 def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     """Resample to a pinhole of the same K; pixels that the lens never saw leave the mask."""
     import cv2
 
     height, width = loaded.image.shape[:2]
+    map_x, map_y = undistortion_maps(loaded.K, lens, width, height)
     K = loaded.K.copy()
-    K[:2, 2] -= 0.5  # OpenCV's pixel centres are at whole numbers
-    map_x, map_y = cv2.initUndistortRectifyMap(K, np.array(lens.distortion), None, K, (width, height), cv2.CV_32FC1)
+    K[:2, 2] -= 0.5
     image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
     # where the polynomial turns back, the map leads into the image again but to a ray that the lens sent elsewhere
@@ -317,11 +344,13 @@ def load_image(
     loaded = _with_mask(path, LoadedImage(image, mask, K, done, alpha), cutout)
     if not native and (lens.fisheye or len(lens.distortion) > 5):
         raise DataError(f"{path}: an image of a {lens.model} lens is not undistorted here; keep the lens by --lenses native")
-    if not native and any(lens.distortion):
-        loaded = _undistort(loaded, lens)
+    undone = lens if not native and any(lens.distortion) else None
+    if undone is not None:
+        loaded = _undistort(loaded, undone)
     loaded = _shrink(path, loaded, downscale, max_side)
     if native and (lens.fisheye or any(lens.distortion)):
         loaded = _native(loaded, lens)
     if loaded.mask is not None and not loaded.mask.any():
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; check all three")
+    loaded = replace(loaded, orientation=orientation, full_size=(height, width), undone=undone)
     return _over_background(loaded, background)

@@ -13,8 +13,10 @@ from warpgs.errors import DataError, UsageError
 from warpgs.io.black_background import cut_from_black
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.folders import SceneFolder
+from warpgs.io.given_maps import check_found
 from warpgs.io.image_formats.kinds import READ
 from warpgs.io.images import list_images
+from warpgs.io.map_files import NO_MAPS, MapOptions
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
 from warpgs.io.pose_matrices import rigid
 from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader, image_scale
@@ -37,6 +39,11 @@ def load_scene(
     score_masks: str | Path | None = None,
     max_pixels: int = MAX_PIXELS,
     lenses: str = "undistort",
+    depths: str | Path | None = None,
+    normals: str | Path | None = None,
+    depth_kind: str = "metric",
+    depth_unit: float | None = None,
+    normal_axes: str = "opencv",
     progress: Callable[[str], object] | None = None,
 ) -> Scene:
     """Read a scene folder of any supported format.
@@ -64,6 +71,14 @@ def load_scene(
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
         lenses: Treatment of lens distortion: undistort (images become those of a pinhole) or native (images stay as they are,
             and ``Camera.model`` is opencv or fisheye with ``Camera.distortion``; the only way to read fisheyes).
+        depths: Folder of depth maps, 16-bit PNG or NPY, named as the images are (docs/scenes.md, "Depth and normals"); None
+            for those that transforms.json names, ``none`` for none at all.
+        normals: Folder of normal maps, likewise.
+        depth_kind: Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths up to a scale and a
+            shift of each view) or disparity (inverse lengths up to a scale and a shift).
+        depth_unit: Length of one unit of a metric depth map in units of the cameras; None for 0.001 in whole numbers and 1 in
+            others.
+        normal_axes: Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera.
         progress: Called with a line for the user before each image is decoded; None for nothing.
 
     Returns:
@@ -72,13 +87,15 @@ def load_scene(
     Raises:
         DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
         ResourceError: There is not enough memory to decode an image.
-        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``masks``, ``mask_keeps`` or
-            ``lenses`` is another word, or there is no such reader.
+        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``depth_unit`` is not above 0, a choice
+            is another word, or there is no such reader.
     """
     root, (factor, side) = Path(path), image_scale(downscale, max_side)
+    given = [None if p is None else Path(p) for p in (depths, normals)]
+    maps = MapOptions(given[0], given[1], depth_kind, depth_unit, normal_axes)
     options = ReadOptions(
         factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side,
-        lenses=lenses, on_image=_counted(root, progress),
+        lenses=lenses, maps=maps, on_image=_counted(root, progress),
     )  # fmt: skip
     try:
         _check_folder(root)
@@ -163,6 +180,7 @@ def _finished(
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more
+    more = (*more, *check_found(views, options.maps, options.allow_outside))
     n: Normalization = normalization_of(views, points, str(root))
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
@@ -170,7 +188,8 @@ def _finished(
     if score_masks is not None or (root / FOLDER).is_dir():
         # a folder that the user names is its own bound, that of the scene must not lead out of it
         masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
-        views, note = add_score_masks(views, masks, SceneFolder(bound, replace(options, mask_keeps="white")))
+        plain = replace(options, mask_keeps="white", maps=NO_MAPS)
+        views, note = add_score_masks(views, masks, SceneFolder(bound, plain))
         more = (*more, note)
     return replace(
         scene,
@@ -196,6 +215,9 @@ def _check_views(root: Path, views: list[View]) -> None:
         wanted = [
             ("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool), ("alpha", v.alpha, size, np.float32),
         ]  # fmt: skip
+        if v.depth is not None:
+            wanted += [("depth", v.depth.values, size, np.float32), ("confidence", v.depth.confidence, size, np.float32)]
+        wanted.append(("normals", v.normals, (*size, 3), np.float32))
         for noun, array, shape, dtype in wanted:
             if array is not None and (array.shape != shape or array.dtype != dtype):
                 raise DataError(

@@ -45,10 +45,13 @@ def normalization_of(views: list[View], points: PointCloud | None, where: str) -
 
 
 def normalize_view(view: View, n: Normalization) -> View:
-    """Return the view with its camera in scene coordinates (float64); rotation and intrinsics stay as they are."""
+    """Return the view with camera (float64) and metric depth in scene coordinates; rotation and intrinsics stay."""
     viewmat = view.camera.viewmat.copy()
     viewmat[:3, 3] = n.scale * (matmul(viewmat[:3, :3], n.offset) + viewmat[:3, 3])
-    return replace(view, camera=replace(view.camera, viewmat=viewmat))
+    depth = view.depth
+    if depth is not None and depth.kind == "metric":
+        depth = replace(depth, values=depth.values * np.float32(n.scale))
+    return replace(view, camera=replace(view.camera, viewmat=viewmat), depth=depth)
 
 
 def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointCloud:
@@ -69,15 +72,17 @@ def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointC
 
 
 def fingerprint(views: list[View]) -> str:
-    """Return the SHA-256, hexadecimal, over names, cameras and pixels of the views in their order."""
+    """Return the SHA-256, hexadecimal, over names, cameras, pixels and given maps of the views in their order."""
     digest = hashlib.sha256()
     for v in views:
         # cameras to 1e-9: their last bits depend on the machine's linear algebra
         cameras = [np.round(m, 9) + 0.0 for m in (v.camera.viewmat, v.camera.K)]
-        arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask, v.alpha) if m is not None]
+        maps = () if v.depth is None else (v.depth.values, v.depth.confidence)
+        arrays = [*cameras, v.image] + [m for m in (v.mask, v.score_mask, v.alpha, *maps, v.normals) if m is not None]
         # name and shapes are delimited, so that bytes moved from one field to the next cannot give the same hash
         lens = () if v.camera.distortion is None else tuple(np.round(v.camera.distortion, 9).tolist())
         model = () if v.camera.model == "pinhole" else (v.camera.model, *lens)
+        model += () if v.depth is None else (v.depth.kind, v.depth.confidence is None)
         digest.update(repr((v.name, [(a.shape, str(a.dtype)) for a in arrays], *model)).encode("utf-8", "surrogateescape"))
         for array in arrays:
             digest.update(np.ascontiguousarray(array).data)

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 
 from warpgs.errors import UsageError
 from warpgs.io.decoding import MAX_PIXELS
+from warpgs.io.map_files import NO_MAPS, MapOptions
 from warpgs.plugins import Registry
 from warpgs.scene import Scene, View
 
@@ -50,6 +51,8 @@ class ReadOptions:
     """Longest side that an image keeps [px], after ``downscale``; 0 for no limit."""
     lenses: str = "undistort"
     """Treatment of lens distortion: undistort (images become those of a pinhole) or native (`Camera.model` keeps the lens)."""
+    maps: MapOptions = NO_MAPS
+    """Given maps of depth and normals."""
     on_image: Callable[[Path], object] | None = None
     """Called with the file of each image before it is decoded; None for nothing."""
 

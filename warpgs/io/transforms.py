@@ -12,7 +12,9 @@ import numpy as np
 from warpgs.errors import DataError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.io.folders import SceneFolder, ViewList, resampling_note, view_name_of
+from warpgs.io.given_maps import NamedMaps
 from warpgs.io.images import BLACK, SUFFIXES, Lens
+from warpgs.io.map_files import SUFFIXES as MAPS
 from warpgs.io.pose_matrices import from_camera_to_world
 from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import Scene
@@ -181,6 +183,27 @@ class _Reading:
             return self.scene.mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"))
         return self.scene.find_mask(path, self.root / "images")
 
+    def named(self, file: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
+        """Return the maps that a frame names, as nerfstudio does."""
+
+        def path(key: str, flag: str) -> Path | None:
+            if not frame.get(key) or getattr(self.scene.options.maps, flag) is not None:
+                return None
+            found = self.scene.inside(self.child(file.parent, frame[key], f"{where}, {key}"))
+            if found.suffix.lower() not in MAPS:
+                raise DataError(
+                    f"{where}: {key} is {found.name}, and maps are read as {' or '.join(MAPS)}; --{flag} none skips it"
+                )
+            return found
+
+        try:
+            unit = _number(frame, shared, "depth_unit_scale_factor")
+            if unit is not None and not unit > 0:
+                raise ValueError(f"depth_unit_scale_factor is {unit}, not above 0")
+        except ValueError as e:
+            raise DataError(f"{where}: {e}") from e
+        return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
+
     def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
         where = f"{file}, frame {number}"
         if not isinstance(frame, dict):
@@ -199,6 +222,7 @@ class _Reading:
             lambda width, height: lens_of(frame, shared, width, height, where, self.scene.options.lenses == "native"),
             mask=self.mask(file, frame, path, where),
             background=self.background,
+            named=self.named(file, shared, frame, where),
         )
         self.views.add(name, viewmat, loaded)
 

@@ -13,9 +13,9 @@ from warpgs.errors import DataError
 from warpgs.files import UNDECODABLE, make_folder, write_bytes
 from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
 from warpgs.io.exif import read_exif
-from warpgs.io.folders import inside
 from warpgs.io.image_formats.kinds import format_of
 from warpgs.io.images import list_images, turn_upright
+from warpgs.io.inside import inside
 from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 
 MASK_FOLDERS = ("mask", "masks", "idrmasks")

@@ -41,9 +41,17 @@ def pinhole_view(view: View) -> View:
     masks = [None if m is None else inside & (moved(m) > 0.5) for m in (view.mask, view.score_mask)]
     mask = inside if masks[0] is None else masks[0]
     alpha = None if view.alpha is None else np.clip(moved(view.alpha), 0, 1) * inside
+
+    def picked(raster: np.ndarray) -> np.ndarray:
+        return cv2.remap(raster, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+    depth = view.depth
+    if depth is not None:
+        sure = None if depth.confidence is None else picked(depth.confidence)
+        depth = replace(depth, values=picked(depth.values), confidence=sure)
     return replace(
         view, camera=replace(camera, model="pinhole", distortion=None), image=moved(view.image),
-        mask=None if mask.all() else mask, score_mask=masks[1], alpha=alpha,
+        mask=None if mask.all() else mask, score_mask=masks[1], alpha=alpha, depth=depth,
     )  # fmt: skip
 
 
@@ -67,7 +75,8 @@ def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
     per_z = np.where(seen, 1 / np.where(seen, rays[:, 2], 1), 0).reshape(shape)  # rays have depth 1
     depth = np.where(valid, taken(found.depth) * per_z, 0).astype(np.float32)
     sensitivity = np.where(valid, taken(found.sensitivity) * per_z, np.inf).astype(np.float32)
-    return replace(found, depth=depth, valid=valid, sensitivity=sensitivity)
+    given = None if found.given is None else (taken(found.given) * per_z).astype(np.float32)
+    return replace(found, depth=depth, valid=valid, sensitivity=sensitivity, given=given)
 
 
 def _lens_pixels(camera: Camera) -> np.ndarray:

@@ -40,6 +40,8 @@ class PriorConfig:
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
     depth_output: str = "auto"
     """Meaning of its output: disparity (inverse depth), depth, or auto: as in FILE.json beside it, else disparity."""
+    depth_guides: bool = False
+    """The depth network's map places Gaussians and guides the fit as maps of --depths do, in views without one."""
     depth_size: int = 0
     """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 384."""
     depth_multiple: int = 0
@@ -76,6 +78,8 @@ class PriorConfig:
                         raise UsageError(
                             f"--{kind}-{key} describes a network; name it by --{kind}-model, or leave the flag out"
                         )
+        if self.depth_guides and self.depth_model is None:
+            raise UsageError("--depth-guides uses a network; name it by --depth-model, or give maps by --depths")
         if self.depth_output != "auto" and self.depth_model is None:
             raise UsageError("--depth-output describes a network; name it by --depth-model, or leave the flag out")
 

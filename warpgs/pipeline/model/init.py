@@ -20,6 +20,7 @@ from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bou
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
+from warpgs.priors.given_depth import any_given, with_given_depth
 from warpgs.priors.matches import triangulate_matches
 from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
 from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
@@ -45,9 +46,9 @@ class InitConfig:
 
     source: str = "auto"
     """Source: sweep or flow (a point per pixel whose depth other views confirm), points (those of the reconstruction), random,
-    hull (on the surface of the visual hull of views that know their opacity), or auto: sweep for few views, else points where
-    the scene has at least 100 that training views saw, else random. Where views know their opacity, points that are empty in
-    one are left out."""
+    hull (on the surface of the visual hull of views that know their opacity), or auto: sweep for few views or given depth, else
+    points where the scene has at least 100 that training views saw, else random. Where views know their opacity, points that
+    are empty in one are left out."""
     sweep_up_to: int = 0
     """auto: most training views from which a fit starts with a sweep, which takes a second a view on two cores."""
     random_count: int = 20_000
@@ -243,14 +244,17 @@ def consistent_points(
 
     With fewer than `MIN_POINTS` such points the start is random, and says why.
     """
-    reason, depths = "a single view has no other to compare with", None
+    reason, depths, given, source = "a single view has no other to compare with", None, [], config.source
     if len(views) > 1:
         depths = consistent_depths(views, points, config, device, progress)
+    if any_given(views):
+        source, (depths, given) = f"given depth and {source}", with_given_depth(views, depths, points)
+    if depths is not None:
         cloud, notes = coarse_points(
-            views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=config.source, known=points
+            views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=source, known=points
         )
         if len(cloud) >= MIN_POINTS:
-            return Start(cloud, "\n    ".join((notes[-1], *notes[:-1])), depths)
+            return Start(cloud, "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1]))), depths)
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
     cloud, how = random_points(views, config.random_count, generator)
     return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
@@ -328,7 +332,7 @@ def _found_points(
 ) -> Start:  # fmt: skip
     """Return the points of any source but the hull."""
     usable = seen_points(views, points)
-    if config.source == "auto" and sweeps(config, len(views)):
+    if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
         return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
     if config.source in ("sweep", "flow"):
         return consistent_points(views, usable, config, generator, device, progress)

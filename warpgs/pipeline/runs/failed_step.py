@@ -102,7 +102,8 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
         tensors["viewmat"][None], K, distortions, plain["camera_model"], tensors["image"][None], mask,
         {n: t[None] for n, t in group("maps").items()}, torch.tensor([plain["number"]], device=device), alpha,
     )  # fmt: skip
-    terms = tuple(t for t in terms_of(config, plain["cutout"]) if t.active(plain["step"], config.steps))
+    given = {n: f"maps.given_{n}" in tensors for n in ("depth", "normals")}
+    terms = tuple(t for t in terms_of(config, plain["cutout"], **given) if t.active(plain["step"], config.steps))
     options = RasterizeOptions(rule=config.rule, background=tensors["background"], antialiased=config.antialiased)
     buffers, render = StepBuffers(device, 1, 1), eager_renderer(options, None)
     buffers.load([0], [[0.0]], [tuple(plain["settings"])])

@@ -35,6 +35,7 @@ from warpgs.pipeline.runs.folder import (
     record_of,
     run_folder,
 )
+from warpgs.pipeline.runs.given_report import given_figures
 from warpgs.pipeline.runs.job import FitJob
 from warpgs.pipeline.runs.learned_views import cameras_of, learned_cameras, learned_figures, with_cameras
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
@@ -317,7 +318,9 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
     complexity = complexity_figures(trainer)
     learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
     details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
-    for note in [*map(Detail, details), *moved_notes(moved), *(e["summary"] for e in learned.values())]:
+    mapped = given_figures(train, trainer.views, gaussians, options)
+    summaries = [e["summary"] for of in (learned, mapped) for e in of.values()]
+    for note in [*map(Detail, details), *moved_notes(moved), *summaries]:
         job.note(note)
     compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
     return metrics | {
@@ -327,6 +330,6 @@ def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict
         "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
         "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
         "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
-        **event_figures(trainer), **complexity, "view_modules": learned,
+        **event_figures(trainer), **complexity, "view_modules": learned, "given": mapped,
         "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
     }  # fmt: skip

@@ -170,7 +170,8 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"
-            words = {"fingerprint": "the scene (images, cameras or points, as --downscale, --max-side and --reader give them)"}
+            given = "images, cameras, points or given maps, as --downscale, --max-side and --reader give them"
+            words = {"fingerprint": f"the scene ({given})"}
             options = [f"{k} was {stored['scene'].get(k)}" for k, v in record["scene"].items() if stored["scene"].get(k) != v]
             was = f" ({', '.join(o for o in options if not o.startswith('path '))})" if key != "device" else ""
             raise UsageError(

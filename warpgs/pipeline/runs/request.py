@@ -58,6 +58,18 @@ class SceneRequest:
     lenses: str = "undistort"
     """Treatment of lens distortion: undistort (images become those of a pinhole) or native (the model is rendered through the
     lens; the only way to read fisheyes)."""
+    depths: str | None = None
+    """Folder of depth maps, 16-bit PNG or NPY, named as the images are; they place the first Gaussians and guide the fit. By
+    default those that transforms.json names; the word none ignores them."""
+    normals: str | None = None
+    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, likewise."""
+    depth_kind: str = "metric"
+    """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
+    disparity (inverse lengths of unknown scale and shift, as networks give)."""
+    depth_unit: float | None = None
+    """Length of one unit of a metric depth map in units of the cameras; None for 0.001 in whole numbers, 1 in others."""
+    normal_axes: str = "opencv"
+    """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
 
     def with_scale(self, device: str) -> SceneRequest:
         """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
@@ -156,7 +168,8 @@ def read_scene(request: SceneRequest, progress: Callable[[str], object] | None =
         request.path, reader=request.reader, downscale=request.downscale, max_side=request.max_side, strict=request.strict,
         allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
         black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
-        lenses=request.lenses, progress=progress,
+        lenses=request.lenses, depths=request.depths, normals=request.normals, depth_kind=request.depth_kind,
+        depth_unit=request.depth_unit, normal_axes=request.normal_axes, progress=progress,
     )  # fmt: skip
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

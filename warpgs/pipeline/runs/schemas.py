@@ -6,6 +6,8 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from warpgs.constants import K_TOLERANCE, RULES
+from warpgs.io.map_files import AXES
+from warpgs.scene import DEPTH_KINDS
 from warpgs.schema import (
     Schema,
     SchemaError,
@@ -56,7 +58,11 @@ _SCENE = fields(
         "masks": one_of("ignore", "cutout"), "mask_keeps": one_of("white", "black"), "black_is_empty": flag,
         "score_masks": or_null(text), "reader": or_null(text),
     },
-    {"max_pixels": whole(1), "max_side": whole(0), "lenses": one_of("undistort", "native")},
+    {
+        "max_pixels": whole(1), "max_side": whole(0), "lenses": one_of("undistort", "native"),
+        "depths": or_null(text), "normals": or_null(text), "depth_kind": one_of(*DEPTH_KINDS),
+        "depth_unit": or_null(number(above=0)), "normal_axes": one_of(*AXES),
+    },
     others=False,
 )  # fmt: skip
 _PARTS = items(fields({"name": text}))

@@ -14,7 +14,7 @@ from warpgs.errors import UsageError
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.lenses import CENTRAL
 from warpgs.pipeline.metrics.region import fitted_region
-from warpgs.pipeline.model.init import Start, check_points, initial_points, subsample
+from warpgs.pipeline.model.init import Start, check_points, initial_points, seen_points, subsample
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LossTerm, collect
 from warpgs.pipeline.train.loss_terms.built_in import built_in_terms
@@ -22,16 +22,19 @@ from warpgs.pipeline.train.strategies.base import find_strategy
 from warpgs.pipeline.train.strategies.sampling_event import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
 from warpgs.priors.cache import cache_folder
+from warpgs.priors.given_depth import any_given, check_given, with_given_depth
 from warpgs.priors.pinhole_views import lens_depth, pinhole_view
 from warpgs.priors.view_prior import view_priors
 from warpgs.runtime.terminal import Detail
-from warpgs.scene import PointCloud, Prior, View
+from warpgs.scene import GivenDepth, PointCloud, Prior, View, ViewDepth
 
 
 @dataclass(frozen=True)
 class Preparation:
     """Points, priors and notes, found before the first step."""
 
+    views: list[View]
+    """The views to fit, with depth by a network where that guides the fit."""
     start: Start
     """The first points, and the depths that views confirm."""
     priors: list[Prior] | None
@@ -58,13 +61,15 @@ def prepare(
 
     Raises:
         DataError: There is nothing to start from.
-        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. Or the start or
+        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. A given map is of
+            another size or not finite. Or the start or
             the strategy compares views, and a camera is no pinhole.
     """
     for view in train:
         check_camera(view.camera)
     _check_models(train, config)  # before anything takes time
     check_points(train, points, config.init)
+    check_given(train)
     where = device if config.memory_limit is None else torch.device("cpu")
 
     def usable() -> torch.device:
@@ -77,6 +82,9 @@ def prepare(
         # what is searched for along lines is searched for in pinholes; given points need no search
         views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
         found = initial_points(views, points, config.init, generator, usable, progress)
+        if found.depths is None and any_given(views):  # a start that searches for none
+            depths, lines = with_given_depth(views, None, seen_points(views, points))
+            found = found._replace(depths=depths, how="\n".join((found.how, *lines)))
         if found.depths is not None:
             found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
         return subsample(found, config.max_gaussians, generator)
@@ -84,15 +92,20 @@ def prepare(
     notes = []
     if priors is None and needs_priors(config):
         regions, cache = [fitted_region(v)[0] for v in train], cache_folder()
-        # semantics come first: they are found while the device is made ready
+        # semantics come first: they are found while the device is made ready; depth by a network comes before the start
         priors, notes = view_priors(
             train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache, tell=progress
         )
+    if config.priors.depth_guides and priors is not None:
+        train = [
+            v if v.depth is not None else dataclasses.replace(v, depth=GivenDepth(p.disparity, "disparity"))
+            for v, p in zip(train, priors, strict=True)
+        ]
     found = start()
     ready()
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
-    return Preparation(found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
+    return Preparation(train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
@@ -111,13 +124,20 @@ def samples(config: FitConfig) -> bool:
 
 
 def needs_priors(config: FitConfig) -> bool:
-    """Return whether sampling or a loss term needs the priors of the views."""
-    return samples(config) or any(t.needs_priors for t in terms_of(config))
+    """Return whether sampling, a loss term or a network's depth in place of a given one needs the priors of the views."""
+    return samples(config) or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 
 
-def terms_of(config: FitConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
-    """Return all loss terms of a fit by its settings; ``cutout``: its images have an alpha channel."""
-    return (*built_in_terms(config.loss, cutout), *config.loss_terms)
+def terms_of(config: FitConfig, cutout: bool = False, depth: bool = False, normals: bool = False) -> tuple[LossTerm, ...]:
+    """Return all loss terms of a fit by its settings.
+
+    Args:
+        config: Settings.
+        cutout: Its images have an alpha channel.
+        depth: Depth is given of a view.
+        normals: Normals are given of a view.
+    """
+    return (*built_in_terms(config.loss, cutout, depth, normals), *config.loss_terms)
 
 
 def prepared_views(
@@ -132,13 +152,23 @@ def prepared_views(
         UsageError: Two loss terms ask for a map of one name.
     """
     views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
-    priors = made.priors or [None] * len(train)
+    priors, depths = made.priors or [None] * len(train), made.start.depths or [None] * len(train)
     if samples(config):
         disparities = [p.disparity for p in priors]
-        depths = made.start.depths or [None] * len(train)
         views = [scored(v, p, d, config.method) for v, p, d in zip(views, priors, depths, strict=True)]
     found = []
-    for view, prior in zip(views, priors, strict=True):
-        maps = collect(terms, lambda term, view=view, prior=prior: term.needs(view, prior), "map")
+    for view, given, depth, prior in zip(views, train, depths, priors, strict=True):
+        mapped = dataclasses.replace(view, **_given_maps(given, depth, device))
+        maps = collect(terms, lambda term, view=mapped, prior=prior: term.needs(view, prior), "map")
         found.append(dataclasses.replace(view, maps=maps))
     return found, disparities
+
+
+def _given_maps(view: View, found: ViewDepth | None, device: torch.device) -> dict[str, torch.Tensor | None]:
+    """Return the fields of a training view that hold given maps."""
+    used = found is not None and found.given is not None
+    maps = {
+        "depth": found.given if used else None,
+        "depth_weight": view.depth.confidence if used and view.depth is not None else None, "normals": view.normals,
+    }  # fmt: skip
+    return {n: None if m is None else torch.as_tensor(m, dtype=torch.float32, device=device) for n, m in maps.items()}

@@ -76,6 +76,7 @@ class Trainer:
         self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
         self.generator = torch.Generator().manual_seed(config.seed)
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
+        train = made.views
         self.notes: list[str] = made.notes
         """Sentences on what was chosen for the user before the first step."""
         self.messages: list[str] = []
@@ -90,7 +91,8 @@ class Trainer:
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # all have an opacity then
-        self.terms = terms_of(config, self.cutout)
+        given = {n: any(getattr(v, n) is not None for v in train) for n in ("depth", "normals")}
+        self.terms = terms_of(config, self.cutout, **given)
         self.step = 0  # taken
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""

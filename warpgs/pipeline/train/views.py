@@ -39,6 +39,14 @@ class TrainingView:
     """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one (`with_alpha`)."""
+    depth: torch.Tensor | None = None
+    """Given z-depth [u] that no other view contradicts, 0 where there is none, shape [H, W]; for `LossTerm.needs` alone, then
+    None, as where no depth is given."""
+    depth_weight: torch.Tensor | None = None
+    """Confidence in it, in [0, 1], shape [H, W]; None for 1 everywhere, or without it."""
+    normals: torch.Tensor | None = None
+    """Given unit normals in the axes of the camera, 0 where there is none, shape [H, W, 3]; for `LossTerm.needs` alone, then
+    None, as where no normals are given."""
     learned: LearnedView | None = None
     """Part of the view in the view modules of the fit; None without view modules."""
 

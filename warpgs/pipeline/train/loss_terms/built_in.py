@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.loss import LossTerm
+from warpgs.pipeline.train.loss_terms.given import GivenDepthDifference, GivenNormalsDifference
 from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
 from warpgs.pipeline.train.loss_terms.photometric import Photometric
 
@@ -22,18 +23,40 @@ class LossConfig:
     alpha_weight: float = 1.0
     """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
 
+    depth_weight: float = 0.3
+    """Weight of the difference of rendered and given inverse depth, in views with given depth, in [0, 1000]; 0 for no such
+    term."""
+    normal_weight: float = 0.03
+    """Weight of 1 - cos between given normals and those of rendered depth, in views with given normals, in [0, 1000]; 0 for no
+    such term."""
+
     exposure_weight: float = 0.01
     """Weight of the sum of squares of each view's exposure less the identity, where exposures are learned, in [0, 1000]."""
 
     def __post_init__(self) -> None:
-        for name in ("alpha_weight", "exposure_weight"):
+        for name in ("alpha_weight", "depth_weight", "normal_weight", "exposure_weight"):
             if not 0 <= getattr(self, name) <= 1000:
                 raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1000")
         if not 0 <= self.ssim_weight <= 1:
             raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
 
 
-def built_in_terms(config: LossConfig, cutout: bool = False) -> tuple[LossTerm, ...]:
-    """Return the terms that every fit has by its settings; ``cutout``: its images have an alpha channel."""
-    alpha = (AlphaDifference(config.alpha_weight),) if config.alpha_weight > 0 and cutout else ()
-    return (Photometric(config.ssim_weight), *alpha)
+def built_in_terms(
+    config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False
+) -> tuple[LossTerm, ...]:
+    """Return the terms that every fit has by its settings and its views.
+
+    Args:
+        config: Weights.
+        cutout: Its images have an alpha channel.
+        depth: Depth is given of a view.
+        normals: Normals are given of a view.
+    """
+    terms: list[LossTerm] = [Photometric(config.ssim_weight)]
+    if cutout and config.alpha_weight > 0:
+        terms.append(AlphaDifference(config.alpha_weight))
+    if depth and config.depth_weight > 0:
+        terms.append(GivenDepthDifference(config.depth_weight))
+    if normals and config.normal_weight > 0:
+        terms.append(GivenNormalsDifference(config.normal_weight))
+    return tuple(terms)

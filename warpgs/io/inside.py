@@ -1,0 +1,24 @@
+"""Files that lie below a folder, with links followed."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from warpgs.errors import DataError
+
+
+def inside(path: Path, root: Path, noun: str) -> Path:
+    """Return a path after a check that no link on it leads out of ``root``, which messages call ``noun``.
+
+    Raises:
+        DataError: One does.
+    """
+    if not is_below(path, root):
+        raise DataError(f"{path}: a link leads out of {noun}; put the files inside of it, or pass --allow-outside")
+    return path
+
+
+def is_below(path: Path, root: Path) -> bool:
+    """Return True where a path lies below ``root``, links followed; a link that leads round in circles is where it lies."""
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))

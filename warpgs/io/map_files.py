@@ -1,0 +1,256 @@
+"""Files of given maps of depth, confidence and normals: folders of 16-bit PNG and NPY, and the checks of their values."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from warpgs.errors import DataError, UsageError
+from warpgs.input_files import open_input, unread_reason
+from warpgs.io.decoding import MAX_PIXELS, decode_png
+from warpgs.io.inside import inside
+from warpgs.scene import DEPTH_KINDS
+
+SUFFIXES = (".png", ".npy")
+UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
+"""Suffixes of other files that may hold maps, which a message names."""
+NONE = "none"
+"""Word in place of a folder, for no maps at all."""
+CONFIDENCE = ".confidence"
+"""End of the stem of a map of confidence."""
+MILLIMETRES = 0.001
+"""Length of a unit of whole numbers where the user names none, as RGB-D cameras store depth beside poses in metres."""
+MAX_DEPTH = 1e12
+"""Largest depth [file units]; beyond it a map is taken for broken."""
+AXES = ("opencv", "opengl")
+UNIT_TOLERANCE = 0.1
+"""Largest difference of a normal's length from 1; eight bits round by less than 0.01."""
+NO_NORMAL = 0.5
+"""Length below which a vector stands for no normal, as the gray of an image of normals does."""
+MAX_STRAY = 0.05
+"""Largest fraction of a map's normals that may have another length, or face away from the camera."""
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """The user's maps and what their numbers mean."""
+
+    depths: Path | None = None
+    """Folder of depth maps; None for those that the scene names, ``none`` for none at all."""
+    normals: Path | None = None
+    """Folder of normal maps; None for those that the scene names, ``none`` for none at all."""
+    depth_kind: str = "metric"
+    """Meaning of the depth maps, one of `DEPTH_KINDS`."""
+    depth_unit: float | None = None
+    """Length of one unit of a depth map in units of the cameras; None for 0.001 in whole numbers and 1 in others."""
+    normal_axes: str = "opencv"
+    """Axes of the normals: those of the camera as OpenCV (y down, z forward) or OpenGL (y up, z back) has them."""
+
+    def __post_init__(self) -> None:
+        if self.depth_kind not in DEPTH_KINDS:
+            raise UsageError(f"--depth-kind must be one of {', '.join(DEPTH_KINDS)}, not {self.depth_kind!r}")
+        if self.normal_axes not in AXES:
+            raise UsageError(f"--normal-axes must be one of {', '.join(AXES)}, not {self.normal_axes!r}")
+        unit = self.depth_unit
+        if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
+            raise UsageError(f"--depth-unit must be a number above 0, not {unit!r}")
+
+
+NO_MAPS = MapOptions()
+"""Options of a scene without maps."""
+
+
+class MapFolder:
+    """The maps of a folder, found by the names of images."""
+
+    def __init__(self, folder: Path, flag: str, allow_outside: bool):
+        """List a folder; unless ``allow_outside``, no link below it may lead out of it.
+
+        Raises:
+            DataError: The folder is missing or holds no map, two files are for one image, or a link leads out.
+        """
+        self.folder, self.flag = folder, flag
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
+        self._files: dict[str, Path] = {}
+        others: set[str] = set()
+        for file in sorted(folder.rglob("*")):
+            suffix = file.suffix.lower()
+            if file.name[0] == "." or (suffix in SUFFIXES and not file.is_file()):
+                continue
+            if suffix in UNREAD:
+                others.add(suffix)
+            if suffix not in SUFFIXES:
+                continue
+            key = file.relative_to(folder).with_suffix("").as_posix()
+            if key in self._files:
+                raise DataError(f"{file}: {self._files[key].name} is for the same image; remove one of them")
+            self._files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
+        if not any(not key.endswith(CONFIDENCE) for key in self._files):
+            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "put"
+            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named as the images are")
+        self.taken: set[str] = set()
+        """Keys of the maps that images asked for."""
+
+    def find(self, image: Path) -> tuple[Path | None, Path | None]:
+        """Return the files of map and confidence of an image; None for what there is not.
+
+        A map has the path of the image below any folder above it, so `a/b.jpg` has `a/b.png` or `b.png`; the longest counts.
+        """
+        tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
+        for tail in tails:
+            for key in (tail.with_suffix("").as_posix(), tail.as_posix()):
+                if key in self._files and not key.endswith(CONFIDENCE):
+                    self.taken.add(key)
+                    return self._files[key], self._files.get(key + CONFIDENCE)
+        return None, None
+
+    def unmatched(self) -> DataError:
+        """Return the error for a folder in which no image found a map."""
+        names = [key for key in self._files if not key.endswith(CONFIDENCE)]
+        return DataError(
+            f"{self.folder}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each as "
+            f"its image, with .png or .npy, or give another {self.flag}"
+        )
+
+
+def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C].
+
+    Raises:
+        DataError: The file is missing, larger than ``max_pixels``, of another type or shape, or damaged.
+    """
+    if path.suffix.lower() == ".npy":
+        return _read_array(path, max_pixels)
+    return decode_png(path, max_pixels)
+
+
+def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+    try:
+        open_input(path).close()
+        # mapped, because that holds the announced shape against the file's size before memory is taken
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
+    except Exception as e:  # numpy raises a dozen types on foreign bytes
+        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); write it again") from e
+    if not isinstance(found, np.ndarray):
+        found.close()
+        raise DataError(f"{path}: is an archive of arrays, not one array [height, width]; save the map alone")
+    if found.dtype.kind not in "fu" or found.dtype.itemsize > 8:
+        raise DataError(f"{path}: its numbers are {found.dtype}; save float32, or uint16 in millimetres")
+    while found.ndim > 2 and found.shape[0] == 1:
+        found = found[0]
+    if found.ndim not in (2, 3) or 0 in found.shape or (found.ndim == 3 and found.shape[2] > 4):
+        raise DataError(f"{path}: must be an array [height, width] or [height, width, 3], not {list(found.shape)}")
+    if found.shape[0] * found.shape[1] > max_pixels:
+        raise DataError(
+            f"{path}: the map is {found.shape[1]} x {found.shape[0]} px, more than the limit of {max_pixels:,} pixels; shrink "
+            "it, or raise the limit with --max-pixels"
+        )
+    if found.dtype in (np.uint8, np.uint16):
+        return np.array(found)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(found, np.float32)
+
+
+def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
+    """Return the one channel of a map [H, W]; a gray map may be stored in three equal ones."""
+    if raw.ndim == 2:
+        return raw
+    if raw.shape[2] == 1 or (raw.shape[2] == 3 and (raw == raw[..., :1]).all()):
+        return raw[..., 0]
+    raise DataError(
+        f"{path}: is a colour image of {raw.shape[2]} channels, not a {what}; save the values as NPY or gray 16-bit PNG"
+    )
+
+
+def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 where there is none.
+
+    Raises:
+        DataError: The file is no map, or its values cannot be depths.
+    """
+    raw = _gray(path, read_numbers(path, max_pixels), "depth map")
+    metric = options.depth_kind == "metric"
+    if raw.dtype == np.uint8 and metric:
+        raise DataError(
+            f"{path}: has eight bits, too few for lengths; save 16-bit PNG, or give --depth-kind relative or disparity"
+        )
+    values = raw.astype(np.float32)
+    finite = np.isfinite(values)
+    if not finite.any():
+        raise DataError(f"{path}: no depth is finite; write the map again, or remove the file")
+    values = np.where(finite, values, 0)
+    if (values < 0).any():
+        raise DataError(
+            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth is along the camera's "
+            "axis and positive, and 0 where there is none"
+        )
+    if metric:
+        unit = options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0)
+        with np.errstate(over="ignore"):
+            values = values * np.float32(unit)
+    if not values.any():
+        raise DataError(f"{path}: holds no depth, all values are 0 or not finite; remove the file, a view needs none")
+    if not values.max() < MAX_DEPTH:
+        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; mark what has no depth by 0")
+    return values
+
+
+def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
+
+    Whole numbers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
+
+    Raises:
+        DataError: The file is no map, of another shape, or not in [0, 1].
+    """
+    raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
+    if raw.shape != shape:
+        raise DataError(
+            f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; give a map of that size"
+        )
+    values = raw.astype(np.float32)
+    if raw.dtype.kind == "u":
+        largest = int(raw.max())
+        values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
+    if not ((values >= 0) & (values <= 1)).all():
+        raise DataError(f"{path}: confidence must lie in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
+    return values
+
+
+def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 where there is none.
+
+    Raises:
+        DataError: The file is no map, or too many of its vectors have another length than 1.
+    """
+    raw = read_numbers(path, max_pixels)
+    if raw.ndim != 3 or raw.shape[2] != 3:
+        shape = " x ".join(map(str, raw.shape))
+        raise DataError(f"{path}: is {shape}, normals need three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
+    black = (raw == 0).all(-1)
+    values = raw.astype(np.float32)
+    if raw.dtype.kind == "u":
+        values = values * np.float32(2 / np.iinfo(raw.dtype).max) - 1
+    usable = np.isfinite(values).all(-1) & ~black
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
+    known = usable & (lengths >= NO_NORMAL)
+    if not known.any():
+        raise DataError(f"{path}: holds no normal; remove the file, a view needs none")
+    stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
+    if not stray <= MAX_STRAY:
+        raise DataError(
+            f"{path}: {stray:.0%} of its vectors are no unit normals (median length {float(np.median(lengths[known])):.3g}); "
+            "save PNG as (n + 1) / 2, or NPY with unit vectors"
+        )
+    known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
+    normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
+    if options.normal_axes == "opengl":
+        normals = normals * np.array([1, -1, -1], np.float32)
+    return normals

@@ -1,0 +1,129 @@
+"""Loss terms on given depth and normals, for views that have them.
+
+The depth term is the mean of |q / z - q / d|, rendered depth z and given depth d, with q the median given depth of the view: a
+difference of inverse depths without a unit, in which a far surface counts less than a near one and an outlier no more than any
+other. The normal term is the mean of 1 - cos of the angle between given normals and those of rendered depth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from warpgs.errors import UsageError
+from warpgs.geometry import depth_normals
+from warpgs.pipeline.train.loss import LossInputs, LossTerm, register, total
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.runtime.step_sizes import FLOAT, LOSS, STEP, Needs, StepSizes
+from warpgs.scene import Prior
+
+MIN_ALPHA = 0.5
+"""Opacity above which a pixel shows a surface, whose depth counts."""
+DEPTH_MAPS = 8
+"""Maps of one float a pixel that the depth term holds at the loss, with its gradient."""
+NORMAL_MAPS = 26
+"""The same of the normal term, whose points, differences and normals have three numbers each."""
+
+
+def inverse_depth_difference(
+    depth: torch.Tensor, alpha: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
+) -> torch.Tensor:
+    """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 where no pixel counts.
+
+    Args:
+        depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
+        alpha: Rendered opacity, shape [H, W].
+        target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: means over pixels stay what they are.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+    """
+    shown = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
+    shown = shown if mask is None else shown & (mask > 0)
+    weight = torch.where(shown, target[..., 1], 0)
+    inverse = target[..., 2] / torch.where(shown & (target[..., 1] > 0), depth, 1)
+    off = torch.where(weight > 0, (inverse - target[..., 0]).abs(), 0)
+    return total(off) / total(weight).clamp_min(1e-6)
+
+
+@register("given_depth")
+@dataclass(frozen=True)
+class GivenDepthDifference(LossTerm):
+    """The weighted difference of rendered and given inverse depth, 0 in views without given depth."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
+    weight: float = 0.3
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"given-depth: weight {self.weight} must lie between 0 and 1000")
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return weight times q / d, weight, and weight times q, [H, W, 3]; 0 where no depth is given."""
+        given = view.depth
+        if given is None:
+            return {"given_depth": view.image.new_zeros(*view.image.shape[:2], 3)}
+        known = given > 0
+        q = given[known].median() if bool(known.any()) else given.new_ones(())
+        weight = known.to(given.dtype) if view.depth_weight is None else view.depth_weight * known
+        return {"given_depth": torch.stack([weight * q / torch.where(known, given, 1), weight, weight * q], -1)}
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the term's maps, and of the copy of its target on CUDA."""
+        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + DEPTH_MAPS * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times `inverse_depth_difference`, shape []."""
+        depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
+        return self.weight * inverse_depth_difference(depth, alpha, target.maps["given_depth"], target.mask)
+
+
+def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Compute the mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 where no pixel has both.
+
+    Args:
+        normals: Unit normals, 0 where there is none, shape [H, W, 3].
+        target: Given normals, 0 where there is none, shape [H, W, 3]; shorter ones, means of several, count less.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+    """
+    shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
+    shown = shown if mask is None else shown & (mask > 0)
+    # the root in float64: float32's has other last digits on other processors (MKL)
+    length = target.square().sum(-1).double().sqrt().to(target.dtype)
+    weight = torch.where(shown, length, 0)
+    off = torch.where(weight > 0, length - (normals * target).sum(-1), 0)
+    return total(off) / total(weight).clamp_min(1e-6)
+
+
+@register("given_normals")
+@dataclass(frozen=True)
+class GivenNormalsDifference(LossTerm):
+    """The weighted 1 - cos between given normals and those of rendered depth, 0 in views without; for pinholes."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
+    weight: float = 0.03
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"given-normals: weight {self.weight} must lie between 0 and 1000")
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""
+        return {"given_normals": torch.zeros_like(view.image) if view.normals is None else view.normals}
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of points, differences and normals, and of the copy of the target on CUDA."""
+        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + NORMAL_MAPS * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
+        depth = torch.where(inputs.outputs["alpha"] <= MIN_ALPHA, 0, inputs.outputs["depth"])
+        # in the axes of the camera, as the given ones: a refined pose gets no gradient
+        camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
+        target = inputs.target
+        return self.weight * normal_difference(depth_normals(camera, depth), target.maps["given_normals"], target.mask)

@@ -1,0 +1,292 @@
+"""Given depth brought to the scene's units, checked against what views confirm, and put in the place of searched depth.
+
+Derived in docs/decisions/022-given-depth.md. Lengths are compared with the references of their view: searched depth that other
+views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from warpgs import geometry
+from warpgs.errors import DataError, UsageError
+from warpgs.priors.epipolar import nearest_views
+from warpgs.scene import DEPTH_KINDS, GivenDepth, PointCloud, View, ViewDepth
+
+MIN_OVERLAP = 50
+"""Fewest references of a view that a map is compared with or fitted to."""
+MAX_RATIO = 1.25
+"""Largest ratio of metric depth to its references, or of these to it, in the median of a view; beyond it they contradict."""
+NEAR = 0.05
+"""Relative difference of depths up to which they count as one surface."""
+GOOD, MIN_GOOD = 0.1, 0.5
+"""Relative difference of a fitted map from a reference that counts as good, and the least fraction of good ones."""
+EXACT = 0.015
+"""Median difference up to which a fitted map is taken for as good as a metric one; a network's is larger."""
+MIN_CONFIDENCE = 0.5
+"""Confidence from which a given depth may place Gaussians."""
+ROUNDS = 20
+"""Rounds of reweighted least squares."""
+NEIGHBORS = 4
+"""Nearest other views that a map is compared with."""
+MAX_POINTS = 2**18
+"""Most pixels of a map that are compared; of more, a grid, whose pixels stand for those beside them."""
+SHOWN = 5
+"""Views that a message names."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Meaning of the map of a view in scene units."""
+
+    scale: float = 1.0
+    """Factor of the values."""
+    shift: float = 0.0
+    """Summand, in the unit of the scaled values."""
+    references: int = 0
+    """Number of references."""
+    difference: float = float("nan")
+    """Median relative difference from them; NaN without any."""
+    why_not: str = ""
+    """Reason why the map is not used; empty where it is."""
+
+    def depth(self, given: GivenDepth) -> np.ndarray:
+        """Return the z-depth [u] of a map, float32 [H, W]; 0 where there is none, or where it would not be positive."""
+        known = given.values > 0
+        found = np.where(known, given.values.astype(np.float64) * self.scale + self.shift, 0)
+        known &= found > 0
+        with np.errstate(divide="ignore", over="ignore"):
+            inverted = 1 / np.where(known, found, 1) if given.kind == "disparity" else found
+            return np.where(known, inverted, 0).astype(np.float32)
+
+
+def any_given(views: Sequence[View]) -> bool:
+    """Return whether depth is given of a view."""
+    return any(v.depth is not None for v in views)
+
+
+def check_given(views: Sequence[View]) -> None:
+    """Check the given maps of views that were made in Python; those that `load_scene` read are right.
+
+    Raises:
+        UsageError: A map has another size than its image, an unknown kind, or values that no depth or normal has.
+    """
+    for v in views:
+        size = v.image.shape[:2]
+        maps = {} if v.depth is None else {"depth": v.depth.values, "confidence": v.depth.confidence}
+        for name, found in {**maps, "normals": v.normals}.items():
+            if found is None:
+                continue
+            wanted = (*size, 3) if name == "normals" else size
+            if found.shape != wanted:
+                raise UsageError(
+                    f"view {v.name}: the map of {name} has shape {list(found.shape)}, the image needs {list(wanted)}"
+                )
+            low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
+            if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
+                raise UsageError(
+                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; 0 stands for none"
+                )
+        if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
+            raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
+
+
+def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
+    """Return scale and shift that take values [N] to wanted ones [N], above 0, by least relative differences.
+
+    Weighted least squares, reweighted by Cauchy's function of the differences, from the line through the medians of the lower
+    and the upper third.
+    """
+    order = np.argsort(values, kind="stable")
+    third = max(1, len(order) // 3)
+    low, high = order[:third], order[-third:]
+    run = float(np.median(values[high]) - np.median(values[low]))
+    scale = float(np.median(wanted[high]) - np.median(wanted[low])) / run if run > 0 else 0.0
+    shift = float(np.median(wanted - scale * values))
+    for _ in range(ROUNDS):
+        off = np.abs((scale * values + shift) / wanted - 1)
+        spread = max(1.5 * float(np.median(off)), 1e-6)
+        weight = 1 / (wanted**2 * (1 + (off / spread) ** 2))
+        total = weight.sum()
+        x, y = values - (weight * values).sum() / total, wanted - (weight * wanted).sum() / total
+        square = float((weight * x * x).sum())
+        if not square > 0:
+            return 0.0, shift
+        scale = float((weight * x * y).sum()) / square
+        shift = float((weight * (wanted - scale * values)).sum() / total)
+    return scale, shift
+
+
+def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Return values of a view's given depth [N], and at the same pixels the depths [N] [u] that views confirm, float64."""
+    assert view.depth is not None
+    sure = np.zeros(view.depth.values.shape) if found is None else np.where(found.valid, found.depth, 0).astype(np.float64)
+    if known.tracks is not None:
+        own = known.seen_by({view.name})
+        _, rows, columns, z = geometry.seen_pixels(view.camera, own.points)
+        order = np.argsort(-z, kind="stable")  # of two in one pixel the nearer is written last
+        sure[rows[order], columns[order]] = z[order]
+    at = (view.depth.values > 0) & (sure > 0)
+    if view.depth.confidence is not None:
+        at &= view.depth.confidence >= MIN_CONFIDENCE
+    return view.depth.values[at].astype(np.float64), sure[at]
+
+
+def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
+    """Return what the given depth of a view means in scene units, by its references.
+
+    Args:
+        view: A view with given depth.
+        found: Searched depth of the view that others confirm; None for none.
+        known: Points of the reconstruction, with the views that saw them.
+    """
+    assert view.depth is not None
+    values, wanted = references(view, found, known)
+    count, kind = len(values), view.depth.kind
+    if kind == "metric":
+        if count < MIN_OVERLAP:
+            return Alignment(references=count)
+        ratio = float(np.median(values / wanted))
+        made = Alignment(1.0, 0.0, count, float(np.median(np.abs(values / wanted - 1))))
+        if 1 / MAX_RATIO <= ratio <= MAX_RATIO:
+            return made
+        return replace(made, why_not=f"its depths are {ratio:.4g} times those that the views confirm")
+    if count < MIN_OVERLAP:
+        return Alignment(references=count, why_not=f"{count} depths are known to fit it to, at least {MIN_OVERLAP} are needed")
+    scale, shift = fit_line(values, 1 / wanted if kind == "disparity" else wanted)
+    fitted = scale * values + shift
+    with np.errstate(divide="ignore"):
+        fitted = np.where(fitted > 0, 1 / fitted if kind == "disparity" else fitted, 0)
+    off = np.abs(fitted / wanted - 1)
+    made = Alignment(scale, shift, count, float(np.median(off)))
+    good = float((off <= GOOD).mean())
+    if good < MIN_GOOD:
+        return replace(made, why_not=f"{good:.0%} of its depths lie within {GOOD:.0%} of those that the views confirm")
+    if not scale > 0:
+        other = "relative" if kind == "disparity" else "disparity"
+        return replace(made, why_not=f"its values fall where depth asks that they rise; are they {other}?")
+    return made
+
+
+def exact(given: GivenDepth, made: Alignment | None) -> bool:
+    """Return whether a map is better than searched depth: a metric one, or one that fits it closely."""
+    return given.kind == "metric" or (made is not None and made.difference <= EXACT)
+
+
+def votes(
+    views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
+) -> tuple[np.ndarray, np.ndarray]:
+    """Count the other views that confirm each depth of a view, and those that look through it to something farther.
+
+    Args:
+        views: All views, pinholes.
+        depths: Depth of each [u], 0 where there is none, shape [H, W] each.
+        index: Index of the view.
+        near: Number of nearest views that are asked.
+
+    Returns:
+        Both counts, int, shape [H, W].
+    """
+    own = depths[index]
+    step = math.ceil(math.sqrt(np.count_nonzero(own) / MAX_POINTS)) if own.any() else 1
+    coarse = own[::step, ::step]
+    rows, columns = np.nonzero(coarse)
+    pixels, z = np.stack([columns, rows], 1) * step + 0.5, coarse[rows, columns].astype(np.float64)
+    points = geometry.back_project(views[index].camera, pixels, z)
+    counts = np.zeros((2, *coarse.shape), int)
+    for j in nearest_views(views, index, near):
+        seen, r, c, there = geometry.seen_pixels(views[j].camera, points)
+        other = depths[j][r, c]
+        known = other > 0
+        at = rows[seen], columns[seen]
+        counts[0][at] += known & (np.abs(there - other) <= NEAR * other)
+        counts[1][at] += known & (there < (1 - NEAR) * other)
+    confirm, through = counts.repeat(step, 1).repeat(step, 2)[:, : own.shape[0], : own.shape[1]]
+    return confirm, through
+
+
+def with_given_depth(
+    views: Sequence[View], found: Sequence[ViewDepth] | None, known: PointCloud
+) -> tuple[list[ViewDepth], list[str]]:
+    """Return the depth of each view with what is given in it, and notes.
+
+    A depth of an `exact` map counts unless more views look through it than confirm it, and comes before a searched one.
+    Another counts where a view confirms it and the search found nothing or something else. ``ViewDepth.given`` has all depths
+    of the maps that are used, in scene units, without those that are contradicted.
+
+    Args:
+        views: Training views, pinholes.
+        found: Searched depth of each that other views confirm; None where none was searched for.
+        known: Points of the reconstruction.
+
+    Raises:
+        DataError: No map can be used; the message has the reason for each of the first.
+    """
+    before = [_unknown(v) for v in views] if found is None else list(found)
+    made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
+    given = [np.zeros(v.image.shape[:2], np.float32) for v in views]
+    for i, (view, a) in enumerate(zip(views, made, strict=True)):
+        if view.depth is not None and a is not None and not a.why_not:
+            given[i] = a.depth(view.depth)
+    refused = [(v.name, a.why_not) for v, a in zip(views, made, strict=True) if a is not None and a.why_not]
+    if len(refused) == sum(a is not None for a in made):
+        reasons = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
+        raise DataError(f"no depth map can be used: {reasons}. {_remedy(views, made)}")
+    best = [np.where(g > 0, g, np.where(d.valid, d.depth, 0)) for g, d in zip(given, before, strict=True)]
+    after, removed, total = [], 0, 0
+    for i, (view, d) in enumerate(zip(views, before, strict=True)):
+        if not given[i].any():
+            after.append(d)
+            continue
+        assert view.depth is not None
+        confirm, through = votes(views, best, i)
+        own = (given[i] > 0) & (through <= confirm)
+        removed, total = removed + int(((given[i] > 0) & ~own).sum()), total + int((given[i] > 0).sum())
+        placing = own if view.depth.confidence is None else own & (view.depth.confidence >= MIN_CONFIDENCE)
+        if not exact(view.depth, made[i]):
+            outlier = np.abs(d.depth - given[i]) > NEAR * given[i]
+            placing = placing & (confirm > 0) & (~d.valid | outlier)
+        after.append(replace(
+            d, depth=np.where(placing, given[i], d.depth).astype(np.float32), valid=d.valid | placing,
+            sensitivity=np.where(placing, 0, d.sensitivity).astype(np.float32), given=np.where(own, given[i], 0),
+        ))  # fmt: skip
+    return after, _notes(views, made, refused, removed / max(1, total))
+
+
+def _unknown(view: View) -> ViewDepth:
+    shape = view.image.shape[:2]
+    return ViewDepth(np.zeros(shape, np.float32), np.zeros(shape, bool), np.full(shape, np.inf, np.float32))
+
+
+def _remedy(views: Sequence[View], made: Sequence[Alignment | None]) -> str:
+    """Return what a user can do where no map can be used."""
+    if any(v.depth is not None and v.depth.kind == "metric" for v in views):
+        return "Give the length of their unit with --depth-unit, or --depth-kind relative where it is not that of the cameras"
+    return "Check --depth-kind, start from a sweep (--init.source sweep), or leave out --depths"
+
+
+def _notes(
+    views: Sequence[View], made: Sequence[Alignment | None], refused: Sequence[tuple[str, str]], removed: float
+) -> list[str]:
+    """Return notes on maps that are used and left out."""
+    used = [a for a in made if a is not None and not a.why_not]
+    compared = [a for a in used if a.references >= MIN_OVERLAP]
+    notes = [f"given depth: used in {len(used)} of {len(views)} views"]
+    if compared:
+        off = [a.difference for a in compared]
+        notes[0] += (
+            f"; median difference from depth that views confirm {np.median(off):.1%} (worst view {max(off):.1%}), at "
+            f"{sum(a.references for a in compared):,} pixels"
+        )
+    if len(compared) < len(used):
+        notes[0] += f"; {len(used) - len(compared)} of them compared with nothing"
+    if removed:
+        notes[0] += f"; {removed:.1%} left out, because other views look through them"
+    if refused:
+        shown = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
+        notes.append(f"given depth: {len(refused)} maps are not used: {shown}{' ...' if len(refused) > SHOWN else ''}")
+    return notes
