@@ -59,9 +59,9 @@ READERS = {
     "priors/cache.py": {"MapCache._read": "stored maps"},
     "priors/flow.py": {"_network": "flow network", "read_flo": "flow"},
     "priors/preprocess.py": {"read_side_file": "description of a network"},
-    "priors/session.py": {"_start": "network", "read_model": "network"},
     "report/events.py": {"read_events": "events"},
     "runtime/folder_lock.py": {"_signed": "signature of a lock"},
+    "runtime/onnx_session.py": {"read_model": "network", "start_session": "network"},
     "schema.py": {"parse": "scores", "read": "scores"},
     "viewer/frames.py": {"read_frame": "frame of a websocket"},
 }
@@ -92,7 +92,10 @@ REASONS = {
     "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
     "poses/heic.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE},
-    "poses/worker.py": {"main": PIPE, "extract": OWN, "match": OWN},
+    "poses/matcher.py": {"write_matches": OWN},
+    "poses/worker.py": {
+        "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN,
+    },
     "priors/export.py": {
         "_onnx_bytes": OWN, "_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
     },
