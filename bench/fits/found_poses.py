@@ -22,11 +22,12 @@ import numpy as np
 import warpgs
 from bench.lib import result_file
 from bench.lib.arguments import SCENE, parse
+from bench.lib.pose_errors import brought_over, errors
 from bench.lib.refined_views import refined
 from bench.lib.tables import mean_sd
 from warpgs.io.images import Lens, load_image
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.view_modules.poses import RefinePoses, similar_cameras
+from warpgs.pipeline.train.view_modules.poses import RefinePoses
 from warpgs.poses.find import find_poses
 from warpgs.poses.record import read_record
 from warpgs.scene import Camera, Scene, View
@@ -52,12 +53,6 @@ def found_scene(images: Path, names: list[str], downscale: int, folder: Path, ma
     return warpgs.load_scene(folder / "scene", downscale=downscale), read_record(folder / "scene")
 
 
-def brought_over(of: dict[str, View], to: dict[str, View], train: list[str], names: list[str]) -> dict[str, Camera]:
-    """Return the named cameras of one scene after the similarity of its training cameras to those of another."""
-    cameras, goal = {n: v.camera for n, v in of.items()}, [to[n].camera for n in train]
-    return similar_cameras(cameras, [cameras[n] for n in train], goal, names)
-
-
 def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: int, factor: float) -> View:
     """Return a held-out view from a camera, seen through the lens that was found: poses and focal length go together.
 
@@ -68,18 +63,6 @@ def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: in
     loaded = load_image(image, Lens(K, width, height, (found["distortion"], 0.0, 0.0, 0.0)), downscale=downscale)
     K = loaded.K * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
     return View(view.name, replace(camera, K=K), loaded.image, loaded.mask)
-
-
-def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
-    """Return how far cameras are from those of another scene after the similarity: degrees, and parts of the mean distance."""
-    names = sorted(of.keys() & to.keys())
-    cameras = brought_over(of, to, names, names)
-    centers = np.array([to[n].camera.center for n in names])
-    spread = np.linalg.norm(centers - centers.mean(0), axis=1).mean()
-    cosines = [(np.trace(to[n].camera.viewmat[:3, :3] @ cameras[n].viewmat[:3, :3].T) - 1) / 2 for n in names]
-    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    offsets = np.linalg.norm([cameras[n].center - to[n].camera.center for n in names], axis=1) / spread
-    return {"degrees": float(np.median(angles)), "degrees_max": float(angles.max()), "offset": float(np.median(offsets))}
 
 
 def psnr(result: warpgs.FitResult, views: list[View]) -> tuple[float, float]:

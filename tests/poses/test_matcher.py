@@ -82,7 +82,7 @@ class Sift:
 
 
 def test_poses_come_from_the_keypoints_of_the_network(sfm, tmp_path, photographs, monkeypatch):
-    """Of all photographs, with the same bits on any number of threads; the report names the network; chosen pairs do as well."""
+    """Of all photographs, with the same bits on any number of threads; the report names the network; so with chosen pairs."""
     monkeypatch.setattr(find, "open_matcher", lambda path, threads: Sift())
     record = find_poses(photographs, tmp_path / "a", matcher="x.onnx", threads=2)
     assert all(p["registered"] for p in record["photographs"]) and record["pairs_tried"] == 15
