@@ -92,7 +92,7 @@ def row(data: Path, name: str, matcher: Path | None) -> dict:
         seconds = time.perf_counter() - began
         posed = {Path(v.name).stem: v for v in warpgs.load_scene(Path(work) / "scene", max_side=0).views}
     camera, lens = next(iter(views.values())).camera, record["cameras"][0]
-    focal = lens["focal"] / max(lens["width"], lens["height"]) / (camera.K[0, 0] / max(camera.width, camera.height))
+    focal = lens["focal"] / max(lens["width"], lens["height"]) / float(camera.K[0, 0] / max(camera.width, camera.height))
     off = angles(posed, views)
     return found | {
         "registered": len(posed), "right": sum(a < RIGHT for a in off), "degrees_mean": statistics.mean(off),

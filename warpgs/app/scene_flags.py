@@ -35,5 +35,5 @@ def scene_of(flags: Any, path: str) -> SceneRequest:
     if asked.reader is not None:
         reader = asked.reader
         load_own(READERS.kind, reader, lambda: READERS.load(reader))
-    masks = None if asked.score_masks is None else os.path.realpath(asked.score_masks)
-    return dataclasses.replace(asked, path=path, score_masks=masks)
+    masks, matcher = (None if p is None else os.path.realpath(p) for p in (asked.score_masks, asked.matcher))
+    return dataclasses.replace(asked, path=path, score_masks=masks, matcher=matcher)

@@ -17,7 +17,7 @@ from warpgs.io.unread_formats import unread_note
 from warpgs.poses.advice import MIN_KEYPOINTS, partners
 from warpgs.poses.heic import is_heic, to_jpeg
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
-from warpgs.poses.matcher import open_matcher, write_matches
+from warpgs.poses.matcher import Matcher, open_matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
@@ -95,7 +95,8 @@ def find_poses(
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.
         allow_outside: Let links lead to photographs outside the folder.
-        matcher: ONNX file that finds keypoints, as `warpgs priors export --model xfeat` writes it; None for SIFT.
+        matcher: ONNX file that finds keypoints where SIFT leaves photographs without a pose, as `warpgs priors export --model
+            xfeat` writes it; None for SIFT alone.
         progress: Called with lines for the user.
 
     Returns:
@@ -115,10 +116,10 @@ def find_poses(
         work, kind = scene / "work", "video" if is_video(source) else "photographs"
         make_folder(work / "small")
         photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
+        found = find_model(photographs, names, kind, work, progress, threads)
         if network is not None:
-            notes.append(f"keypoints and matches by {network.title} instead of SIFT")
-            write_matches(network, [work / "small" / n for n in names], work / LEARNED, kind, EXHAUSTIVE, progress)
-        found = find_model(photographs, names, kind, work, progress, threads, network is not None)
+            found, more = _with_network(network, found, photographs, names, kind, work, progress, threads)
+            notes += more
         _check_found(source, found, photographs)
         record = record_of(found, photographs, source_digest(source, allow_outside), notes)
         for done, i in enumerate(found.views):
@@ -131,6 +132,32 @@ def find_poses(
         write_record(scene, record)
         shutil.rmtree(work)
     return record
+
+
+def _with_network(
+    network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
+    progress: Callable[[str], object], threads: int,
+) -> tuple[Mapping, list[str]]:  # fmt: skip
+    """Return the model by the network's matches if it has more photographs than SIFT's, and notes; it is asked where some lack.
+
+    The model lies in ``work``/model. Arguments are those of `find_model`.
+    """
+    count = len(found.views)
+    if count == len(photographs):
+        return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, more exactly"]
+    small, second = [work / "small" / n for n in names], work / "network"
+    make_folder(second)
+    turned = write_matches(network, small, second / LEARNED, kind, EXHAUSTIVE, progress)
+    (work / "small").rename(second / "small")
+    other = find_model(photographs, names, kind, second, progress, threads, learned=True)
+    if len(other.views) <= count:
+        return found, [f"{network.title} is not used: it finds {len(other.views)} poses, SIFT {count}"]
+    shutil.rmtree(work / "model", ignore_errors=True)
+    (second / "model").rename(work / "model")
+    notes = [f"keypoints and matches by {network.title}: {len(other.views)} poses; SIFT finds {count}, more exactly"]
+    if turned:
+        notes.append(f"matched after quarter turns: {', '.join(photographs[i].name for i in turned)}")
+    return other, notes
 
 
 def _something_else(folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Keypoints and matches of photographs by a network that the user names, instead of SIFT's.
+"""Keypoints and matches of photographs by a network that the user names, where SIFT's do not suffice.
 
 The network is one ONNX file. It takes an image, colours in [0, 1], and returns `keypoints` [K, 2] in pixels of its input (pixel
 centres at +0.5), `scores` [K], positive where there is a keypoint, and `descriptors` [K, D] of length 1.
@@ -7,7 +7,7 @@ centres at +0.5), `scores` [K], positive where there is a keypoint, and `descrip
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -32,6 +32,10 @@ MAX_CHANNELS = 256
 """Longest descriptor."""
 MIN_COSINE = 0.82
 """Smallest cosine of the descriptors of a match: that of XFeat (Potje et al. 2024)."""
+TURN_SIDE, TURN_KEYPOINTS = 512, 512
+"""Longer side [px] and keypoints of a photograph when it is found out how photographs are turned to each other."""
+TURN_GAIN = 2
+"""Matches with a turned photograph over those with it upright from which it counts as turned: networks know no turns."""
 WHOLE = 2047
 """Factor of descriptors before they are rounded: sums of their products stay below 2^24, where float32 is exact."""
 
@@ -64,16 +68,23 @@ class Matcher:
         """File name and first digits of the hash, for reports."""
         return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
 
-    def features(self, image: np.ndarray) -> Features:
-        """Return the keypoints of an image, uint8 RGB [H, W, 3].
+    def features(self, image: np.ndarray, turns: int = 0, side: int = SIDE, most: int = MAX_KEYPOINTS) -> Features:
+        """Return the keypoints of an image.
+
+        Args:
+            image: The image as it is, uint8 RGB [H, W, 3].
+            turns: Quarter turns to the left after which the network sees it.
+            side: Longer side at which the network sees it [px], unless its graph fixes the size.
+            most: Largest number of keypoints, those of the highest score.
 
         Raises:
             DataError: onnxruntime cannot run the network, or its outputs are not those of a matcher.
         """
         import cv2
 
+        image = np.ascontiguousarray(np.rot90(image, turns))
         height, width = image.shape[:2]
-        h, w = self.size or _network_size(height, width)
+        h, w = self.size or _network_size(height, width, side)
         seen = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if w <= width else cv2.INTER_CUBIC)
         batch = np.ascontiguousarray((seen.astype(np.float32) / 255).transpose(2, 0, 1)[None])
         try:
@@ -83,9 +94,11 @@ class Matcher:
                             "again") from e  # fmt: skip
         keypoints, scores, descriptors = (np.asarray(a) for a in found)
         self._check(keypoints, scores, descriptors, h, w)
-        order = np.argsort(-scores, kind="stable")[:MAX_KEYPOINTS]
+        order = np.argsort(-scores, kind="stable")[:most]
         order = order[scores[order] > 0]
         pixels = keypoints[order] * np.array([width / w, height / h])
+        for _ in range(turns % 4):
+            pixels, height, width = np.stack([height - pixels[:, 1], pixels[:, 0]], 1), width, height
         whole = np.round(descriptors[order] * WHOLE).astype(np.int16)
         return Features(pixels.astype(np.float32), whole)
 
@@ -106,9 +119,9 @@ class Matcher:
                             "it with keypoints in pixels and normalised descriptors")  # fmt: skip
 
 
-def _network_size(height: int, width: int) -> tuple[int, int]:
-    """Return the height and width [px] at which a network sees a photograph."""
-    scale = SIDE / max(height, width) / MULTIPLE
+def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
+    """Return the height and width [px] at which a network sees a photograph, the longer one about ``side``."""
+    scale = side / max(height, width) / MULTIPLE
     return max(1, round(scale * height)) * MULTIPLE, max(1, round(scale * width)) * MULTIPLE
 
 
@@ -153,9 +166,45 @@ def mutual_matches(a: Features, b: Features) -> np.ndarray:
     return np.stack([rows[good], best[good]], 1).astype(np.uint32)
 
 
+def _read(path: Path) -> np.ndarray:
+    """Return the copy of a photograph, uint8 RGB [H, W, 3]."""
+    import cv2
+
+    return np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
+
+
+def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the quarter turns to the left after which photographs have the same side up, most of them none.
+
+    Each pair is matched with the second photograph in all four turns. The pairs with the most matches, a maximum spanning tree,
+    decide.
+
+    Args:
+        matcher: The network.
+        images: The photographs, uint8 RGB [H, W, 3].
+        pairs: Pairs of photographs that may show the same place.
+    """
+    found = [[matcher.features(image, t, TURN_SIDE, TURN_KEYPOINTS) for t in range(4)] for image in images]
+    links = []
+    for i, j in pairs:
+        counts = [len(mutual_matches(found[i][0], turned)) for turned in found[j]]
+        best = int(np.argmax(counts))
+        turn = best if counts[best] >= TURN_GAIN * counts[0] else 0
+        links.append((-counts[turn], i, j, turn))
+    group = {i: {i: 0} for i in range(len(found))}  # photographs joined so far, each with its turns
+    for _, i, j, turn in sorted(links):
+        if group[i] is not group[j]:
+            more = group[i][i] + turn - group[j][j]
+            group[i].update({k: (t + more) % 4 for k, t in group[j].items()})
+            group.update(dict.fromkeys(group[j], group[i]))
+    turns = [group[i][i] for i in range(len(found))]
+    first = int(np.argmax(np.bincount(turns, minlength=4))) if turns else 0
+    return [(t - first) % 4 for t in turns]
+
+
 def write_matches(
     matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Callable[[str], object]
-) -> None:
+) -> list[int]:
     """Find keypoints and matches of photographs, and write them for the worker.
 
     Args:
@@ -165,16 +214,24 @@ def write_matches(
         kind: photographs or video.
         exhaustive: Most photographs of which all pairs are matched.
         progress: Called with lines for the user.
-    """
-    import cv2
 
+    Returns:
+        The photographs that the network saw turned, since so they match others.
+    """
     found = []
     for i, image in enumerate(images):
         progress(f"finding features: photograph {i + 1} of {len(images)}")
-        found.append(matcher.features(np.ascontiguousarray(cv2.imread(str(image))[..., ::-1])))
+        found.append(matcher.features(_read(image)))
     pairs = [(i, j) for j in range(len(found)) for i in range(j)]
     if len(found) > exhaustive:
         pairs = choose_pairs([(f.descriptors // 16 + 128).astype(np.uint8) for f in found], kind)
+    turned = []
+    if kind == "photographs":
+        progress("finding turned photographs")
+        turns = quarter_turns(matcher, map(_read, images), pairs)
+        turned = [i for i, t in enumerate(turns) if t]
+        for i in turned:
+            found[i] = matcher.features(_read(images[i]), turns[i])
     matches = []
     for k, (i, j) in enumerate(pairs):
         progress(f"matching: pair {k + 1} of {len(pairs)}")
@@ -183,3 +240,4 @@ def write_matches(
         out, keypoints=np.concatenate([f.pixels for f in found]), per_photograph=np.array([len(f.pixels) for f in found]),
         pairs=np.array(pairs).reshape(-1, 2), matches=np.concatenate(matches), counts=np.array([len(m) for m in matches]),
     )  # fmt: skip
+    return turned

@@ -24,9 +24,9 @@ SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
 """Matches that agree with one motion of the camera which a pair needs, and points that a new photograph must see."""
-MIN_RATIO = 0.5
-"""Fraction of a network's matches of a pair that must agree with one motion: places that only look alike reach 0.45 (decision
-017)."""
+MIN_RATIO = 0.6
+"""Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
+(decision 017)."""
 PEAK = 0.003
 """Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on temple and fern."""
 CAMERA_MODEL = "SIMPLE_RADIAL"

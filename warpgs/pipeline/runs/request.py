@@ -58,6 +58,9 @@ class SceneRequest:
     lenses: str = "undistort"
     """Treatment of lens distortion: undistort (images become those of a pinhole) or native (the model is rendered through the
     lens; the only way to read fisheyes)."""
+    matcher: str | None = None
+    """ONNX file that finds matches where SIFT leaves photographs without a pose, from `warpgs priors export --model xfeat`;
+    None for SIFT alone."""
 
     def with_scale(self, device: str) -> SceneRequest:
         """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""

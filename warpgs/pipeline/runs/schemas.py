@@ -56,7 +56,7 @@ _SCENE = fields(
         "masks": one_of("ignore", "cutout"), "mask_keeps": one_of("white", "black"), "black_is_empty": flag,
         "score_masks": or_null(text), "reader": or_null(text),
     },
-    {"max_pixels": whole(1), "max_side": whole(0), "lenses": one_of("undistort", "native")},
+    {"max_pixels": whole(1), "max_side": whole(0), "lenses": one_of("undistort", "native"), "matcher": or_null(text)},
     others=False,
 )  # fmt: skip
 _PARTS = items(fields({"name": text}))
