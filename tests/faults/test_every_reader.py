@@ -92,13 +92,15 @@ REASONS = {
     "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
     "poses/heic.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE},
-    "poses/matcher.py": {"write_matches": OWN},
+    "poses/matcher.py": {"_read": OWN},
     "poses/worker.py": {
         "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN,
     },
-    "priors/export.py": {
-        "_onnx_bytes": OWN, "_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
+    "priors/export.py": {"_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do"},
+    "priors/export_matcher.py": {
+        "package_files": "reads files whose SHA-256 must be known", "_backbone": "loads weights whose SHA-256 is known",
     },
+    "priors/onnx_export.py": {"onnx_bytes": OWN},
     "report/film.py": {"_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
     "report/overview.py": {"render_overview": OWN},

@@ -30,7 +30,7 @@ def run(arguments: list[str], about: str) -> int:
         """Let links lead to photographs outside the folder."""
 
         matcher: Path | None = None
-        """ONNX file of `warpgs priors export --model xfeat`, which finds matches where SIFT leaves photographs without a pose."""
+        """ONNX file of `warpgs priors export --model xfeat`; finds matches where SIFT leaves photographs without a pose."""
 
     a = parse_flags(Poses, arguments, "warpgs poses", about)
     check_range("--frames", a.frames, 3, 1000)
