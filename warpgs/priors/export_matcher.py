@@ -37,9 +37,9 @@ OUTPUTS = ("keypoints", "scores", "descriptors")
 KEYPOINTS = 4096
 """Places that the network returns, those of the highest score."""
 THRESHOLD = 0.05
-"""Smallest probability of a keypoint, and ..."""
+"""Smallest probability of a keypoint, as in the published code of XFeat."""
 WINDOW = 5
-"""... side of the square [px] in which it is the highest: both as in the published code of XFeat."""
+"""Side of the square [px] in which a keypoint is the likeliest place, as in the same code."""
 CELL = 8
 """Pixels of a side that share one descriptor."""
 LARGEST = 128
@@ -121,7 +121,12 @@ def build_matcher() -> torch.nn.Module:
 
 
 def agreement(found: list[np.ndarray], wanted: list[np.ndarray]) -> float:
-    """Return the fraction of the keypoints of one run that another has, too, with the same score and descriptor to 1e-3."""
+    """Return the fraction of the wanted keypoints that are found with the same score and descriptor, to 1e-3.
+
+    Args:
+        found: Places [K, 2], scores [K] and descriptors [K, D] of one run.
+        wanted: Places [K, 2], scores [K] and descriptors [K, D] of another.
+    """
     same = {tuple(place): i for i, place in enumerate(found[0].tolist())}
     pairs = [(same[tuple(p)], i) for i, p in enumerate(wanted[0].tolist()) if tuple(p) in same and wanted[1][i] > 0]
     near = [abs(found[1][i] - wanted[1][j]) < 1e-3 and np.abs(found[2][i] - wanted[2][j]).max() < 1e-3 for i, j in pairs]

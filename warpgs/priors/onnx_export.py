@@ -20,7 +20,11 @@ REMEDY = "`pip install warpgs[export]`"
 
 @contextlib.contextmanager
 def folder_for_files() -> Iterator[Path]:
-    """Give a folder that is removed at the end of the block; ResourceError where the files in it cannot be written."""
+    """Give a folder that is removed at the end of the block.
+
+    Raises:
+        ResourceError: The files in it cannot be written.
+    """
     try:
         with temporary_folder() as folder:
             yield folder.path
