@@ -4,14 +4,16 @@ SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every 
 so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and
 of the training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training
 cameras, with the lens that was found. Since that similarity is not exact, each held-out camera is also scored where its
-photograph fits the model best.
+photograph fits the model best. `--refine` also fits with poses, or poses and focal length, refined; held-out cameras are then
+brought over to the refined training cameras. `--work` keeps the found scenes, for machines without pycolmap.
 """
 
 from __future__ import annotations
 
+import argparse
+import itertools
 import statistics
 import tempfile
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,15 +22,18 @@ import numpy as np
 import warpgs
 from bench.lib import result_file
 from bench.lib.arguments import SCENE, parse
+from bench.lib.pose_errors import brought_over, errors
 from bench.lib.refined_views import refined
 from bench.lib.tables import mean_sd
 from warpgs.io.images import Lens, load_image
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.view_modules.poses import similar_cameras
+from warpgs.pipeline.train.view_modules.poses import RefinePoses
 from warpgs.poses.find import find_poses
+from warpgs.poses.record import read_record
 from warpgs.scene import Camera, Scene, View
 
 HOLD_EVERY = 8
+FOCAL_LR = 2e-4
 
 
 def chosen(names: list[str], train: int) -> tuple[list[str], list[str]]:
@@ -37,88 +42,85 @@ def chosen(names: list[str], train: int) -> tuple[list[str], list[str]]:
     return [pool[round(x)] for x in np.linspace(0, len(pool) - 1, train)], test
 
 
-def found_scene(images: Path, names: list[str], downscale: int) -> tuple[Scene, dict]:
-    """Return the scene found from some photographs, the record of its poses, and the seconds it took in it."""
-    with tempfile.TemporaryDirectory() as folder:
-        source, began = Path(folder) / "in", time.perf_counter()
-        source.mkdir()
+def found_scene(images: Path, names: list[str], downscale: int, folder: Path, matcher: Path | None) -> tuple[Scene, dict]:
+    """Return the scene found from some photographs, kept in a folder, and the record of its poses."""
+    if not (folder / "scene").is_dir():
+        source = folder / "photographs"
+        source.mkdir(parents=True)
         for name in names:
             (source / name).write_bytes((images / name).read_bytes())
-        record = find_poses(source, Path(folder) / "scene", threads=2)
-        record["seconds"] = time.perf_counter() - began
-        return warpgs.load_scene(Path(folder) / "scene", downscale=downscale), record
+        find_poses(source, folder / "scene", threads=2, matcher=matcher)
+    return warpgs.load_scene(folder / "scene", downscale=downscale), read_record(folder / "scene")
 
 
-def brought_over(of: dict[str, View], to: dict[str, View], train: list[str], names: list[str]) -> dict[str, Camera]:
-    """Return the named cameras of one scene after the similarity of its training cameras to those of another."""
-    cameras, goal = {n: v.camera for n, v in of.items()}, [to[n].camera for n in train]
-    return similar_cameras(cameras, [cameras[n] for n in train], goal, names)
+def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: int, factor: float) -> View:
+    """Return a held-out view from a camera, seen through the lens that was found: poses and focal length go together.
 
-
-def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: int) -> View:
-    """Return a held-out view from a camera, seen through the lens that was found: poses and focal length go together."""
+    The fit may have changed the focal length by a factor.
+    """
     f, width, height = found["focal"], found["width"], found["height"]
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
     loaded = load_image(image, Lens(K, width, height, (found["distortion"], 0.0, 0.0, 0.0)), downscale=downscale)
-    return View(view.name, replace(camera, K=loaded.K), loaded.image, loaded.mask)
+    K = loaded.K * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
+    return View(view.name, replace(camera, K=K), loaded.image, loaded.mask)
 
 
-def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
-    """Return how far cameras are from those of another scene after the similarity: degrees, and parts of the mean distance."""
-    names = sorted(of.keys() & to.keys())
-    cameras = brought_over(of, to, names, names)
-    centers = np.array([to[n].camera.center for n in names])
-    spread = np.linalg.norm(centers - centers.mean(0), axis=1).mean()
-    cosines = [(np.trace(to[n].camera.viewmat[:3, :3] @ cameras[n].viewmat[:3, :3].T) - 1) / 2 for n in names]
-    angles = np.degrees(np.arccos(np.clip(cosines, -1, 1)))
-    offsets = np.linalg.norm([cameras[n].center - to[n].camera.center for n in names], axis=1) / spread
-    return {"degrees": float(np.median(angles)), "degrees_max": float(angles.max()), "offset": float(np.median(offsets))}
-
-
-def psnr(scene: Scene, train: list[str], test: list[str], preset: str, seed: int, device: str) -> tuple[float, float]:
-    """Return the held-out PSNR of one fit [dB], and that with each held-out camera moved to where its photograph fits best."""
-    config = replace(warpgs.PRESETS[preset], seed=seed)
-    split = f"train={','.join(train)};test={','.join(test)}"
-    result = warpgs.fit(scene, config, split=split, device=device, verbose=False)
+def psnr(result: warpgs.FitResult, views: list[View]) -> tuple[float, float]:
+    """Return the mean PSNR of held-out views [dB], and that with each camera moved to where its photograph fits best."""
     options = result.options()
-    views = [refined(result.scene_gaussians, v, options) for v in scene.views if v.name in test]
-    best = warpgs.evaluate(result.scene_gaussians, views, options)
-    return float(result.metrics["test"]["psnr"]), statistics.mean(m.psnr for m in best)
+    best = [refined(result.scene_gaussians, v, options) for v in views]
+    plain, moved = (warpgs.evaluate(result.scene_gaussians, vs, options) for vs in (views, best))
+    return statistics.mean(m.psnr for m in plain), statistics.mean(m.psnr for m in moved)
 
 
 def main() -> None:
     """Measure and write."""
     a = parse(
-        __doc__, None, SCENE, train=[17, 6, 3], seeds=[0, 1, 2], preset="quick", downscale=4, device="cpu", out=Path,
+        __doc__, None, SCENE, train=[17, 6, 3], seeds=[0, 1, 2], preset="quick", downscale=4, device="cpu", refine=["none"],
+        poses=["given", "joint", "aligned"], focal_lr=FOCAL_LR, matcher=Path, work=Path, out=Path,
     )  # fmt: skip
-    given, rows = warpgs.load_scene(a.scene, downscale=a.downscale), []
+    with tempfile.TemporaryDirectory() as temporary:
+        measure(a, a.work or Path(temporary))
+
+
+def measure(a: argparse.Namespace, work: Path) -> None:
+    """Fit each number of photographs with each kind of poses, refined in each way."""
+    given, rows, images = warpgs.load_scene(a.scene, downscale=a.downscale), [], a.scene / "images"
     reference = {v.name: v for v in given.views}
-    for count in a.train:
+    ways = {"none": (), "poses": (RefinePoses(),), "focal": (RefinePoses(focal_lr=a.focal_lr),)}
+    for count, poses in itertools.product(a.train, a.poses):
         train, test = chosen(list(reference), count)
-        joint, joint_record = found_scene(a.scene / "images", [*train, *test], a.downscale)
-        alone, alone_record = found_scene(a.scene / "images", train, a.downscale)
-        mine = {v.name: v for v in alone.views}
-        over = brought_over(reference, mine, [n for n in train if n in mine], test)
-        (lens,) = alone_record["cameras"]
-        tests = [held_out(reference[n], over[n], a.scene / "images" / n, lens, a.downscale) for n in test]
-        aligned = replace(alone, views=(*alone.views, *tests))
-        for poses, scene, record in (
-            ("given", given, None),
-            ("joint", joint, joint_record),
-            ("aligned", aligned, alone_record),
-        ):
-            scores = [psnr(scene, train, test, a.preset, seed, a.device) for seed in a.seeds]
+        scene, record = given, None
+        if poses != "given":
+            names = [*train, *test] if poses == "joint" else train
+            scene, record = found_scene(images, names, a.downscale, work / f"{count}_{poses}", a.matcher)
+        there = [v.name for v in scene.views]
+        train = [n for n in train if n in there]
+        row = {"poses": poses, "train": count, "held_out": len(test), "preset": a.preset, "seeds": a.seeds}
+        row |= {"downscale": a.downscale, "matcher": None if a.matcher is None else a.matcher.name}
+        if record is not None:
+            row |= errors({v.name: v for v in scene.views}, reference)
+            row |= {k: record[k] for k in ("mean_reprojection_error_px", "points")}
+            row |= {"registered": len(there), "focal_px": [c["focal"] for c in record["cameras"]]}
+        for way in a.refine:
+            config, scores, focal = replace(warpgs.PRESETS[a.preset], view_modules=ways[way]), [], []
+            for seed in a.seeds:
+                split = f"train={','.join(train)};test={','.join(n for n in test if n in there)}"
+                result = warpgs.fit(scene, replace(config, seed=seed), split=split, device=a.device, verbose=False)
+                K, cameras = scene.view(train[0]).camera.K, result.scene_cameras
+                focal.append(float(cameras[train[0]].K[0, 0] / K[0, 0]))
+                if poses == "aligned":
+                    assert record is not None
+                    over = brought_over(reference, {n: replace(reference[n], camera=cameras[n]) for n in train}, train, test)
+                    (lens,) = record["cameras"]
+                    views = [held_out(reference[n], over[n], images / n, lens, a.downscale, focal[-1]) for n in test]
+                else:
+                    views = [replace(scene.view(n), camera=cameras[n]) for n in test]
+                scores.append(psnr(result, views))
             plain, best = ([s[k] for s in scores] for k in (0, 1))
-            row = {"poses": poses, "train": count, "held_out": len(test), "psnr": plain, "psnr_cameras_refined": best,
-                   "preset": a.preset, "seeds": a.seeds, "downscale": a.downscale}  # fmt: skip
-            if record is not None:
-                row |= errors({v.name: v for v in (joint if poses == "joint" else alone).views}, reference)
-                row |= {k: record[k] for k in ("mean_reprojection_error_px", "points", "seconds")}
-                row["registered"] = sum(p["registered"] for p in record["photographs"])
-            rows.append(row)
-            print(
-                f"{count} views, {poses} poses: {mean_sd(plain)} dB; held-out cameras refined: {mean_sd(best)} dB", flush=True
-            )
+            rows.append(row | {"refined": way, "psnr": plain, "psnr_cameras_refined": best, "focal_factors": focal})
+            print(f"{count} views, {poses} poses, refined {way}: {mean_sd(plain)} dB; held-out cameras refined: "
+                  f"{mean_sd(best)} dB; focal length times {np.mean(focal):.4f}", flush=True)  # fmt: skip
             what = "held-out PSNR with given and with found poses of the same photographs"
             result_file.keep(a.out, what, choose_device(a.device)[0], rows)
 

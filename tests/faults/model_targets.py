@@ -25,7 +25,8 @@ from warpgs.pipeline.model import model_file
 from warpgs.pipeline.runs import checkpoint, folder
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.priors import flow, onnx_file, preprocess
+from warpgs.priors import flow, preprocess
+from warpgs.runtime import onnx_file
 from warpgs.scene import Gaussians, Normalization
 
 

@@ -13,7 +13,9 @@ from tests.faults.model_targets import SMALL, onnx_field, tensors_body, tensors_
 from tests.faults.targets import Target, register
 from tests.priors import networks as nw
 from warpgs.pipeline.metrics import lpips_weights
+from warpgs.poses import matcher
 from warpgs.priors import cache, flow, session
+from warpgs.runtime import onnx_session
 
 # ---- weights of LPIPS as others publish them ---------------------------------------------------------------------------
 
@@ -73,11 +75,33 @@ def network_files(root: Path) -> list[Path]:
     return sorted(root.glob("*.onnx"))
 
 
-NETWORK = (session.open_network, session._start, session._input_axes)
+NETWORK = (session.open_network, onnx_session.start_session, onnx_session.read_model, session._input_axes)
 register(
     Target(
         "network", network_files, lambda root, path: session.open_network(path, threads=1), NETWORK,
         (onnx_field, onnx_field, onnx_field), lines=0.7, share=0.3,
+    )
+)  # fmt: skip
+
+
+def matcher_files(root: Path) -> list[Path]:
+    (root / "matcher.onnx").write_bytes(nw.matcher(np.array([[3.0, 4.0]]), np.ones(1), np.array([[0.6, 0.8]])))
+    return [root / "matcher.onnx"]
+
+
+def matched(root: Path, path: Path) -> matcher.Features:
+    return matcher.open_matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
+
+
+def matcher_nonsense(found: matcher.Features) -> str:
+    inside = (found.pixels >= 0) & (found.pixels <= 8)
+    return "" if inside.all() and len(found.pixels) == len(found.descriptors) else "a keypoint is none"
+
+
+register(
+    Target(
+        "matcher", matcher_files, matched, (matcher.open_matcher, matcher.Matcher.features, matcher.Matcher._check),
+        (onnx_field, onnx_field, onnx_field), nonsense=matcher_nonsense, lines=0.6, share=0.2,
     )
 )  # fmt: skip
 

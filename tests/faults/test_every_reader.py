@@ -60,9 +60,9 @@ READERS = {
     "priors/cache.py": {"MapCache._read": "stored maps"},
     "priors/flow.py": {"_network": "flow network", "read_flo": "flow"},
     "priors/preprocess.py": {"read_side_file": "description of a network"},
-    "priors/session.py": {"_start": "network", "read_model": "network"},
     "report/events.py": {"read_events": "events"},
     "runtime/folder_lock.py": {"_signed": "signature of a lock"},
+    "runtime/onnx_session.py": {"read_model": "network", "start_session": "network"},
     "schema.py": {"parse": "scores", "read": "scores"},
     "viewer/frames.py": {"read_frame": "frame of a websocket"},
 }
@@ -93,10 +93,15 @@ REASONS = {
     "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
     "poses/heic.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE},
-    "poses/worker.py": {"main": PIPE, "extract": OWN, "match": OWN},
-    "priors/export.py": {
-        "_onnx_bytes": OWN, "_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
+    "poses/matcher.py": {"_read": OWN},
+    "poses/worker.py": {
+        "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN,
     },
+    "priors/export.py": {"_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do"},
+    "priors/export_matcher.py": {
+        "package_files": "reads files whose SHA-256 must be known", "_backbone": "loads weights whose SHA-256 is known",
+    },
+    "priors/onnx_export.py": {"onnx_bytes": OWN},
     "report/film.py": {"_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
     "report/overview.py": {"render_overview": OWN},

@@ -21,15 +21,20 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
 
     def copied(source, out, **options):
         calls.append(source)
+        assert options["matcher"] == "x.onnx"
         shutil.copytree(found[0], out)
         return found[1]
 
     monkeypatch.setattr(module, "find_poses", copied)
     shutil.copytree(photographs, tmp_path / "in")
-    request = SceneRequest(str(tmp_path / "in"))
+    request = SceneRequest(str(tmp_path / "in"), matcher="x.onnx")
     for _ in range(2):
         posed, notes = with_poses(request, run, said.append)
-        assert posed.path == str(run / "scene") and any(n.startswith("poses found for 6 of 6") for n in notes)
+        assert (
+            posed.path == str(run / "scene")
+            and posed.matcher is None
+            and any(n.startswith("poses found for 6 of 6") for n in notes)
+        )
     assert calls == [tmp_path / "in"] and "holds no cameras: finding poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
     with pytest.raises(UsageError, match="holds the poses of other photographs"):
@@ -54,6 +59,8 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
     for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
         assert with_poses(request, tmp_path, print) == (request, [])
+    with pytest.raises(UsageError, match=r"--matcher finds poses, and .* is no folder of photographs"):
+        with_poses(SceneRequest(str(found[0]), matcher="x.onnx"), tmp_path, print)
     with pytest.raises(UsageError, match="kept in a run folder; give out"):
         with_poses(SceneRequest(str(photographs)), None, print)
 

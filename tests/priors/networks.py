@@ -93,6 +93,16 @@ def linear(
     return model(graph(nodes, tensors, ins, outs))
 
 
+def matcher(
+    keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray, size: tuple = ("h", "w"), named: str = "scores"
+) -> bytes:
+    """Return a network that finds the same keypoints in every image; ``named`` is the name of its second output."""
+    found = {"keypoints": keypoints, named: scores, "descriptors": descriptors}
+    nodes = [node("Identity", [f"the_{n}"], [n]) for n in found]
+    outs = [value(n, a.shape) for n, a in found.items()]
+    return model(graph(nodes, [tensor(f"the_{n}", a) for n, a in found.items()], [value("image", (1, 3, *size))], outs))
+
+
 def write(path: Path, data: bytes) -> str:
     path.write_bytes(data)
     return str(path)

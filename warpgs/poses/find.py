@@ -16,7 +16,8 @@ from warpgs.io.readers import all_readers
 from warpgs.io.unread_formats import unread_note
 from warpgs.poses.advice import MIN_KEYPOINTS, partners
 from warpgs.poses.heic import is_heic, to_jpeg
-from warpgs.poses.mapping import Mapping, camera_groups, cameras_of, check_installed, find_model
+from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
+from warpgs.poses.matcher import Matcher, open_matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
@@ -79,6 +80,7 @@ def find_poses(
     threads: int = 0,
     max_pixels: int = MAX_PIXELS,
     allow_outside: bool = False,
+    matcher: str | Path | None = None,
     progress: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
     """Find the poses of photographs or of a video's sharpest frames, and write a scene folder that holds those registered.
@@ -93,24 +95,31 @@ def find_poses(
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.
         allow_outside: Let links lead to photographs outside the folder.
+        matcher: ONNX file that finds keypoints where SIFT leaves photographs without a pose, as `warpgs priors export --model
+            xfeat` writes it; None for SIFT alone.
         progress: Called with lines for the user.
 
     Returns:
         The record, as poses.json holds it.
 
     Raises:
-        DataError: There are no photographs or too few, one lies outside or cannot be decoded, or fewer than three fit together.
+        DataError: There are no photographs or too few, one lies outside or cannot be decoded, fewer than three fit together, or
+            the matcher is none.
         ResourceError: pycolmap failed, or the folder cannot be written.
         UsageError: pycolmap is not installed, or ``out`` holds something already.
     """
     source, out = Path(source), Path(out)
     _check(source, out, allow_outside)
     check_installed()
+    network = None if matcher is None else open_matcher(matcher, threads)
     with filling(out) as scene:
-        work = scene / "work"
+        work, kind = scene / "work", "video" if is_video(source) else "photographs"
         make_folder(work / "small")
         photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
-        found = find_model(photographs, names, "video" if is_video(source) else "photographs", work, progress, threads)
+        found = find_model(photographs, names, kind, work, progress, threads)
+        if network is not None:
+            found, more = _with_network(network, found, photographs, names, kind, work, progress, threads)
+            notes += more
         _check_found(source, found, photographs)
         record = record_of(found, photographs, source_digest(source, allow_outside), notes)
         for done, i in enumerate(found.views):
@@ -123,6 +132,32 @@ def find_poses(
         write_record(scene, record)
         shutil.rmtree(work)
     return record
+
+
+def _with_network(
+    network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
+    progress: Callable[[str], object], threads: int,
+) -> tuple[Mapping, list[str]]:  # fmt: skip
+    """Return the model by the network's matches if it has more photographs than SIFT's, and notes; it is asked where some lack.
+
+    The model lies in ``work``/model. Arguments are those of `find_model`.
+    """
+    count = len(found.views)
+    if count == len(photographs):
+        return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, more exactly"]
+    small, second = [work / "small" / n for n in names], work / "network"
+    make_folder(second)
+    turned = write_matches(network, small, second / LEARNED, kind, EXHAUSTIVE, progress)
+    (work / "small").rename(second / "small")
+    other = find_model(photographs, names, kind, second, progress, threads, learned=True)
+    if len(other.views) <= count:
+        return found, [f"{network.title} is not used: it finds {len(other.views)} poses, SIFT {count}"]
+    shutil.rmtree(work / "model", ignore_errors=True)
+    (second / "model").rename(work / "model")
+    notes = [f"keypoints and matches by {network.title}: {len(other.views)} poses; SIFT finds {count}, more exactly"]
+    if turned:
+        notes.append(f"matched after quarter turns: {', '.join(photographs[i].name for i in turned)}")
+    return other, notes
 
 
 def _something_else(folder: Path) -> str:

@@ -23,6 +23,8 @@ EXHAUSTIVE = 60
 """Most photographs of which all pairs are matched; of more, pairs are chosen."""
 JOB = "job.json"
 """Name of the file with the worker's input."""
+LEARNED = "learned.npz"
+"""Name of the file with keypoints and matches of a network."""
 LAST_WORDS = 500
 """Letters of pycolmap's last message that are shown where it fails."""
 
@@ -58,7 +60,7 @@ class Mapping:
     """Result of structure from motion; photographs are known by their number in the order of their names."""
 
     keypoints: tuple[int, ...]
-    """Number of SIFT keypoints of each photograph."""
+    """Number of keypoints of each photograph."""
     matches: dict[tuple[int, int], int]
     """Number of matches that agree with one motion of the camera, by pair, the smaller number first."""
     tried: int
@@ -115,7 +117,9 @@ def cameras_of(photographs: list[Photograph], groups: list[int]) -> list[Photogr
     return [first[number] for number in range(len(first))]
 
 
-def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int) -> dict[str, Any]:
+def _job(
+    photographs: list[Photograph], names: list[str], kind: str, folder: Path, threads: int, learned: bool
+) -> dict[str, Any]:
     """Return the worker's input."""
     of = camera_groups(photographs)
     cameras = []
@@ -130,6 +134,7 @@ def _job(photographs: list[Photograph], names: list[str], kind: str, folder: Pat
         "sizes": [(p.width, p.height) for p in photographs], "scene_names": [p.name for p in photographs],
         # relative to the folder that the worker runs in: pycolmap takes names in UTF-8 alone
         "images": "small", "database": "matches.db", "pairs": "pairs.txt", "models": "models", "model": "model",
+        "learned": LEARNED if learned else None,
     }  # fmt: skip
 
 
@@ -160,6 +165,7 @@ def find_model(
     folder: Path,
     progress: Callable[[str], object],
     threads: int = 0,
+    learned: bool = False,
 ) -> Mapping:
     """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files.
 
@@ -172,12 +178,13 @@ def find_model(
         folder: Folder to work in.
         progress: Called with lines for the user.
         threads: CPU threads; 0 for as many as there are cores.
+        learned: Whether ``folder`` holds keypoints and matches of a network, which stand for SIFT's.
 
     Raises:
         ResourceError: pycolmap failed.
     """
     result: dict[str, Any] | None = None
-    for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores()), folder):
+    for said in _lines(_job(photographs, names, kind, folder, threads or usable_cores(), learned), folder):
         if "progress" in said:
             progress(said["progress"])
         result = said.get("result", result)

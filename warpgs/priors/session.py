@@ -9,19 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.input_files import read_input, unread_reason
-from warpgs.priors.onnx_file import check_onnx
-from warpgs.runtime.processor import usable_cores
+from warpgs.errors import DataError, UsageError
+from warpgs.runtime.onnx_session import PROVIDERS, first_line, read_model, start_session
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-PROVIDERS = {"cpu": "CPUExecutionProvider", "cuda": "CUDAExecutionProvider"}
 TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
-ERRORS_ONLY = 3
-MAX_MODEL_BYTES = 2**31
-"""Largest model [bytes]: the largest message of protobuf."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +52,7 @@ class Network:
             (output,) = self.session.run(None, feed)
         except Exception as e:  # onnxruntime's errors share no base but Exception
             shape = " x ".join(map(str, batch.shape))
-            raise DataError(f"{self.path}: onnxruntime cannot run it on an input of {shape} ({_line(e)}); see --help for "
+            raise DataError(f"{self.path}: onnxruntime cannot run it on an input of {shape} ({first_line(e)}); see --help for "
                             "the flags that set its input") from e  # fmt: skip
         output = np.asarray(output)
         if output.dtype.kind != "f":
@@ -69,38 +63,6 @@ class Network:
         if output.size == 0 or not output.max() > output.min():
             raise DataError(f"{self.path}: its output is the same number everywhere; check the model's weights")
         return output
-
-
-def _line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__
-
-
-def _start(data: bytes, path: Path, provider: str, threads: int) -> InferenceSession:
-    try:
-        import onnxruntime as ort
-    except ImportError as e:
-        raise ResourceError(f"{path}: onnxruntime, which runs it, cannot be imported ({e}); `pip install onnxruntime`") from e
-    there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
-    remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
-    if provider not in there:
-        raise ResourceError(
-            f"--onnx-provider {provider}: this onnxruntime {ort.__version__} has only {', '.join(there)}. {remedy}"
-        )
-    options = ort.SessionOptions()
-    options.intra_op_num_threads = threads or usable_cores()
-    options.inter_op_num_threads = 1
-    options.log_severity_level = ERRORS_ONLY
-    options.use_deterministic_compute = True
-    try:
-        session = ort.InferenceSession(data, options, providers=[PROVIDERS[provider]])
-    except Exception as e:
-        raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({_line(e)}); export it again, perhaps with an "
-                        "older operator set") from e  # fmt: skip
-    # onnxruntime goes on without a provider whose libraries are missing
-    if PROVIDERS[provider] not in session.get_providers():
-        raise ResourceError(f"--onnx-provider {provider}: onnxruntime finds no {provider} libraries or device. {remedy}")
-    return session
 
 
 def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
@@ -118,20 +80,6 @@ def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
     if (sides[0] is None) != (sides[1] is None):
         raise DataError(f"{path}: its input, {text}, fixes only one side of the image; export it with both fixed or both free")
     return layout, None if sides[0] is None else sides
-
-
-def read_model(path: Path) -> bytes:
-    """Return the bytes of an ONNX file that needs nothing but itself.
-
-    Raises:
-        DataError: It cannot be read, is no ONNX model, or needs other files or foreign operators.
-    """
-    try:
-        data = read_input(path, MAX_MODEL_BYTES)
-    except OSError as e:
-        raise DataError(f"{path}: the model cannot be read ({unread_reason(e)}); give the path of an ONNX file") from e
-    check_onnx(data, path)
-    return data
 
 
 def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
@@ -154,7 +102,7 @@ def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -
         raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")
     path = Path(path)
     data = read_model(path)
-    session = _start(data, path, provider, threads)
+    session = start_session(data, path, provider, threads)
     try:
         return _checked(path, data, session)
     except UnicodeDecodeError as e:

@@ -15,7 +15,8 @@ from warpgs.priors.cache import MapCache
 from warpgs.priors.depth import complete_disparity, network_disparity
 from warpgs.priors.preprocess import check_value, describe
 from warpgs.priors.semantics import SemanticMaps, boundary_weight, classical_maps, knows_foreground, network_semantics
-from warpgs.priors.session import PROVIDERS, open_network
+from warpgs.priors.session import open_network
+from warpgs.runtime.onnx_session import PROVIDERS
 from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Prior, View
 

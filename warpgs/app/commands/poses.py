@@ -29,6 +29,9 @@ def run(arguments: list[str], about: str) -> int:
         allow_outside: bool = False
         """Let links lead to photographs outside the folder."""
 
+        matcher: Path | None = None
+        """ONNX file of `warpgs priors export --model xfeat`; finds matches where SIFT leaves photographs without a pose."""
+
     a = parse_flags(Poses, arguments, "warpgs poses", about)
     check_range("--frames", a.frames, 3, 1000)
     check_range("--threads", a.threads, 0, MAX_THREADS)
@@ -38,7 +41,7 @@ def run(arguments: list[str], about: str) -> int:
 
     record = find_poses(
         a.photographs, a.out, frames=a.frames, threads=a.threads, max_pixels=a.max_pixels, allow_outside=a.allow_outside,
-        progress=Stages(),
+        matcher=a.matcher, progress=Stages(),
     )  # fmt: skip
     for line in report_lines(record):
         say(line)

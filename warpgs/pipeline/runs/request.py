@@ -70,6 +70,9 @@ class SceneRequest:
     """Length of one unit of a metric depth map in units of the cameras; None for 0.001 in whole numbers, 1 in others."""
     normal_axes: str = "opencv"
     """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
+    matcher: str | None = None
+    """ONNX file that finds matches where SIFT leaves photographs without a pose, from `warpgs priors export --model xfeat`;
+    None for SIFT alone."""
 
     def with_scale(self, device: str) -> SceneRequest:
         """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""

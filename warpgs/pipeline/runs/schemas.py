@@ -61,7 +61,7 @@ _SCENE = fields(
     {
         "max_pixels": whole(1), "max_side": whole(0), "lenses": one_of("undistort", "native"),
         "depths": or_null(text), "normals": or_null(text), "depth_kind": one_of(*DEPTH_KINDS),
-        "depth_unit": or_null(number(above=0)), "normal_axes": one_of(*AXES),
+        "depth_unit": or_null(number(above=0)), "normal_axes": one_of(*AXES), "matcher": or_null(text),
     },
     others=False,
 )  # fmt: skip

@@ -29,11 +29,13 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
     Raises:
         DataError: The photographs do not fit together, or are too few.
-        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, or a continued run has other
-            photographs.
+        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, a continued run has other
+            photographs, or a matcher is given for a scene with cameras.
     """
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
+        if request.matcher is not None:
+            raise UsageError(f"--matcher finds poses, and {source} is no folder of photographs without cameras; leave it out")
         return request, []
     if out is None:
         raise UsageError(f"{source}: has no cameras, and those found are kept in a run folder; give out")
@@ -47,9 +49,9 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
         threads = torch.get_num_threads()
         record = find_poses(
             source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,
-            progress=progress,
+            matcher=request.matcher, progress=progress,
         )  # fmt: skip
-    return replace(request, path=str(scene)), _notes(record)
+    return replace(request, path=str(scene), matcher=None), _notes(record)
 
 
 def lost_lines(out: Path | None) -> list[str]:

@@ -4,6 +4,11 @@ A training view i > 0 is rendered from T_i viewmat_i, where T_i turns by a rotat
 t_i in the camera's axes. The first camera stays, so that the scene as a whole cannot turn or wander away; what is left free,
 its size, no image shows. The rotation is Cayley's map of w / 2, of angle 2 atan(|w| / 2): for small w that of exp(w), without
 a case for w = 0, and with the same bits on every processor.
+
+A focal length that is not known exactly can be learned too: fx and fy of every view of one camera are multiplied by
+s = (2 + z) / (2 - z), which is exp(z) to second order and positive for |z| < 2. Views with the same intrinsics and size count
+as one camera. Each row of such a camera holds the same z: a view has the mean of its camera's rows, so each row gets the same
+gradient.
 """
 
 from __future__ import annotations
@@ -24,6 +29,10 @@ from warpgs.scene import Camera, View
 
 ROTATION, TRANSLATION = "pose_rotation", "pose_translation"
 """Names of the parameters: w [rad] and t [u], shape [V, 3] each."""
+FOCAL, CAMERA_NUMBER = "pose_focal", "pose_camera"
+"""Names of the parameters of a learned focal length: z, and the number of the view's camera, which stays; shape [V, 1] each."""
+SHOWN_LENSES = 3
+"""Cameras whose focal length the summary names."""
 RULE = (
     "held-out views are moved by the one similarity that takes the given training cameras to the refined ones best; their "
     "own images are not looked at"
@@ -57,6 +66,26 @@ def moved(viewmats: torch.Tensor, rotation: torch.Tensor, translation: torch.Ten
     # four products, not a matrix product, whose order of summation is the library's
     products = [motion[..., k : k + 1] * viewmats[..., k : k + 1, :] for k in range(4)]
     return products[0] + products[1] + products[2] + products[3]
+
+
+def camera_numbers(cameras: Sequence[Camera]) -> list[int]:
+    """Return a number for each view's camera: views with the same intrinsics and size have the same one."""
+    numbers: dict[tuple[bytes, int, int], int] = {}
+    return [numbers.setdefault((np.asarray(c.K, np.float64).tobytes(), c.width, c.height), len(numbers)) for c in cameras]
+
+
+def focal_factors(params: Tensors, numbers: torch.Tensor) -> torch.Tensor:
+    """Return the factor s of the focal length of views of these numbers [B], shape [B]; differentiable."""
+    camera = params[CAMERA_NUMBER][:, 0]
+    same = (camera.index_select(0, numbers)[:, None] == camera).to(camera.dtype)
+    z = (same * params[FOCAL][:, 0]).sum(1) / same.sum(1)
+    return (2 + z) / (2 - z)
+
+
+def zoomed(K: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
+    """Return intrinsics [B, 3, 3] with fx and fy times a factor [B]; differentiable."""
+    focal = K[:, :2, :2] * factor[:, None, None]
+    return torch.cat([torch.cat([focal, K[:, :2, 2:]], 2), K[:, 2:]], 1)
 
 
 def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.ndarray, float, np.ndarray]:
@@ -100,17 +129,30 @@ def refined_cameras(
 ) -> dict[str, Camera]:
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `RULE`.
 
+    Where focal lengths are learned, a held-out view has that of the training views of its camera, or the mean factor of all
+    training views if its intrinsics are those of none.
+
     Args:
         given: Cameras as given, in scene units, by name.
         train: Names of the training views, in the order of the fit.
         test: Names of the held-out views.
-        params: Increments of the training views, shape [V, 3] each.
+        params: Parameters of the training views.
     """
     motions = increments(*(params[n].detach().cpu().double() for n in (ROTATION, TRANSLATION))).numpy()
     found = dict(given)
     for name, motion in zip(train, motions, strict=True):
         found[name] = replace(given[name], viewmat=matmul(motion, given[name].viewmat))
-    return found | similar_cameras(given, [given[n] for n in train], [found[n] for n in train], test)
+    found |= similar_cameras(given, [given[n] for n in train], [found[n] for n in train], test)
+    if FOCAL not in params:
+        return found
+    exact = {n: params[n].detach().cpu().double() for n in (FOCAL, CAMERA_NUMBER)}
+    factors = focal_factors(exact, torch.arange(len(train))).tolist()
+    numbers = dict(zip([*train, *test], camera_numbers([given[n] for n in (*train, *test)])))
+    of_camera = {numbers[n]: f for n, f in zip(train, factors)}
+    for name in (*train, *test):
+        factor = of_camera.get(numbers[name], float(np.mean(factors)))
+        found[name] = replace(found[name], K=np.asarray(given[name].K) * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+    return found
 
 
 def pose_figures(
@@ -126,7 +168,8 @@ def pose_figures(
         scale: Scene units per unit of the scene's files.
 
     Returns:
-        ``views``, the turn [degrees] and the shift of the centre [units of the files] of each training view, and ``summary``.
+        ``views``, the turn [degrees] and the shift of the centre [units of the files] of each training view; ``cameras``, the
+        focal length [px] of each camera before and after, if any changed; and ``summary``.
     """
     rows = []
     for name in train:
@@ -140,7 +183,19 @@ def pose_figures(
         f"poses refined: {len(train)} training cameras turned by {np.median(degrees):.3f} degrees in the median, "
         f"{max(degrees):.3f} at most, and moved by {np.median(units):.4g} and {max(units):.4g} units; the first one is fixed"
     )
-    return {"views": rows, "summary": f"{summary}; {RULE}" if held_out else summary}
+    first = dict(zip(reversed(camera_numbers([given[n] for n in train])), reversed(train)))
+    lenses = [
+        {"views": sum(np.array_equal(given[n].K, given[name].K) for n in train),
+         "given": float(given[name].K[0, 0]), "focal": float(refined[name].K[0, 0])}
+        for _, name in sorted(first.items())
+    ]  # fmt: skip
+    found: dict[str, Any] = {"views": rows}
+    if any(lens["given"] != lens["focal"] for lens in lenses):
+        found["cameras"] = lenses
+        changes = [f"{r['focal']:.1f} px, given {r['given']:.1f} ({r['focal'] / r['given'] - 1:+.1%})" for r in lenses]
+        more = f" and {len(lenses) - SHOWN_LENSES} more" if len(lenses) > SHOWN_LENSES else ""
+        summary = f"{summary}; focal length {', '.join(changes[:SHOWN_LENSES])}{more}"
+    return found | {"summary": f"{summary}; {RULE}" if held_out else summary}
 
 
 @register("refine_poses")
@@ -154,32 +209,42 @@ class RefinePoses(ViewModule):
     """Learning rate of the training cameras' rotations [rad] from then on."""
     translation_lr: float = 2e-4
     """The same of their translations, times the scene's extent."""
+    focal_lr: float | None = None
+    """The same of the logarithm of each camera's focal length, which all its views share; None keeps it as given."""
     decay: float = 0.1
-    """Fraction of both that is left at the last step; log-linear between."""
+    """Fraction of all three that is left at the last step; log-linear between."""
 
     def __post_init__(self) -> None:
-        check_lrs(self.name, rotation_lr=self.rotation_lr, translation_lr=self.translation_lr, decay=self.decay)
+        lrs = {"rotation_lr": self.rotation_lr, "translation_lr": self.translation_lr, "focal_lr": self.focal_lr}
+        check_lrs(self.name, **lrs, decay=self.decay)
         if not 0 <= self.start < 1:
             raise UsageError(f"refine_poses start must be at least 0 and less than 1, not {self.start}")
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
-        """Return zeros, shape [V, 3] each."""
-        return {name: torch.zeros(len(views), 3) for name in (ROTATION, TRANSLATION)}
+        """Return zeros, shape [V, 3] each; for focal lengths, if they are learned, zeros and the views' cameras [V, 1]."""
+        found = {name: torch.zeros(len(views), 3) for name in (ROTATION, TRANSLATION)}
+        if self.focal_lr is not None:
+            numbers = torch.tensor(camera_numbers([v.camera for v in views]), dtype=torch.float32)
+            found |= {FOCAL: torch.zeros(len(views), 1), CAMERA_NUMBER: numbers[:, None]}
+        return found
 
     def lrs(self, progress: float, extent: float) -> dict[str, float]:
-        """Return the learning rates of rotations [rad] and translations [u], zero before ``start``."""
+        """Return the learning rates of rotations [rad], translations [u] and focal lengths, zero before ``start``."""
         begun = (progress - self.start) / (1 - self.start)
         left = log_linear(1.0, self.decay, begun) if begun >= 0 else 0.0
-        return {ROTATION: self.rotation_lr * left, TRANSLATION: self.translation_lr * extent * left}
+        found = {ROTATION: self.rotation_lr * left, TRANSLATION: self.translation_lr * extent * left}
+        return found | ({FOCAL: self.focal_lr * left, CAMERA_NUMBER: 0.0} if self.focal_lr is not None else {})
 
     def values(self, params: Tensors, numbers: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return w and t of the views, shape [B, 3] each, zeros for view 0."""
+        """Return w and t of the views, shape [B, 3] each, zeros for view 0; and factors of learned focal lengths [B]."""
         free = (numbers != 0).to(params[ROTATION].dtype)[:, None]
-        return {n: params[n].index_select(0, numbers) * free for n in (ROTATION, TRANSLATION)}
+        found = {n: params[n].index_select(0, numbers) * free for n in (ROTATION, TRANSLATION)}
+        return found | ({FOCAL: focal_factors(params, numbers)} if FOCAL in params else {})
 
     def before_render(self, camera: Camera, values: Tensors) -> Camera:
-        """Return the camera after the increments of its views."""
-        return replace(camera, viewmat=moved(camera.viewmat, values[ROTATION], values[TRANSLATION]))
+        """Return the camera after the increments of its views, with its learned focal length."""
+        K = zoomed(camera.K, values[FOCAL]) if FOCAL in values else camera.K
+        return replace(camera, viewmat=moved(camera.viewmat, values[ROTATION], values[TRANSLATION]), K=K)
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the gradient of the camera."""

@@ -1,0 +1,243 @@
+"""Keypoints and matches of photographs by a network that the user names, where SIFT's do not suffice.
+
+The network is one ONNX file. It takes an image, colours in [0, 1], and returns `keypoints` [K, 2] in pixels of its input (pixel
+centres at +0.5), `scores` [K], positive where there is a keypoint, and `descriptors` [K, D] of length 1.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.poses.pairs import choose_pairs
+from warpgs.runtime.onnx_session import first_line, read_model, start_session
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+OUTPUTS = ("keypoints", "scores", "descriptors")
+SIDE = 1024
+"""Longer side at which the network sees a photograph [px]."""
+MULTIPLE = 32
+"""Both sides are multiples of this [px], the coarsest stride of such networks."""
+MAX_KEYPOINTS = 4096
+"""Most keypoints of a photograph, those of the highest score."""
+MAX_CHANNELS = 256
+"""Longest descriptor."""
+MIN_COSINE = 0.82
+"""Smallest cosine of the descriptors of a match: that of XFeat (Potje et al. 2024)."""
+TURN_SIDE, TURN_KEYPOINTS = 512, 512
+"""Longer side [px] and keypoints of a photograph when it is found out how photographs are turned to each other."""
+TURN_GAIN = 2
+"""Matches with a turned photograph over those with it upright from which it counts as turned: networks know no turns."""
+WHOLE = 2047
+"""Factor of descriptors before they are rounded: sums of their products stay below 2^24, where float32 is exact."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of one photograph."""
+
+    pixels: np.ndarray
+    """Positions [px of the photograph], float32 [K, 2], pixel centres at +0.5."""
+    descriptors: np.ndarray
+    """Descriptors times `WHOLE`, whole numbers as int16 [K, D]."""
+
+
+@dataclass(frozen=True)
+class Matcher:
+    """An opened network for keypoints."""
+
+    path: Path
+    """File of the network."""
+    sha256: str
+    """SHA-256 of the file, hexadecimal."""
+    session: InferenceSession
+    """The onnxruntime session."""
+    size: tuple[int, int] | None
+    """Height and width [px] that the graph fixes; None where both are free."""
+
+    @property
+    def title(self) -> str:
+        """File name and first digits of the hash, for reports."""
+        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+
+    def features(self, image: np.ndarray, turns: int = 0, side: int = SIDE, most: int = MAX_KEYPOINTS) -> Features:
+        """Return the keypoints of an image.
+
+        Args:
+            image: The image as it is, uint8 RGB [H, W, 3].
+            turns: Quarter turns to the left after which the network sees it.
+            side: Longer side at which the network sees it [px], unless its graph fixes the size.
+            most: Largest number of keypoints, those of the highest score.
+
+        Raises:
+            DataError: onnxruntime cannot run the network, or its outputs are not those of a matcher.
+        """
+        import cv2
+
+        image = np.ascontiguousarray(np.rot90(image, turns))
+        height, width = image.shape[:2]
+        h, w = self.size or _network_size(height, width, side)
+        seen = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if w <= width else cv2.INTER_CUBIC)
+        batch = np.ascontiguousarray((seen.astype(np.float32) / 255).transpose(2, 0, 1)[None])
+        try:
+            found = self.session.run(list(OUTPUTS), {self.session.get_inputs()[0].name: batch})
+        except Exception as e:  # onnxruntime's errors share no base but Exception
+            raise DataError(f"{self.path}: onnxruntime cannot run it on an image of {w} x {h} px ({first_line(e)}); export it "
+                            "again") from e  # fmt: skip
+        keypoints, scores, descriptors = (np.asarray(a) for a in found)
+        self._check(keypoints, scores, descriptors, h, w)
+        order = np.argsort(-scores, kind="stable")[:most]
+        order = order[scores[order] > 0]
+        pixels = keypoints[order] * np.array([width / w, height / h])
+        for _ in range(turns % 4):
+            pixels, height, width = np.stack([height - pixels[:, 1], pixels[:, 0]], 1), width, height
+        whole = np.round(descriptors[order] * WHOLE).astype(np.int16)
+        return Features(pixels.astype(np.float32), whole)
+
+    def _check(self, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray, h: int, w: int) -> None:
+        """Raise a DataError if these are not the keypoints of an image of ``h`` x ``w`` px."""
+        shapes = ", ".join(f"{n} {list(a.shape)}" for n, a in zip(OUTPUTS, (keypoints, scores, descriptors)))
+        count = len(scores) if scores.ndim == 1 else -1
+        if keypoints.shape != (count, 2) or descriptors.ndim != 2 or len(descriptors) != count:
+            raise DataError(f"{self.path}: returned {shapes}, not K x 2, K and K x D numbers; export it again")
+        if not 0 < descriptors.shape[1] <= MAX_CHANNELS:
+            raise DataError(f"{self.path}: its descriptors have {descriptors.shape[1]} numbers, not 1 to {MAX_CHANNELS}")
+        if not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors)):
+            raise DataError(f"{self.path}: its outputs hold NaN, infinity or no floating-point numbers; check its weights")
+        there = scores > 0
+        inside = (keypoints >= 0) & (keypoints <= [w, h])
+        if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
+            raise DataError(f"{self.path}: its keypoints lie outside the image, or its descriptors are not of length 1; export "
+                            "it with keypoints in pixels and normalised descriptors")  # fmt: skip
+
+
+def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
+    """Return the height and width [px] at which a network sees a photograph, the longer one about ``side``."""
+    scale = side / max(height, width) / MULTIPLE
+    return max(1, round(scale * height)) * MULTIPLE, max(1, round(scale * width)) * MULTIPLE
+
+
+def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
+    """Open an ONNX file and check that it maps one image to keypoints.
+
+    Args:
+        path: The file; its weights must be inside.
+        threads: CPU threads; 0 for as many as the process may use.
+
+    Raises:
+        DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
+        ResourceError: onnxruntime is not there.
+    """
+    path = Path(path)
+    data = read_model(path)
+    session = start_session(data, path, "cpu", threads)
+    remedy = "give a file of `warpgs priors export --model xfeat`"
+    try:
+        inputs, outputs = session.get_inputs(), [o.name for o in session.get_outputs()]
+    except UnicodeDecodeError as e:
+        raise DataError(f"{path}: the name of an input or an output is not UTF-8; {remedy}") from e
+    shape = list(inputs[0].shape) if len(inputs) == 1 else []
+    if len(shape) != 4 or shape[:2] != [1, 3] or inputs[0].type != "tensor(float)":
+        raise DataError(f"{path}: a matcher takes one float image 1 x 3 x height x width; {remedy}")
+    if missing := [n for n in OUTPUTS if n not in outputs]:
+        raise DataError(f"{path}: is no matcher, as it has no output {' and '.join(missing)}; {remedy}")
+    fixed = [n for n in shape[2:] if isinstance(n, int) and n > 0]
+    if len(fixed) == 1:
+        raise DataError(f"{path}: its input fixes only one side of the image; export it with both fixed or both free")
+    return Matcher(path, hashlib.sha256(data).hexdigest(), session, (fixed[0], fixed[1]) if fixed else None)
+
+
+def mutual_matches(a: Features, b: Features) -> np.ndarray:
+    """Return the pairs of keypoints that are each other's most similar ones, uint32 [M, 2]."""
+    if not (len(a.pixels) and len(b.pixels)):
+        return np.zeros((0, 2), np.uint32)
+    products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T
+    best, back = products.argmax(1), products.argmax(0)
+    rows = np.arange(len(best))
+    good = (back[best] == rows) & (products[rows, best] > MIN_COSINE * WHOLE**2)
+    return np.stack([rows[good], best[good]], 1).astype(np.uint32)
+
+
+def _read(path: Path) -> np.ndarray:
+    """Return the copy of a photograph, uint8 RGB [H, W, 3]."""
+    import cv2
+
+    return np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
+
+
+def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the quarter turns to the left after which photographs have the same side up, most of them none.
+
+    Each pair is matched with the second photograph in all four turns. The pairs with the most matches, a maximum spanning tree,
+    decide.
+
+    Args:
+        matcher: The network.
+        images: The photographs, uint8 RGB [H, W, 3].
+        pairs: Pairs of photographs that may show the same place.
+    """
+    found = [[matcher.features(image, t, TURN_SIDE, TURN_KEYPOINTS) for t in range(4)] for image in images]
+    links = []
+    for i, j in pairs:
+        counts = [len(mutual_matches(found[i][0], turned)) for turned in found[j]]
+        best = int(np.argmax(counts))
+        turn = best if counts[best] >= TURN_GAIN * counts[0] else 0
+        links.append((-counts[turn], i, j, turn))
+    group = {i: {i: 0} for i in range(len(found))}  # photographs joined so far, each with its turns
+    for _, i, j, turn in sorted(links):
+        if group[i] is not group[j]:
+            more = group[i][i] + turn - group[j][j]
+            group[i].update({k: (t + more) % 4 for k, t in group[j].items()})
+            group.update(dict.fromkeys(group[j], group[i]))
+    turns = [group[i][i] for i in range(len(found))]
+    first = int(np.argmax(np.bincount(turns, minlength=4))) if turns else 0
+    return [(t - first) % 4 for t in turns]
+
+
+def write_matches(
+    matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Callable[[str], object]
+) -> list[int]:
+    """Find keypoints and matches of photographs, and write them for the worker.
+
+    Args:
+        matcher: The network.
+        images: Copies of the photographs that are matched, PNG.
+        out: File to write, .npz.
+        kind: photographs or video.
+        exhaustive: Most photographs of which all pairs are matched.
+        progress: Called with lines for the user.
+
+    Returns:
+        The photographs that the network saw turned, since so they match others.
+    """
+    found = []
+    for i, image in enumerate(images):
+        progress(f"finding features: photograph {i + 1} of {len(images)}")
+        found.append(matcher.features(_read(image)))
+    pairs = [(i, j) for j in range(len(found)) for i in range(j)]
+    if len(found) > exhaustive:
+        pairs = choose_pairs([(f.descriptors // 16 + 128).astype(np.uint8) for f in found], kind)
+    turned = []
+    if kind == "photographs":
+        progress("finding turned photographs")
+        turns = quarter_turns(matcher, map(_read, images), pairs)
+        turned = [i for i, t in enumerate(turns) if t]
+        for i in turned:
+            found[i] = matcher.features(_read(images[i]), turns[i])
+    matches = []
+    for k, (i, j) in enumerate(pairs):
+        progress(f"matching: pair {k + 1} of {len(pairs)}")
+        matches.append(mutual_matches(found[i], found[j]))
+    np.savez(
+        out, keypoints=np.concatenate([f.pixels for f in found]), per_photograph=np.array([len(f.pixels) for f in found]),
+        pairs=np.array(pairs).reshape(-1, 2), matches=np.concatenate(matches), counts=np.array([len(m) for m in matches]),
+    )  # fmt: skip
+    return turned
