@@ -1,82 +1,93 @@
-"""Rendering and its gradients, and a whole training step, beside gsplat 1.5.3 on the same inputs in the same run.
+"""Images, gradients and training steps beside gsplat, Faster-GS and gswarp, on the same inputs in the same run.
 
---kernels lists our kernels by GPU time.
-Needs a CUDA device and gsplat 1.5.3 (`pip install gsplat==1.5.3`, which builds itself on first use).
+Directions: `image` without gradients, `forward` as it precedes a backward pass, `both`. GPU time is the sum of the kernels'
+durations; wall time runs from an idle device to an idle device, in turn, repeat by repeat. Memory is the peak of `both` above
+the inputs.
+Needs a CUDA device; peers that cannot be imported are left out, with the reason. --kernels lists our kernels by GPU time.
 """
 
 from __future__ import annotations
 
-import gc
-import statistics
-from collections import Counter
+import contextlib
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
-import warp as wp
 
-from bench.lib import result_file
+from bench.lib import rasterizers, result_file
 from bench.lib.arguments import parse
+from bench.lib.gpu_times import gpu_times, peak_memory
 from bench.lib.inputs import first_camera, garden_inputs
-from bench.lib.peers import gsplat_rasterize, torch_ssim
-from bench.lib.timing import measure_in_turn, recorded
+from bench.lib.peers import torch_ssim
+from bench.lib.rasterizers import ATOMIC, GSPLAT, MANY_CHANNELS, OURS, UNRECORDED, Drawing
+from bench.lib.timing import measure_in_turn
 from bench.lib.training import Steps
-from warpgs import RasterizeOptions, clear_graph_cache, rasterize
-from warpgs.constants import RULES
-from warpgs.kernels.project import project
 from warpgs.scene import Camera, Gaussians
 
-WHAT = "rendering, its gradients and a training step beside gsplat on the same inputs in the same run"
+WHAT = "images, gradients and training steps beside other rasterizers on the same inputs in the same run"
 CONFIGURATIONS = {
     "112k at 504x378": (1, 504, 378),
     "112k at 1920x1080": (1, 1920, 1080),
     "2.8M at 1920x1080": (5, 1920, 1080),
     "2.8M at 3840x2160": (5, 3840, 2160),
 }
-REPEATS = 30
-WARM_UP = 5
+RULE = "gsplat-1.6"
+VARIANTS = {OURS: {}, UNRECORDED: {"record": False}, ATOMIC: {"deterministic": False}}
+CHANNELS = (3, 32)
+CUDA = torch.device("cuda")
 
 
-def ours(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor, **choices):
-    """Work: our rendering and the gradients of all five tensors."""
-    leaves, options = list(gaussians.tensors().values()), RasterizeOptions(rule="gsplat-1.5", **choices)
+def works_of(drawing: Drawing, upstream: torch.Tensor) -> dict[str, Callable[[], object]]:
+    """Return the work of each direction; ``upstream`` is the gradient of the image [H, W, D]."""
+    native = drawing.upstream(upstream)
 
-    def work():
-        return torch.autograd.grad(rasterize(gaussians, camera, options).rgb, leaves, upstream)
+    def image():
+        with torch.no_grad():
+            return drawing.draw()
 
-    return work
-
-
-def peer(gaussians: Gaussians, camera: Camera, upstream: torch.Tensor, packed: bool):
-    """Work: gsplat's rendering and the gradients of the same tensors; exp and sigmoid are torch's, as in its trainer."""
-    leaves = list(gaussians.tensors().values())
-    return lambda: torch.autograd.grad(gsplat_rasterize(gaussians, camera, packed), leaves, upstream)
+    return {"image": image, "forward": drawing.draw, "both": lambda: drawing.gradients(native)}
 
 
-def count_instances(gaussians: Gaussians, camera: Camera) -> int:
-    """Return the (Gaussian, tile) instances of an image."""
-    size = {"width": camera.width, "height": camera.height}
+def drawings(g: Gaussians, camera: Camera, channels: int, present: dict) -> dict[str, Drawing]:
+    """Return the scene as each program takes it: with coefficients for 3 channels, with plain colours for more."""
+    if channels == 3:
+        made = {who: rasterizers.ours(g, camera, rule=RULE, **how) for who, how in VARIANTS.items()}
+        return made | {who: prepare(g, camera) for who, prepare in present.items()}
+    generator = torch.Generator(g.means.device).manual_seed(3)
+    colors = torch.rand(len(g), channels, device=g.means.device, generator=generator)
+    made = {who: rasterizers.ours(g, camera, colors, rule=RULE, **VARIANTS[who]) for who in (OURS, ATOMIC)}
+    return made | {who: prepare(g, camera, colors) for who, prepare in present.items() if who in MANY_CHANNELS}
+
+
+def compare(g: Gaussians, camera: Camera, channels: int, present: dict, repeats: int, kernels: bool) -> dict:
+    """Return times by direction and program, peak memory, and the programs' differences from gsplat's image."""
+    generator = torch.Generator(g.means.device).manual_seed(1)
+    upstream = torch.rand(camera.height, camera.width, channels, device=g.means.device, generator=generator)
+    made = drawings(g, camera, channels, present)
+    works = {who: works_of(drawing, upstream) for who, drawing in made.items()}
+    row: dict = {"channels": channels, "wall_ms": {}, "gpu_ms": {}, "peak_mib": {}}
+    for direction in ("image", "forward", "both"):
+        rows = measure_in_turn([w[direction] for w in works.values()], CUDA, repeats)
+        keep = {who: {"median": r["median_ms"], "quartiles": r["quartiles_ms"]} for who, r in zip(works, rows, strict=True)}
+        row["wall_ms"][direction] = keep
+        row["gpu_ms"][direction] = {}
+        for who, w in works.items():
+            row["gpu_ms"][direction][who], by_kernel = gpu_times(w[direction], repeats)
+            if kernels and who == OURS:
+                row.setdefault("kernels_us", {})[direction] = {k: round(v, 1) for k, v in by_kernel.most_common(24)}
+    row["peak_mib"] = {who: round(peak_memory(w["both"]), 1) for who, w in works.items()}
     with torch.no_grad():
-        tensors = gaussians.tensors().values()
-        counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES["gsplat-1.5"])[1]
-    return int(counts.sum())
+        images = {who: drawing.image() for who, drawing in made.items()}
+        row["image_difference"] = {who: float((image - images[OURS]).abs().mean()) for who, image in images.items()}
+    return row
 
 
-def in_calling_thread(work):
-    """The same work with its backward pass in the caller's thread: torch hands it to another one otherwise, and waits."""
-
-    def here():
-        with torch.autograd.set_multithreading_enabled(False):
-            return work()
-
-    return here
-
-
-def peer_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
-    """Work: the same step in the manner of gsplat's trainer: coefficients in two tensors, its fused Adam, torch SSIM."""
+def peer_step(g: Gaussians, camera: Camera, target: torch.Tensor):
+    """Work: a training step in the manner of gsplat's trainer: coefficients in two tensors, its fused Adam, torch SSIM."""
     from gsplat import rasterization
     from gsplat.optimizers import SelectiveAdam
 
-    params = {n: t.detach().clone().requires_grad_() for n, t in gaussians.tensors().items()}
+    params = {n: t.detach().clone().requires_grad_() for n, t in g.tensors().items()}
     sh = params.pop("sh").detach()
     params |= {"sh0": sh[:, :1].clone().requires_grad_(), "shN": sh[:, 1:].clone().requires_grad_()}
     optimizers = [SelectiveAdam([{"params": [p], "lr": 1e-3}], eps=1e-15, betas=(0.9, 0.999)) for p in params.values()]
@@ -85,11 +96,11 @@ def peer_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
         rgb, _, info = rasterization(
             params["means"], params["quats"], params["log_scales"].exp(), params["logit_opacities"].sigmoid(),
             torch.cat([params["sh0"], params["shN"]], 1), camera.viewmat, camera.K, camera.width, camera.height,
-            sh_degree=gaussians.sh_degree, packed=False,
+            sh_degree=g.sh_degree, packed=False,
         )  # fmt: skip
         loss = 0.8 * (rgb[0] - target).abs().mean() + 0.2 * (1 - torch_ssim(rgb[0], target).mean())
         loss.backward()
-        visible = (info["radii"] > 0).flatten(2).all(-1).any(0) if info["radii"].ndim == 3 else (info["radii"] > 0).any(0)
+        visible = (info["radii"] > 0).all(-1).any(0)
         for optimizer in optimizers:
             optimizer.step(visible)
             optimizer.zero_grad(set_to_none=True)
@@ -97,133 +108,50 @@ def peer_step(gaussians: Gaussians, camera: Camera, target: torch.Tensor):
     return work
 
 
-def wall_times(works: dict) -> dict[str, dict]:
-    """Return the wall time of each work [ms], repeat by repeat in turn, the device drained around each."""
-    rows = measure_in_turn(list(works.values()), torch.device("cuda"), REPEATS)
-    return {n: {"median": r["median_ms"], "quartiles": r["quartiles_ms"], "repeats": REPEATS} for n, r in zip(works, rows)}
+def steps(g: Gaussians, camera: Camera, present: dict, repeats: int) -> dict:
+    """Return the wall time of a training step: ours as a graph, gsplat's with torch."""
+    shape = (camera.height, camera.width, 3)
+    target = torch.rand(shape, device=g.means.device, generator=torch.Generator(g.means.device).manual_seed(2))
+    works = {f"{OURS} graph": Steps(g, camera, target, RULE).replay}
+    if GSPLAT in present:
+        works["gsplat"] = peer_step(g, camera, target)
+    rows = measure_in_turn(list(works.values()), CUDA, repeats)
+    return {who: {"median": r["median_ms"], "quartiles": r["quartiles_ms"]} for who, r in zip(works, rows, strict=True)}
 
 
-def gpu_times(work, repeats: int = REPEATS) -> tuple[dict, Counter]:
-    """GPU time of a work [ms]: the sum of its kernels' durations as the driver's tracer reports them; and by kernel."""
-    from torch.profiler import ProfilerActivity, profile
-
-    for _ in range(WARM_UP):
-        work()
-    torch.cuda.synchronize()
-    totals, kernels = [], Counter()
-    for _ in range(3):  # several short traces: a spread, and no trace so long that events are dropped
-        with profile(activities=[ProfilerActivity.CUDA]) as trace:
-            for _ in range(repeats // 3):
-                work()
-            torch.cuda.synchronize()
-        total = 0.0
-        for event in trace.events():
-            if event.device_type == torch.autograd.DeviceType.CUDA:
-                total += event.device_time
-                kernels[event.name] += event.device_time / repeats
-        totals.append(total / (repeats // 3) / 1000)
-    return {"median": round(statistics.median(totals), 4), "spread": [round(min(totals), 4), round(max(totals), 4)]}, kernels
-
-
-def _set_aside() -> int:
-    """Return the bytes that captured graphs hold and torch counts as free, in whole segments."""
-    segments = [s for s in torch.cuda.memory_snapshot() if tuple(s["segment_pool_id"]) != (0, 0)]
-    return sum(s["total_size"] - s["active_size"] for s in segments)
-
-
-def peak_memory(work) -> float:
-    """Return the memory above what was loaded before [MiB]: torch's high-water mark, and that of Warp's pool where it grew.
-
-    Where a loop of ``work`` is captured, all memory counts that is set aside for graphs, which that mark does not show: in
-    whole segments, so rather too much.
-    """
-    clear_graph_cache()
-    gc.collect()
-    torch.cuda.synchronize()
-    torch.cuda.empty_cache()
-    device = wp.device_from_torch(torch.device("cuda", torch.cuda.current_device()))
-    loaded, pool, aside = torch.cuda.memory_allocated(), wp.get_mempool_used_mem_current(device), _set_aside()
-    for _ in range(WARM_UP):
-        work()
-    torch.cuda.synchronize()
-    torch.cuda.reset_peak_memory_stats()
-    work()
-    torch.cuda.synchronize()
-    highest, warp_peak = torch.cuda.max_memory_allocated() - loaded, wp.get_mempool_used_mem_high(device) - pool
-    unseen = max(0, _set_aside() - aside)
-    clear_graph_cache()
-    return (highest + unseen + max(0, warp_peak)) / 2**20
-
-
-def compare(path: Path, name: str, kernels: bool) -> dict:
-    """One configuration: wall time, GPU time and memory of both programs, and ratios."""
-    tiles, width, height = CONFIGURATIONS[name]
-    gaussians, cameras = garden_inputs(path, tiles=tiles, sh_degree=3, width=width, height=height)
-    camera = first_camera(cameras)
-    upstream = torch.rand(1, height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(1))
-    capacity = int(1.3 * count_instances(gaussians, camera))
-    works = {
-        "warpgs": ours(gaussians, camera, upstream),
-        "warpgs, never recorded": ours(gaussians, camera, upstream, record=False),
-        "warpgs atomic": ours(gaussians, camera, upstream, deterministic=False),
-        "warpgs graph": recorded(ours(gaussians, camera, upstream, capacity=capacity)),
-    }
-    works |= {f"gsplat {kind}": peer(gaussians, camera, upstream, kind == "packed") for kind in ("dense", "packed")}
-    one = {f"{who}, one thread": in_calling_thread(works[who]) for who in ("warpgs", "warpgs, never recorded", "gsplat dense")}
-    row = {"configuration": name, "gaussians": len(gaussians), "wall_ms": wall_times(works | one)}
-    row |= {"gpu_ms": {}, "peak_mib": {}}
-    for who, work in works.items():
-        row["gpu_ms"][who], by_kernel = gpu_times(work)
-        if who != "warpgs graph":  # its memory is taken when it is recorded
-            row["peak_mib"][who] = round(peak_memory(work), 1)
-        if kernels and who == "warpgs":
-            row["kernels_us"] = {k: round(v, 1) for k, v in by_kernel.most_common(24)}
-    peers = [who for who in works if who.startswith("gsplat")]
-    for measure in ("wall_ms", "gpu_ms"):
-        best = min(row[measure][who]["median"] for who in peers)
-        row[f"{measure}_ratio"] = {w: round(row[measure][w]["median"] / best, 3) for w in works if w not in peers}
-    *alone, theirs = (row["wall_ms"][who]["median"] for who in one)
-    row["wall_ms_ratio"] |= {who: round(own / theirs, 3) for who, own in zip(one, alone)}
-    least = min(row["peak_mib"][who] for who in peers)
-    row["peak_ratio"] = {w: round(mib / least, 3) for w, mib in row["peak_mib"].items() if w not in peers}
-    del works, work
-    target = torch.rand(height, width, 3, device="cuda", generator=torch.Generator("cuda").manual_seed(2))
-    steps = {
-        "warpgs graph": Steps(gaussians, camera, target, "gsplat-1.5").replay,
-        "gsplat": peer_step(gaussians, camera, target),
-    }
-    row["step_wall_ms"] = wall_times(steps)
-    row["step_ratio"] = round(row["step_wall_ms"]["warpgs graph"]["median"] / row["step_wall_ms"]["gsplat"]["median"], 3)
-    if kernels:
-        row["step_gpu_ms"], by_kernel = gpu_times(steps["warpgs graph"])
-        row["step_kernels_us"] = {k: round(v, 1) for k, v in by_kernel.most_common(40)}
-    return row
+def report(row: dict) -> None:
+    """Print a line for each program."""
+    print(f"{row['configuration']}, {row['channels']} channels: GPU ms image / forward / both; wall ms; MiB; image difference")
+    for who in row["peak_mib"]:
+        gpu, wall = ([row[kind][d][who]["median"] for d in row[kind]] for kind in ("gpu_ms", "wall_ms"))
+        figures = "  ".join(" / ".join(f"{v:7.3f}" for v in values) for values in (gpu, wall))
+        print(f"  {who:<24} {figures}  {row['peak_mib'][who]:8.1f}  {row['image_difference'][who]:.1e}", flush=True)
+    for who, wall in row.get("step_wall_ms", {}).items():
+        print(f"  {who:<24} step {wall['median']:7.3f}", flush=True)
 
 
 def main() -> None:
-    """Measure, print a line per configuration, write."""
-    a = parse(__doc__, None, {"garden": Path}, out=Path, only="", kernels=False)
+    """Measure, print, write after each configuration."""
+    flags = {"repeats": 21, "only": "", "kernels": False, "without_steps": False}
+    a = parse(__doc__, None, {"garden": Path}, out=Path, **flags)
+    present, absent = rasterizers.present(CUDA)
+    for who, reason in absent.items():
+        print(f"without {who}: {reason}")
     rows = []
-    for name in CONFIGURATIONS:
+    for name, (tiles, width, height) in CONFIGURATIONS.items():
         if not name.startswith(a.only):
             continue
-        row = compare(a.garden, name, a.kernels)
-        rows.append(row)
-        if a.kernels:
-            for kernel, microseconds in (row["kernels_us"] | {"step:": 0.0} | row["step_kernels_us"]).items():
-                print(f"    {microseconds:9.1f} us  {kernel[:100]}")
-        for who in row["wall_ms"]:
-            wall, gpu = row["wall_ms"][who], row["gpu_ms"].get(who)
-            figures = f"wall {wall['median']:7.3f} {wall['quartiles']}"
-            if gpu is not None:
-                figures += f"  GPU {gpu['median']:7.3f} {gpu['spread']} ms  peak {row['peak_mib'].get(who, 0):7.1f} MiB"
-            print(f"{name:<18} {who:<24} {figures}")
-        for who, wall in row["step_wall_ms"].items():
-            print(f"{name:<18} {who:<14} step {wall['median']:7.3f} {wall['quartiles']} ms")
-        ratios = f"wall {row['wall_ms_ratio']}, GPU {row['gpu_ms_ratio']}, memory {row['peak_ratio']}, step {row['step_ratio']}"
-        print(f"{name:<18} ratios: {ratios}", flush=True)
-        torch.cuda.empty_cache()
-    result_file.keep(a.out, WHAT, torch.device("cuda"), rows)
+        g, cameras = garden_inputs(a.garden, tiles=tiles, sh_degree=3, width=width, height=height)
+        camera = first_camera(cameras)
+        for channels in CHANNELS:
+            row = {"configuration": name, "gaussians": len(g)} | compare(g, camera, channels, present, a.repeats, a.kernels)
+            if channels == 3 and not a.without_steps:
+                with contextlib.suppress(torch.cuda.OutOfMemoryError):
+                    row["step_wall_ms"] = steps(g, camera, present, a.repeats)
+            rows.append(row)
+            report(row)
+            result_file.keep(a.out, WHAT, CUDA, rows, repeats=a.repeats, absent=absent)
+            torch.cuda.empty_cache()
 
 
 if __name__ == "__main__":
