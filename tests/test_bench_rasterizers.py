@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from bench.lib import inputs, naive, rasterizers
+from bench.lib import inputs, naive, rasterizers, rasterizers_page
+from bench.lib.buffers import BLEND, PROJECT, Counts, at_most, buffers
 from bench.lib.gradient_errors import TENSORS, errors_of
 from bench.lib.rasterizers import Drawing
 from warpgs import RasterizeOptions, rasterize
@@ -104,3 +105,54 @@ def test_naive_layers_are_the_most_that_a_pixel_blends():
     assert np.isclose(
         float(naive.rasterize(g, inputs.camera(48, 36, CPU)).mean()), float(rasterize(g, inputs.camera(48, 36, CPU)).rgb.mean())
     )
+
+
+def result_of_others() -> dict:
+    """A result as `bench.peers.against_others` writes it, of one configuration."""
+    programs = {"warpgs": 1.0, "warpgs atomic": 0.9, "gsplat dense": 2.0, "Faster-GS": 1.25}
+    times = {d: {who: {"median": t * k} for who, t in programs.items()} for d, k in (("image", 1), ("forward", 2), ("both", 5))}
+    size = {"gaussians": 1000, "visible": 900, "instances": 4000, "width": 320, "height": 240}
+    row = {
+        "configuration": "1k at 320x240",
+        **size,
+        "gpu_ms": times,
+        "wall_ms": times,
+        "peak_mib": dict.fromkeys(programs, 3.5),
+    }
+    steps = {"warpgs graph": {"median": 2.0}, "gsplat": {"median": 8.0}}
+    return {"rows": [row | {"channels": 3, "step_wall_ms": steps}, row | {"channels": 32}]}
+
+
+def test_tables_of_other_rasterizers():
+    """Each program has its row; ratios and sums are right."""
+    result = result_of_others()
+    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 | 1.25 | 6.25 | 3.5 |" in rasterizers_page.times_table(result)
+    assert "| 1k, 320 x 240 | gsplat dense | 2 | 4 | 10 | 3.5 |" in rasterizers_page.channels_table(result)
+    assert "Faster-GS" not in rasterizers_page.channels_table(result)
+    assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)
+    made = rasterizers_page.buffers_table(result)
+    assert "| gradient of each instance | blending | 0.183 |" in made and "| measured: gsplat dense |  | 3.5 |" in made
+
+
+def test_buffers_are_those_of_one_moment():
+    """Slots and states count while blending, parameters while projecting; atomic sums need no slots."""
+    many, wide = Counts(10**6, 10**5, 10**5, 64, 64), Counts(100, 100, 10**6, 1920, 1080)
+    assert at_most(many) == sum(size for size, moments in buffers(many).values() if PROJECT in moments)
+    assert at_most(wide) == sum(size for size, moments in buffers(wide).values() if BLEND in moments)
+    assert at_most(wide) - at_most(wide, False) == 48 * 10**6 and at_most(many) == at_most(many, False)
+
+
+def test_the_table_of_gradients_says_where_ours_are_not_lowest():
+    """The worst of five tensors stands for the whole; a lower 99th percentile of a peer is named."""
+    same = {"median": 1e-7, "largest": 1e-3, "one_minus_cosine": 1e-12, "bias": 1e-8}
+    rows = [
+        {"scene": "garden", "rule": "gsplat-1.6", "program": who, "tensor": t, "p99": p, **same}
+        for who, p in (("warpgs", 1e-6), ("warpgs atomic", 1e-7), ("gsplat dense", 1e-5))
+        for t in TENSORS
+    ]
+    result = {"rows": rows, "judge": {"exact": 1e-9}}
+    assert "Ours are lowest at every 99th percentile." in rasterizers_page.gradients_table(result)
+    rows[-1] |= {"p99": 1e-8, "bias": -2e-8}
+    made = rasterizers_page.gradients_table(result)
+    assert "Not lowest at the 99th percentile: sh of `garden` (gsplat dense 1.0e-08, ours 1.0e-06)." in made
+    assert "| garden | `gsplat-1.6` | gsplat dense | 1.0e-05 |" in made and "-2.0e-08" in made

@@ -22,6 +22,8 @@ from bench.lib.peers import torch_ssim
 from bench.lib.rasterizers import ATOMIC, GSPLAT, MANY_CHANNELS, OURS, UNRECORDED, Drawing
 from bench.lib.timing import measure_in_turn
 from bench.lib.training import Steps
+from warpgs.constants import RULES
+from warpgs.kernels.project import project
 from warpgs.scene import Camera, Gaussians
 
 WHAT = "images, gradients and training steps beside other rasterizers on the same inputs in the same run"
@@ -82,6 +84,15 @@ def compare(g: Gaussians, camera: Camera, channels: int, present: dict, repeats:
         images = {who: drawing.image() for who, drawing in made.items()}
         row["image_difference"] = {who: float((image - images[OURS]).abs().mean()) for who, image in images.items()}
     return row
+
+
+def counts_of(g: Gaussians, camera: Camera) -> dict[str, int]:
+    """Return how many Gaussians are visible, and how many (Gaussian, tile) instances they make."""
+    size = {"width": camera.width, "height": camera.height}
+    with torch.no_grad():
+        tensors = g.tensors().values()
+        counts = project(*tensors, camera.viewmat, camera.K, **size, degree=0, rule=RULES[RULE])[1]
+    return {"visible": int((counts > 0).sum()), "instances": int(counts.sum())}
 
 
 def peer_step(g: Gaussians, camera: Camera, target: torch.Tensor):
@@ -146,7 +157,8 @@ def main() -> None:
         g, cameras = garden_inputs(a.garden, tiles=tiles, sh_degree=3, width=width, height=height)
         camera = first_camera(cameras)
         for channels in CHANNELS:
-            row = {"configuration": name, "gaussians": len(g)} | compare(g, camera, channels, present, a.repeats, a.kernels)
+            row = {"configuration": name, "gaussians": len(g), "width": width, "height": height} | counts_of(g, camera)
+            row |= compare(g, camera, channels, present, a.repeats, a.kernels)
             if channels == 3 and not a.without_steps:
                 with contextlib.suppress(torch.cuda.OutOfMemoryError):
                     row["step_wall_ms"] = steps(g, camera, present, a.repeats)
