@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+import warp as wp
 
 from bench.lib import inputs, peers
 from warpgs import RasterizeOptions, rasterize
@@ -19,6 +20,8 @@ from warpgs.scene import Camera, Gaussians
 OURS = "warpgs"
 UNRECORDED = "warpgs, never recorded"
 ATOMIC = "warpgs atomic"
+FAST_MATH = "warpgs fast math"
+"""Our kernels under CUDA's fast math, which no option of ours turns on."""
 GSPLAT = "gsplat dense"
 GSPLAT_PACKED = "gsplat packed"
 FASTER_GS = "Faster-GS"
@@ -60,6 +63,18 @@ class Drawing:
         if "sh0" in found:
             found["sh"] = torch.cat([found.pop("sh0"), found.pop("sh_rest")], 1)
         return {name: g.squeeze(-1) if name == "logit_opacities" and g.ndim == 2 else g for name, g in found.items()}
+
+
+def compile_with_fast_math() -> None:
+    """Have kernels that are made from now on compiled with CUDA's fast math, in single precision."""
+    module = type(wp.get_module("bench.lib.rasterizers"))
+    made = module.__init__
+
+    def make(self, *given, **named):
+        made(self, *given, **named)
+        self.options["fast_math"] = True
+
+    module.__init__ = make
 
 
 def _leaves(g: Gaussians) -> dict[str, torch.Tensor]:

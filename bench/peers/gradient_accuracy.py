@@ -3,6 +3,7 @@
 The judge is our float64 pass under the cut-offs of the program that is judged, so that an error is arithmetic and no choice
 of model; before that it is compared with the derivative that torch takes of a plain program in float64. Each peer stands
 beside our kernels under its own cut-offs. The gradient is that of a sum of the image with random weights of both signs.
+--fast-math measures our kernels alone, compiled with CUDA's fast math.
 A Gaussian whose alpha rounds to the other side of a cut-off in some pixel is among the largest errors, of every program.
 """
 
@@ -17,7 +18,7 @@ from bench.lib import frozen, rasterizers, result_file
 from bench.lib.arguments import parse
 from bench.lib.gradient_errors import TENSORS, errors_of
 from bench.lib.inputs import first_camera, garden_inputs
-from bench.lib.rasterizers import ATOMIC, GSPLAT_PACKED, OURS, RULE_OF, Drawing
+from bench.lib.rasterizers import ATOMIC, FAST_MATH, GSPLAT_PACKED, OURS, RULE_OF, Drawing
 from warpgs.constants import RULES, Rule
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.scene import Camera, Gaussians
@@ -63,8 +64,11 @@ def judged(g: Gaussians, camera: Camera, rule: Rule, weights: torch.Tensor) -> d
     return rasterizers.ours(double, batch(camera, double.means), rule=rule).named_gradients(weights.double())
 
 
-def programs(g: Gaussians, camera: Camera, present: dict, device: torch.device):
-    """Yield each rule with its programs: our two ways to sum, and the peer with these cut-offs."""
+def programs(g: Gaussians, camera: Camera, present: dict, device: torch.device, fast_math: bool = False):
+    """Yield each rule with its programs: our two ways to sum, and the peer with these cut-offs; or ours with fast math."""
+    if fast_math:
+        yield RULES["gsplat-1.6"], {FAST_MATH: rasterizers.ours(g, camera, rule="gsplat-1.6")}
+        return
     groups: dict[str, tuple[Rule, dict[str, Drawing]]] = {}
     peers = {who: prepare for who, prepare in present.items() if who != GSPLAT_PACKED}
     if device.type == "cpu":
@@ -96,10 +100,10 @@ def of_the_judge(device: torch.device) -> dict[str, float]:
     return found
 
 
-def measure(name: str, g: Gaussians, camera: Camera, present: dict, device: torch.device) -> list[dict]:
+def measure(name: str, g: Gaussians, camera: Camera, present: dict, device: torch.device, fast_math: bool) -> list[dict]:
     """Return a row for each program and parameter."""
     weights, rows = weights_of(camera, device), []
-    for rule, made in programs(g, camera, present, device):
+    for rule, made in programs(g, camera, present, device, fast_math):
         wanted = judged(g, camera, rule, weights)
         for who, drawing in made.items():
             found = drawing.named_gradients(weights)
@@ -111,9 +115,11 @@ def measure(name: str, g: Gaussians, camera: Camera, present: dict, device: torc
 
 def main() -> None:
     """Measure, print a line for each program, write."""
-    a = parse(__doc__, garden=Path, size=[504, 378], count=20_000, device="auto", out=Path)
+    a = parse(__doc__, garden=Path, size=[504, 378], count=20_000, device="auto", fast_math=False, out=Path)
     device, _ = choose_device(a.device)
-    present, absent = rasterizers.present(device) if device.type == "cuda" else ({}, {})
+    if a.fast_math:
+        rasterizers.compile_with_fast_math()
+    present, absent = rasterizers.present(device) if device.type == "cuda" and not a.fast_math else ({}, {})
     for who, reason in absent.items():
         print(f"without {who}: {reason}")
     judge = of_the_judge(device)
@@ -121,7 +127,7 @@ def main() -> None:
     rows, facts = [], {}
     for name, words, g, camera in scenes(a.garden, device, *a.size, a.count):
         facts[name] = words
-        rows += measure(name, g, camera, present, device)
+        rows += measure(name, g, camera, present, device, a.fast_math)
         for rule, who in dict.fromkeys((r["rule"], r["program"]) for r in rows if r["scene"] == name):
             own = [r for r in rows if (r["scene"], r["rule"], r["program"]) == (name, rule, who)]
             worst = {k: max(own, key=lambda r: abs(r[k])) for k in ("median", "p99", "largest", "one_minus_cosine", "bias")}
