@@ -69,7 +69,14 @@ def compare(g: Gaussians, camera: Camera, channels: int, present: dict, repeats:
     upstream = torch.rand(camera.height, camera.width, channels, device=g.means.device, generator=generator)
     made = drawings(g, camera, channels, present)
     works = {who: works_of(drawing, upstream) for who, drawing in made.items()}
-    row: dict = {"channels": channels, "wall_ms": {}, "gpu_ms": {}, "peak_mib": {}}
+    row: dict = {"channels": channels, "wall_ms": {}, "gpu_ms": {}, "peak_mib": {}, "failed": {}}
+    for who in list(works):
+        try:
+            works[who]["image"]()
+            works[who]["both"]()
+        except Exception as e:  # whatever a foreign program fails with at this size, the others go on
+            row["failed"][who] = " ".join(f"{type(e).__name__}: {e}".split())[:200]
+            del works[who], made[who]
     for direction in ("image", "forward", "both"):
         rows = measure_in_turn([w[direction] for w in works.values()], CUDA, repeats)
         keep = {who: {"median": r["median_ms"], "quartiles": r["quartiles_ms"]} for who, r in zip(works, rows, strict=True)}
@@ -139,6 +146,8 @@ def report(row: dict) -> None:
         gpu, wall = ([row[kind][d][who]["median"] for d in row[kind]] for kind in ("gpu_ms", "wall_ms"))
         figures = "  ".join(" / ".join(f"{v:7.3f}" for v in values) for values in (gpu, wall))
         print(f"  {who:<24} {figures}  {row['peak_mib'][who]:8.1f}  {row['image_difference'][who]:.1e}", flush=True)
+    for who, reason in row["failed"].items():
+        print(f"  {who:<24} {reason}", flush=True)
     for who, wall in row.get("step_wall_ms", {}).items():
         print(f"  {who:<24} step {wall['median']:7.3f}", flush=True)
 
