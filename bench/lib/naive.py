@@ -1,6 +1,7 @@
 """Blending as one would first write it in Warp: a thread per pixel, scalar code, float atomics. A peer to compare with.
 
 The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so launch it there from one thread only.
+On CUDA Warp can make them repeatable (`wp.DeterministicMode`): it stores each of them as a record, and sorts and adds those.
 """
 
 import functools
@@ -72,10 +73,49 @@ def forward_kernel():
 
 
 @functools.cache
-def backward_kernel():
-    """Return the kernel of the gradients, which are added by float atomics."""
+def count_kernel():
+    """Return the kernel that counts the Gaussians that were blended into each pixel."""
 
-    @wp.kernel(enable_backward=False, module="bench.naive.backward")
+    @wp.kernel(enable_backward=False, module="bench.naive.count")
+    def count(
+        projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
+        width: int, height: int, columns: int, tiles: int, side: int, alpha_cut: float, ends: wp.array(dtype=int),
+        # outputs
+        counts: wp.array(dtype=int),
+    ):  # fmt: skip
+        i = wp.tid()
+        x = float(i % width) + 0.5
+        y = float((i // width) % height) + 0.5
+        tile = tile_of(i, width, height, columns, tiles, side)
+        n = int(0)
+        for k in range(ranges[tile, 0], ends[i]):
+            s = ids[k]
+            dx = x - projected[s, 0]
+            dy = y - projected[s, 1]
+            e1 = projected[s, 2] * dx + projected[s, 3] * dy
+            e2 = projected[s, 4] * dy
+            if projected[s, 5] * wp.exp(-0.5 * (e1 * e1 + e2 * e2)) >= alpha_cut:
+                n += 1
+        counts[i] = n
+
+    return count
+
+
+ATOMICS = 9
+"""Atomic additions of the backward kernel for each Gaussian blended into a pixel."""
+
+
+@functools.cache
+def backward_kernel(mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED, layers: int = 0):
+    """Return the kernel of the gradients, which are added by float atomics.
+
+    Args:
+        mode: What Warp guarantees of their order.
+        layers: Most Gaussians that are blended into a pixel, for which a guarantee takes memory.
+    """
+    options = {"deterministic": mode, "deterministic_max_records": ATOMICS * layers}
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def backward(
         projected: wp.array2d(dtype=float), ranges: wp.array2d(dtype=int), ids: wp.array(dtype=int),
         backgrounds: wp.array2d(dtype=float), width: int, height: int, columns: int, tiles: int, side: int,
@@ -130,7 +170,17 @@ def backward_kernel():
 class Naive:
     """The kernels bound to one set of inputs; colour only, neither alpha nor depth."""
 
-    def __init__(self, projected: torch.Tensor, tiles: Tiles, backgrounds: torch.Tensor, width: int, height: int, rule: Rule):
+    def __init__(
+        self,
+        projected: torch.Tensor,
+        tiles: Tiles,
+        backgrounds: torch.Tensor,
+        width: int,
+        height: int,
+        rule: Rule,
+        mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED,
+        layers: int = 0,
+    ):
         if not rule.inclusive_stop or rule.square_sigma:
             raise ValueError("the naive kernels know only the rule `exact`")
         cameras, pixels = len(backgrounds), len(backgrounds) * height * width
@@ -149,7 +199,7 @@ class Naive:
             interop.view(tiles.gaussian_ids, wp.int32), interop.view(backgrounds, wp.float32), width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
-        self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
+        self.stop, self.kept, self.how = rule.transmittance_stop, [transmittances, ends], (mode, layers)
         self.state = [interop.view(transmittances, wp.float32), interop.view(ends, wp.int32)]
 
     def _launch(self, kernel, inputs: list) -> None:
@@ -163,29 +213,54 @@ class Naive:
         self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
 
+    def layers(self) -> int:
+        """Return the most Gaussians that `forward` blended into a pixel."""
+        counts = torch.empty(self.pixels, dtype=torch.int32, device=self.rgb.device)
+        projected, ranges, ids, _, *sizes, alpha_cut, _ = self.inputs
+        outputs = [self.state[1], interop.view(counts, wp.int32)]
+        self._launch(count_kernel(), [projected, ranges, ids, *sizes, alpha_cut, *outputs])
+        return int(counts.max())
+
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Gradient of the records for an upstream gradient, after `forward`; shape [C, N, 12]."""
         self.v_projected.zero_()
         arrays = [interop.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
-        self._launch(backward_kernel(), [*self.inputs, *self.state, *arrays])
+        self._launch(backward_kernel(*self.how), [*self.inputs, *self.state, *arrays])
         return self.v_projected
 
 
 class _Blend(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, projected, tiles, width, height):
-        ctx.naive = Naive(projected, tiles, projected.new_zeros(len(projected), 3), width, height, RULES["exact"])
+    def forward(ctx, projected, tiles, width, height, how):
+        black = projected.new_zeros(len(projected), 3)
+        ctx.naive = Naive(projected, tiles, black, width, height, RULES["exact"], *how)
         return ctx.naive.forward()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb):
-        return ctx.naive.backward(v_rgb), None, None, None
+        return ctx.naive.backward(v_rgb), None, None, None, None
 
 
-def rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """Images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
+def _binned(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, Tiles]:
     size = {"width": camera.width, "height": camera.height}
     how = {"degree": gaussians.sh_degree, "rule": RULES["exact"]}
     projected, counts = project(*gaussians.tensors().values(), camera.viewmat, camera.K, **size, **how)
-    return _Blend.apply(projected, bin_tiles(projected, counts, **size, rule=RULES["exact"]), *size.values())
+    return projected, bin_tiles(projected, counts, **size, rule=RULES["exact"])
+
+
+def rasterize(
+    gaussians: Gaussians, camera: Camera, mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED, layers: int = 0
+) -> torch.Tensor:
+    """Images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
+    return _Blend.apply(*_binned(gaussians, camera), camera.width, camera.height, (mode, layers))
+
+
+def layers_of(gaussians: Gaussians, camera: Camera) -> int:
+    """Return the most Gaussians that are blended into a pixel."""
+    with torch.no_grad():
+        projected, tiles = _binned(gaussians, camera)
+        black = projected.new_zeros(len(projected), 3)
+        naive = Naive(projected, tiles, black, camera.width, camera.height, RULES["exact"])
+        naive.forward()
+        return naive.layers()

@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from torch.utils.checkpoint import checkpoint
 
 from bench.lib import inputs, naive
-from warpgs.constants import RULES
+from warpgs.constants import RULES, Rule
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
 from warpgs.scene import Camera, Gaussians
@@ -43,9 +43,11 @@ def torch_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     return similarity[0].permute(1, 2, 0)
 
 
-def _projected(g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, height: int) -> tuple[torch.Tensor, ...]:
+def _projected(
+    g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, height: int, rule: Rule
+) -> tuple[torch.Tensor, ...]:
     """Means [px] [N, 2], inverse covariances [N, 2, 2], opacities [N], colours [N, 3] of what is visible, by depth."""
-    rule, R, t = RULES["exact"], view[:3, :3], view[:3, 3]
+    R, t = view[:3, :3], view[:3, 3]
     p = g.means @ R.T + t
     order = torch.argsort(p[:, 2])
     order = order[p[order, 2] >= rule.near]
@@ -57,33 +59,33 @@ def _projected(g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, he
     clamped = means.clamp(-margin, margin * (1 / 0.15 + 1))
     jacobian = torch.cat([torch.diag_embed(f / p[:, 2:]), ((c - clamped) / p[:, 2:])[..., None]], -1)
     axes = jacobian @ R @ rotation * log_scales.exp()[:, None]
-    covariance = axes @ axes.mT + rule.low_pass * torch.eye(2, device=p.device)
+    covariance = axes @ axes.mT + rule.low_pass * torch.eye(2, device=p.device, dtype=p.dtype)
     directions = F.normalize(g.means[order] + R.T @ t, dim=1)
     colors = torch.einsum("nk,nkc->nc", basis(directions)[:, : g.sh.shape[1]], g.sh[order])
     return means, torch.linalg.inv(covariance), g.logit_opacities[order].sigmoid(), (colors + 0.5).clamp_min(0)
 
 
-def _composite(pixels, means, inverses, opacities, colors):
+def _composite(rule, pixels, means, inverses, opacities, colors):
     """Colours [P, 3] of pixel centres [P, 2], every Gaussian looked at for every pixel."""
-    rule = RULES["exact"]
     dx, dy = pixels[:, :1] - means[:, 0], pixels[:, 1:] - means[:, 1]
     a, b, c = inverses[:, 0, 0], inverses[:, 0, 1], inverses[:, 1, 1]
     alpha = (opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=rule.alpha_max)
     alpha = torch.where(alpha >= rule.alpha_cut, alpha, 0)
     after = torch.cumprod(1 - alpha, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
-    return torch.where(before >= rule.transmittance_stop, alpha * before, 0) @ colors
+    looked_at = before if rule.inclusive_stop else after
+    return torch.where(looked_at >= rule.transmittance_stop, alpha * before, 0) @ colors
 
 
-def dense_rasterize(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
-    """Rule `exact` in plain torch, without tiles: images [C, H, W, 3] over black, for small N only."""
-    device = gaussians.means.device
+def dense_rasterize(gaussians: Gaussians, camera: Camera, rule: Rule = RULES["exact"]) -> torch.Tensor:
+    """A rule without a square in plain torch, without tiles: images [C, H, W, 3] over black, for small N only."""
+    device, composite = gaussians.means.device, functools.partial(_composite, rule)
     y, x = torch.meshgrid(torch.arange(camera.height, device=device), torch.arange(camera.width, device=device), indexing="ij")
     centers = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
     images = []
     for view, K in zip(camera.viewmat, camera.K):
-        projected = _projected(gaussians, view, K, camera.width, camera.height)
-        parts = [checkpoint(_composite, part, *projected, use_reentrant=False) for part in centers.split(PIXELS_AT_ONCE)]
+        projected = _projected(gaussians, view, K, camera.width, camera.height, rule)
+        parts = [checkpoint(composite, part, *projected, use_reentrant=False) for part in centers.split(PIXELS_AT_ONCE)]
         images.append(torch.cat(parts).view(camera.height, camera.width, 3))
     return torch.stack(images)
 

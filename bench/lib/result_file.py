@@ -39,10 +39,14 @@ def commit_of(checkout: Path = ROOT) -> str | None:
 
 def _versions(device: torch.device) -> dict[str, str]:
     versions = {"python": platform.python_version(), "torch": torch.__version__, "warp": warp.config.version}
-    try:
-        versions["gsplat"] = version("gsplat")
-    except PackageNotFoundError:
-        pass
+    for name in ("gsplat", "gswarp"):
+        found = getattr(
+            sys.modules.get(name), "__version__", None
+        )  # of a program that lies on the path without being installed
+        try:
+            versions[name] = found or version(name)
+        except PackageNotFoundError:
+            pass
     return versions | ({"cuda": torch.version.cuda} if device.type == "cuda" else {})
 
 

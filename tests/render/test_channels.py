@@ -167,3 +167,16 @@ def test_wrong_channels_are_named():
     ]:
         with pytest.raises(kind, match=words):
             rasterize(gaussians, cam, RasterizeOptions(**options))
+
+
+@pytest.mark.parametrize("what", ["colors", "background", "features", "feature_background"])
+def test_leaves_render_where_autograd_is_off(what, device):
+    """A learned background or feature shows the same image under no_grad, without a gradient."""
+    gaussians, cam, values, behind = scene(torch.float32, device, 5)
+    given = {"colors": values, "background": behind, "features": values, "feature_background": behind}
+    wanted = rasterize(gaussians, cam, RasterizeOptions(**given))
+    given[what] = given[what].clone().requires_grad_()
+    with torch.no_grad():
+        found = rasterize(gaussians, cam, RasterizeOptions(**given))
+    assert torch.equal(found.rgb, wanted.rgb) and torch.equal(found.features, wanted.features)
+    assert not found.rgb.requires_grad

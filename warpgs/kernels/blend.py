@@ -216,6 +216,11 @@ class _Blend(torch.autograd.Function):
         return v_projected, v_backgrounds, None, None
 
 
+def without_gradients(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Return tensors of any shape [...]; detached where autograd is off, since leaves would ask for gradients there, too."""
+    return tensors if torch.is_grad_enabled() else tuple(t.detach() for t in tensors)
+
+
 def check_slots(tiles: Tiles) -> None:
     """Check that the instances have slots.
 
@@ -281,7 +286,8 @@ def blend(
         ValueError: A shape or device disagrees, or the tiles belong to another image size.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
-    return _Blend.apply(projected, backgrounds, tiles, BlendSettings(origin, width, height, rule, deterministic, absgrad))
+    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
+    return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
 
 
 def contributions(

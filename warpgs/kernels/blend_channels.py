@@ -12,7 +12,15 @@ from typing import NamedTuple
 import torch
 
 from warpgs.constants import Rule
-from warpgs.kernels.blend import background_gradient, check_slots, check_tiles, composite, composite_gradients, is_native
+from warpgs.kernels.blend import (
+    background_gradient,
+    check_slots,
+    check_tiles,
+    composite,
+    composite_gradients,
+    is_native,
+    without_gradients,
+)
 from warpgs.kernels.blend_records import COLORS, WIDTHS
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles
@@ -145,4 +153,4 @@ def blend_channels(
     if colors.shape[-1] == 0:
         raise ValueError(f"colors must have at least one channel, not shape {list(colors.shape)}")
     settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
-    return _BlendChannels.apply(projected, colors, backgrounds, tiles, settings)
+    return _BlendChannels.apply(*without_gradients(projected, colors, backgrounds), tiles, settings)

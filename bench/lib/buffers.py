@@ -1,0 +1,69 @@
+"""What the buffers of a render with gradients cost on CUDA, as the kernels declare them, and when they live.
+
+One camera, three channels, gradients in the five tensors. Upstream gradients and the Gaussians themselves are inputs, and do
+not count. A sort takes memory from Warp's pool beside these, about as much as its own keys and values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from warpgs.kernels.blend_cuda import STATE, STRIDE, chunk_of
+from warpgs.kernels.tiles import grid
+
+REAL = 4
+"""Bytes of a number."""
+TILE = 16
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Sizes of a render."""
+
+    gaussians: int
+    visible: int
+    instances: int
+    """(Gaussian, tile) pairs."""
+    width: int
+    height: int
+    coefficients: int = 16
+
+    @property
+    def pixels(self) -> int:
+        """Pixels of the image."""
+        return self.width * self.height
+
+    @property
+    def tiles(self) -> int:
+        """Tiles of the image."""
+        columns, rows = grid(self.width, self.height, TILE)
+        return columns * rows
+
+
+BLEND = "blending backward"
+PROJECT = "projection backward"
+MOMENTS = (BLEND, PROJECT)
+"""When memory is largest: in the first where images are large, in the second where Gaussians are many."""
+
+
+def buffers(n: Counts, deterministic: bool = True) -> dict[str, tuple[int, tuple[str, ...]]]:
+    """Return bytes, and the moments at which they are held, of each buffer by name."""
+    chunk = chunk_of(n.tiles, deterministic)
+    states = (n.instances // chunk + 1) * STATE * TILE * TILE * REAL
+    lists = 8 * n.tiles + 8 * n.visible + REAL * n.gaussians + 4 * REAL * n.instances
+    return {
+        "projected Gaussians and counts": ((STRIDE + 1) * REAL * n.gaussians, MOMENTS),
+        "lists of instances": (lists, (BLEND,)),
+        "image, alpha, depth": (5 * REAL * n.pixels, (BLEND,)),
+        "transmittance, weight and end of each pixel": (3 * REAL * n.pixels, (BLEND,)),
+        "state of each pixel every few instances": (states, (BLEND,)),
+        "gradient of each instance": (STRIDE * REAL * n.instances if deterministic else 0, (BLEND,)),
+        "gradients of projected Gaussians": (STRIDE * REAL * n.gaussians, MOMENTS),
+        "gradients of the five tensors": ((11 + 3 * n.coefficients) * REAL * n.gaussians, (PROJECT,)),
+    }
+
+
+def at_most(n: Counts, deterministic: bool = True) -> int:
+    """Return the bytes that are held at the larger of the moments."""
+    held = buffers(n, deterministic).values()
+    return max(sum(size for size, moments in held if moment in moments) for moment in MOMENTS)
