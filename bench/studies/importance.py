@@ -35,6 +35,7 @@ from bench.lib.importance_scores import (
     opacity_slopes,
     residual_elsewhere,
     spearman,
+    warped_gains,
 )
 from bench.lib.one_fit import Fit, config_of, figures_of, plan
 from bench.lib.pool import measure_all
@@ -107,6 +108,9 @@ class Studied(ImportanceSampling):
         scores = [image_scores(g, c, pull, method.sampler.footprint, options, own) for c in found]
         if log or wanted.startswith(("gain", "best", "agreed")):
             scores = [a | b for a, b in zip(scores, gain_scores(g, found, views, t.background, own), strict=True)]
+        if log or wanted.startswith("warped"):
+            warped = warped_gains(g, found, views, method.sampler.footprint, options)
+            scores = [a | b for a, b in zip(scores, warped, strict=True)]
         if log or wanted == "residual elsewhere":
             for i, (c, s) in enumerate(zip(found, scores, strict=True)):
                 others = [v for k, v in enumerate(views) if k != i]
