@@ -14,6 +14,8 @@ from collections.abc import Sequence
 import torch
 
 from warpgs.constants import Rule
+from warpgs.geometry import project_tensors
+from warpgs.pipeline.train.strategies.gain import gains, residual_of
 from warpgs.pipeline.train.strategies.importance import blur, normalized
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig, fine_gaussians, valid_pixels
 from warpgs.pipeline.train.views import TrainingView
@@ -118,16 +120,6 @@ def best_opacity_gain(down: torch.Tensor, bend: torch.Tensor) -> torch.Tensor:
     return opacity * down - opacity.square() * bend
 
 
-def landing(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return rows, columns and depths of points [K, 3] in a camera; rows and columns are clamped to the image."""
-    inside = (points[:, None] * camera.viewmat[:3, :3]).sum(2) + camera.viewmat[:3, 3]
-    depth = inside[:, 2]
-    x, y = (camera.K[i, i] * inside[:, i] / depth.clamp_min(1e-6) + camera.K[i, 2] for i in range(2))
-    seen = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
-    column, row = (t.floor().long().clamp(0, most - 1) for t, most in ((x, camera.width), (y, camera.height)))
-    return torch.stack([row, column], 1), depth, seen
-
-
 def residual_elsewhere(
     gaussians: Gaussians, points: torch.Tensor, views: Sequence[TrainingView], options: RasterizeOptions
 ) -> torch.Tensor:
@@ -136,10 +128,12 @@ def residual_elsewhere(
     for view in views:
         render = rasterize(gaussians, view.camera, options)
         error = blur((view.seen(render.rgb) - view.image).square().mean(-1), 2.0)
-        at, depth, seen = landing(view.camera, points)
-        there = render.depth[at[:, 0], at[:, 1]]
-        seen &= (there - depth).abs() < NEARLY * depth
-        total += torch.where(seen, error[at[:, 0], at[:, 1]], 0)
+        pixels, depth = project_tensors(view.camera, points)
+        size = torch.tensor([view.camera.width, view.camera.height]).to(pixels)
+        seen = (depth > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
+        columns, rows = torch.where(seen[:, None], pixels, 0).long().unbind(1)
+        seen &= (render.depth[rows, columns] - depth).abs() < NEARLY * depth
+        total += torch.where(seen, error[rows, columns], 0)
         count += seen
     return total / count.clamp_min(1)
 
@@ -151,32 +145,16 @@ def warped_gains(
     footprint: float,
     options: RasterizeOptions,
 ) -> list[dict[str, torch.Tensor]]:
-    """Return the gains of the candidates of each view without rendering them, by blurred residuals where they land, [K] each.
-
-    A Gaussian of colour c and opacity o in front of colours C turns them into C + o w (c - C), which lowers the squared error
-    to an image I by 2 o sum w (I - C) (c - C): c times the blurred residual, less the blurred product of residual and C.
-    """
-    maps = []
+    """Return the gains of the candidates of each view as the package computes them, without rendering them, [K] each."""
+    residuals = []
     for view in views:
         render = rasterize(gaussians, view.camera, options)
-        rgb = view.seen(render.rgb)
-        residual = view.image - rgb
-        if view.countable is not None:
-            residual = residual * view.countable[..., None]
-        product = (residual * rgb).sum(-1)
-        blurred = [blur(c.contiguous(), footprint) for c in (*residual.unbind(-1), product)]
-        maps.append((torch.stack(blurred, -1), render.depth))
+        residuals.append(residual_of(view, view.seen(render.rgb), render.depth, footprint))
     scores = []
     for number, c in enumerate(found):
-        color = c.view.image[c.at[:, 0], c.at[:, 1]]
-        each = []
-        for view, (blurred, there) in zip(views, maps, strict=True):
-            at, depth, seen = landing(view.camera, c.rows["means"])
-            here = blurred[at[:, 0], at[:, 1]]
-            seen &= depth < (1 + NEARLY) * there[at[:, 0], at[:, 1]]
-            each.append(torch.where(seen, (color * here[:, :3]).sum(1) - here[:, 3], 0))
-        total = torch.stack(each).sum(0)
-        scores.append({"warped": total, "warped own": each[number], "warped others": total - each[number]})
+        points, colors = c.rows["means"], c.view.image[c.at[:, 0], c.at[:, 1]]
+        total, own = gains(points, colors, residuals), gains(points, colors, residuals[number : number + 1])
+        scores.append({"warped": total, "warped own": own, "warped others": total - own})
     return scores
 
 

@@ -247,12 +247,12 @@ def test_unknown_semantics_leave_the_weights_to_the_others():
 
 
 def test_gain_draws_where_all_views_ask_for_colour():
-    """One of the three Gaussians is missing: most of what is drawn by the gain lies on it, and what is drawn by lot does not."""
+    """One of the three Gaussians is missing: most pixels sampled by the gain lie on it, and uniform ones do not."""
     fit = fitted(dataclasses.replace(CONFIG, steps=400, dropout=0.0), steps=0)
     whole = three_gaussians()
     kept = Gaussians(**{n: t[:2] for n, t in whole.tensors().items()})
     views = [dataclasses.replace(v, consistent=rasterize(whole, v.camera).depth) for v in fit.views]
-    alone = dict(s_semantic=False, s_geometry=False, importance=ImportanceConfig(residual="gain"))
+    alone = {"s_semantic": False, "s_geometry": False, "importance": ImportanceConfig(residual="gain")}
     sampler = SamplerConfig(depth="consistent", fraction=0.01, gate_quantile=0, max_fraction=50, min_alpha=0.05)
     fraction = []
     for switches in (alone, {"s_render": False, **alone}):
