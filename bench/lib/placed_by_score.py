@@ -117,7 +117,9 @@ class Studied(ImportanceSampling):
             self._tell(step, scores)
         if score != OWN:
             maps = [c.whole(s[score].clamp_min(0)) for c, s in zip(found, scores, strict=True)]
-            maps = [normalized(m, c.gate) if bool((m != m[0, 0]).any()) else m for m, c in zip(maps, found, strict=True)]
+            maps = [
+                torch.ones_like(m) if score == "uniform" else normalized(m, c.gate) for m, c in zip(maps, found, strict=True)
+            ]
             views = [dataclasses.replace(v, geometry=m, semantic=None) for v, m in zip(views, maps, strict=True)]
             alone = ImportanceConfig(render=0.0, semantic=0.0, geometry=1.0)
             method = dataclasses.replace(method, importance=alone, s_geometry=True)

@@ -82,11 +82,17 @@ class MethodConfig:
     """Protection mechanism: new fine Gaussians keep a least opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
     """Fraction of its Adam step that each mean of the coarse layer takes from phase 2 on, in [0, 1]."""
+    keep: float = 1.0
+    """Fraction of the Gaussians that stay when phase 3 begins, in (0, 1]: those that contribute most to the training views."""
+    keep_by: str = "max"
+    """Contribution by which they are ranked: sum or max of the blending weights, or random."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
 
     def __post_init__(self):
+        if not 0 < self.keep <= 1:
+            raise UsageError(f"method keep {self.keep} must lie in (0, 1]")
         if not 0 <= self.coarse_lr_factor <= 1:
             raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must lie between 0 and 1")
 
@@ -215,6 +221,23 @@ def least_contributing(
         total += rasterize(gaussians, half_size_camera(view.camera), options).weight_sums[0]
     total = torch.where(candidates, total, torch.inf)
     return torch.topk(total, min(count, int(candidates.sum())), largest=False).indices
+
+
+@torch.no_grad()
+def keep_contributors(
+    gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions, by: str, generator: torch.Generator
+) -> DensityUpdate:
+    """Return the change that leaves the ``count`` Gaussians which contribute most to the views, by rank ``by``."""
+    weigh = dataclasses.replace(options, contributions=True)
+    total = torch.zeros(len(gaussians), device=gaussians.means.device)
+    if by == "random":
+        total = torch.rand(len(gaussians), generator=generator).to(total)
+    for view in views[:: -(-len(views) // MAX_WEIGHED)] if by != "random" else ():
+        found = rasterize(gaussians, view.camera, weigh)
+        total = total + found.weight_sums[0] if by == "sum" else torch.maximum(total, found.weight_maxima[0])
+    ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
+    none = {n: t[:0] for n, t in gaussians.tensors().items()}
+    return DensityUpdate(ids, none, ids[:0])
 
 
 @torch.no_grad()
