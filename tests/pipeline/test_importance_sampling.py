@@ -24,6 +24,7 @@ from warpgs.pipeline.train.strategies.sampling_event import (
     Event,
     MethodConfig,
     ProtectConfig,
+    keep_contributors,
     render_before,
     sample_view,
     sampling_event,
@@ -264,6 +265,28 @@ def test_gain_draws_where_all_views_ask_for_colour():
         away = (event.change.added["means"] - whole.means[2]).norm(dim=1)
         fraction.append(float((away < 0.45).float().mean()))
     assert fraction[0] > 0.9 > 0.6 > fraction[1]
+
+
+def test_phase_3_begins_with_those_that_contribute_most():
+    """Half stay, none of which has a smaller largest blending weight than one that went; nothing changes afterwards."""
+    fit = fitted(steps=27)
+    options = RasterizeOptions(background=torch.zeros(3), contributions=True)
+    weights = torch.stack([rasterize(fit.gaussians, v.camera, options).weight_maxima[0] for v in fit.views]).amax(0)
+    kept = keep_contributors(fit.gaussians, len(weights) // 2, fit.views, options, "max", torch.Generator())
+    stays = torch.zeros(len(weights), dtype=torch.bool).index_fill(0, kept.keep, True)
+    assert int(stays.sum()) == len(weights) // 2 and weights[stays].min() >= weights[~stays].max()
+    whole, half = (fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=k))) for k in (1.0, 0.5))
+    assert len(half.gaussians) == round(0.5 * len(whole.gaussians))
+    with pytest.raises(UsageError, match="keep"):
+        MethodConfig(keep=0.0)
+
+
+def test_growth_that_ends_early_keeps_those_that_contribute_most():
+    """Then, too, they are counted once, before pixels that were held out are sampled."""
+    fit = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=0.5)), steps=20)
+    count, views = len(fit.gaussians), fit.views
+    first, *rest = fit.strategy.catch_up(20, [dataclasses.replace(v, mask=torch.ones_like(v.image[..., 0])) for v in views], 64)
+    assert len(first.keep) == round(0.5 * count) and len(first.parents) == 0 and all(len(c.keep) >= count for c in rest)
 
 
 def test_unknown_residual_is_refused():
