@@ -13,8 +13,6 @@ from warpgs.geometry import back_project_tensors, logit
 from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.scene import Camera
 
-SPREAD = 2.0
-"""Largest factor by which the local density of samples narrows or widens a footprint."""
 SUPPORT = 4
 """Fewest pixels that a gate leaves, as a multiple of those to be sampled; with fewer its quantile is lowered."""
 
@@ -38,8 +36,6 @@ class SamplerConfig:
     """First opacity of a fine Gaussian, in (0, 1)."""
     footprint: float = 1.0
     """First standard deviation of a fine Gaussian [px], in the view that placed it."""
-    spread: bool = False
-    """Scale the footprint by the local density of samples: narrower where importance is high, wider where it is low."""
     max_fraction: float = 0.5
     """Most fine Gaussians, as a fraction of the coarse ones."""
 
@@ -116,19 +112,6 @@ def sample_pixels(
     key = torch.where(allowed, key, -1.0)
     chosen = torch.topk(key.flatten(), count).indices.sort().values
     return torch.stack([chosen // score.shape[1], chosen % score.shape[1]], 1)
-
-
-def spread_factors(score: torch.Tensor, gate: torch.Tensor, at: torch.Tensor) -> torch.Tensor:
-    """Return factors of the footprint, shape [S]: one over the root of the density of samples, which follows the score.
-
-    Args:
-        score: Importance, shape [H, W].
-        gate: Pixels that could be sampled, bool, shape [H, W].
-        at: Rows and columns of the sampled pixels, shape [S, 2].
-    """
-    here = score[at[:, 0], at[:, 1]].double()
-    mean = score[gate].double().mean()
-    return (mean / here).sqrt().clamp(1 / SPREAD, SPREAD)
 
 
 def fine_gaussians(

@@ -24,7 +24,6 @@ from warpgs.pipeline.train.strategies.sampler import (
     fine_gaussians,
     geometry_gate,
     sample_pixels,
-    spread_factors,
     valid_pixels,
 )
 from warpgs.pipeline.train.views import TrainingView, half_size_camera
@@ -203,9 +202,6 @@ def sample_view(
     gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
     at = sample_pixels(score, gate, wanted, generator, random=config.agp)
     rows = fine_gaussians(view.camera, view.image, depth, at, c, coefficients)
-    if c.spread and len(at) > 0:
-        factors = spread_factors(score, gate, at).log().to(depth.dtype)
-        rows["log_scales"] = rows["log_scales"] + factors[:, None]
     return SampledView(number, rgb, scores, score, gate, quantile, at), rows
 
 
