@@ -94,6 +94,8 @@ def test_points_come_back_from_pixels_and_depths():
         assert np.allclose(geometry.back_project(arrays, pixels, depths), points, atol=1e-12)
         found = geometry.back_project_tensors(tensors, torch.from_numpy(pixels), torch.from_numpy(depths))
         assert np.allclose(found.numpy(), points, atol=1e-12)
+        again = geometry.project_tensors(tensors, found)
+        assert np.allclose(again[0].numpy(), pixels, atol=1e-9) and np.allclose(again[1].numpy(), depths, atol=1e-12)
 
 
 def plane_depth(cam: Camera, normal: torch.Tensor, distance: float) -> torch.Tensor:
@@ -157,6 +159,10 @@ def test_points_come_back_from_lenses(model):
     assert np.allclose(geometry.back_project(arrays, pixels, depths), points, atol=1e-9)
     found = geometry.back_project_tensors(cam, torch.from_numpy(pixels), torch.from_numpy(depths))
     assert np.allclose(found.numpy(), points, atol=1e-9)
+    again = geometry.project_tensors(cam, found)
+    assert np.allclose(again[0].numpy(), pixels, atol=1e-6) and np.allclose(again[1].numpy(), depths, atol=1e-9)
+    if model == "opencv":
+        assert bool((geometry.project_tensors(cam, -found)[1] <= 0).all())
     if model == "opencv":
         assert geometry.project_points(arrays, -points)[1].tolist() == [0] * 50
 

@@ -185,6 +185,28 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
     return ((in_camera - viewmat[:3, 3])[:, :, None] * viewmat[:3, :3]).sum(1)
 
 
+def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what `project_points` returns for tensors, without a product of matrices: pixels [S, 2] and depths [S] [u].
+
+    Where a camera cannot see a point, its depth is at most 0 and its pixel means nothing.
+
+    Args:
+        camera: Its tensors are float32 or float64, on the device of the points.
+        points: World points [u], shape [S, 3].
+
+    Raises:
+        UsageError: The camera model is known to the kernels alone.
+    """
+    import torch
+
+    K, viewmat = camera.K, camera.viewmat
+    in_camera = (points[:, None] * viewmat[:3, :3]).sum(2) + viewmat[:3, 3]
+    seen, depth = lenses.on_lens(camera.model, camera.distortion, in_camera), lenses.depth_of(camera.model, in_camera)
+    plane = lenses.to_plane(camera.model, camera.distortion, torch.where(seen[:, None], in_camera, torch.ones_like(in_camera)))
+    pixels = torch.stack([K[i, i] * plane[:, i] + K[i, 2] for i in range(2)], 1)
+    return pixels, torch.where(seen, depth, 0)
+
+
 def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:
     """Return the positions in the camera [S, 3] at depths [S], from those at depth 1 [S, 3]."""
     scaled = rays * depths[:, None]

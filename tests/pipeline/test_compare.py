@@ -273,19 +273,31 @@ FULL = dataclasses.replace(A, preset="whole", method=MethodConfig(events=True, h
 
 
 def test_ablation_rows_switch_off_one_part_each():
-    """Full, seven parts of the paper's table, no sampling at all, uniform draws and the residual alone; marks by heading."""
+    """Full, uniform draws, the residual alone, the paper's seven parts and no sampling at all; marks by heading."""
     variants, marks = ablation_variants(FULL)
-    assert list(variants) == list(ABLATION_ROWS) and len(variants) == 11 and variants["full"] == FULL
+    assert list(variants) == ["full", "uniform", "residual only", *(f"no {name}" for name in SWITCHES)]
+    assert variants["full"] == FULL
     weights = [variants[row].method.weights() for row in ("uniform", "residual only", "no s_geometry")]
     assert weights == [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), pytest.approx((2 / 3, 1 / 3, 0.0))]
-    for (row, variant), name in zip(list(variants.items())[1:], SWITCHES):
+    for (row, variant), name in zip(list(variants.items())[3:], SWITCHES, strict=True):
         switches = dataclasses.asdict(variant.method)
         assert [s for s, value in switches.items() if value is False] == [name] and row == f"no {name}"
         assert dataclasses.replace(variant, method=FULL.method) == FULL
         assert [s for s, mark in zip(SWITCHES, marks[row]) if not mark] == [name]
     assert all(marks["full"]) and list(SWITCHES)[:7] == ["hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"]
-    with pytest.raises(UsageError, match="preset '3dgs' has hier, events switched off already"):
+    with pytest.raises(UsageError, match="preset '3dgs' has no sampling events"):
         ablation_variants(FitConfig())
+
+
+def test_ablation_switches_on_what_a_preset_leaves_out():
+    """A preset without scores gets a row with each, and no row twice: uniform is the preset itself."""
+    scores = {"s_render": False, "s_semantic": False, "s_geometry": False}
+    base = dataclasses.replace(FULL, method=dataclasses.replace(FULL.method, **scores))
+    variants, _ = ablation_variants(base)
+    assert {"full", "residual only", "no hier", "with s_semantic", "with s_geometry"} <= set(variants)
+    assert not {"uniform", "no s_render", "with s_render", "with hier"} & set(variants)
+    weights = [variants[row].method.weights() for row in ("full", "with s_semantic", "with s_geometry")]
+    assert weights == [(0, 0, 0), (0, 1, 0), (0, 0, 1)]
 
 
 def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
@@ -310,7 +322,7 @@ def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
     off = dataclasses.replace(FULL.method, pm=False)
     assert asked == [(0, FULL.method), (0, off)]
     assert main(["ablate", scene.path, "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
-    assert "ablate a preset of the full method" in capsys.readouterr().err
+    assert "ablate a preset with them" in capsys.readouterr().err
 
 
 def test_requests_that_make_no_sense(scene, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.scenes import photos, priors, seeds
+from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig, initial_points
@@ -16,6 +16,7 @@ from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.strategies.importance import ImportanceConfig
 from warpgs.pipeline.train.strategies.importance_sampling import COARSE, NOT_SAMPLED
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.strategies.sampling_event import (
@@ -23,11 +24,14 @@ from warpgs.pipeline.train.strategies.sampling_event import (
     Event,
     MethodConfig,
     ProtectConfig,
+    keep_contributors,
+    render_before,
     sample_view,
     sampling_event,
 )
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.scene import Gaussians
 
 CPU = torch.device("cpu")
 SWITCHES = ("hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm")
@@ -236,11 +240,59 @@ def test_unknown_semantics_leave_the_weights_to_the_others():
     """A view of which semantics say nothing is scored by the other two, whose weights sum to 1."""
     blank = [dataclasses.replace(p, boundary=p.boundary * 0, foreground=p.foreground * 0) for p in priors(photos(3))]
     fit = Trainer(photos(3), seeds(), CONFIG, CPU, priors=blank)
-    drawn, _ = sample_view(
-        fit.gaussians, fit.views[0], 0, METHOD, RasterizeOptions(background=torch.zeros(3)), torch.Generator().manual_seed(0)
-    )
+    options, generator = RasterizeOptions(background=torch.zeros(3)), torch.Generator().manual_seed(0)
+    before = render_before(fit.gaussians, fit.views[0], METHOD, options)
+    drawn, _ = sample_view(fit.views[0], 0, before, [], METHOD, 4, generator)
     assert fit.views[0].semantic is None
     assert torch.allclose(drawn.score, 0.5 * drawn.scores[0] + 0.5 * drawn.scores[2])
+
+
+def test_gain_draws_where_all_views_ask_for_colour():
+    """One of the three Gaussians is missing: most pixels sampled by the gain lie on it, and uniform ones do not."""
+    fit = fitted(dataclasses.replace(CONFIG, steps=400, dropout=0.0), steps=0)
+    whole = three_gaussians()
+    kept = Gaussians(**{n: t[:2] for n, t in whole.tensors().items()})
+    views = [dataclasses.replace(v, consistent=rasterize(whole, v.camera).depth) for v in fit.views]
+    alone = {"s_semantic": False, "s_geometry": False, "importance": ImportanceConfig(residual="gain")}
+    sampler = SamplerConfig(depth="consistent", fraction=0.01, gate_quantile=0, max_fraction=50, min_alpha=0.05)
+    fraction = []
+    for switches in (alone, {"s_render": False, **alone}):
+        method = dataclasses.replace(METHOD, sampler=sampler, **switches)
+        event = sampling_event(
+            kept, torch.zeros(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool), views, method, step=9, capacity=10_000,
+            options=RasterizeOptions(background=torch.zeros(3)), generator=torch.Generator().manual_seed(0),
+        )  # fmt: skip
+        away = (event.change.added["means"] - whole.means[2]).norm(dim=1)
+        fraction.append(float((away < 0.45).float().mean()))
+    assert fraction[0] > 0.9 > 0.6 > fraction[1]
+
+
+def test_phase_3_begins_with_those_that_contribute_most():
+    """Half stay, none of which has a smaller largest blending weight than one that went; nothing changes afterwards."""
+    fit = fitted(steps=27)
+    options = RasterizeOptions(background=torch.zeros(3), contributions=True)
+    weights = torch.stack([rasterize(fit.gaussians, v.camera, options).weight_maxima[0] for v in fit.views]).amax(0)
+    kept = keep_contributors(fit.gaussians, len(weights) // 2, fit.views, options, "max", torch.Generator())
+    stays = torch.zeros(len(weights), dtype=torch.bool).index_fill(0, kept.keep, True)
+    assert int(stays.sum()) == len(weights) // 2 and weights[stays].min() >= weights[~stays].max()
+    whole, half = (fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=k))) for k in (1.0, 0.5))
+    assert len(half.gaussians) == round(0.5 * len(whole.gaussians))
+    with pytest.raises(UsageError, match="keep"):
+        MethodConfig(keep=0.0)
+
+
+def test_growth_that_ends_early_keeps_those_that_contribute_most():
+    """Then, too, they are counted once, before pixels that were held out are sampled."""
+    fit = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=0.5)), steps=20)
+    count, views = len(fit.gaussians), fit.views
+    first, *rest = fit.strategy.catch_up(20, [dataclasses.replace(v, mask=torch.ones_like(v.image[..., 0])) for v in views], 64)
+    assert len(first.keep) == round(0.5 * count) and len(first.parents) == 0 and all(len(c.keep) >= count for c in rest)
+
+
+def test_unknown_residual_is_refused():
+    """The message names the choices."""
+    with pytest.raises(UsageError, match="length, gain"):
+        ImportanceConfig(residual="error")
 
 
 def test_dropout_falls_with_the_number_of_views():

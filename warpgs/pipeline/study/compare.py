@@ -28,12 +28,13 @@ SCORES = ("s_render", "s_semantic", "s_geometry")
 """Switches of the scores that the importance map is the sum of."""
 ABLATION_ROWS: dict[str, dict[str, bool]] = {
     "full": {},
-    **{f"no {name}": {name: False} for name in SWITCHES},
     "uniform": dict.fromkeys(SCORES, False),
-    "residual only": dict.fromkeys(SCORES[1:], False),
+    "residual only": {"s_render": True} | dict.fromkeys(SCORES[1:], False),
+    **{f"no {name}": {name: False} for name in SWITCHES},
+    **{f"with {name}": {name: True} for name in SWITCHES},
 }
-"""Switches of each row of the ablation: all on; each part off alone; pixels sampled uniformly, or by the residual alone. "no
-s_geometry" and "no s_semantic" are the residual with one of the other scores."""
+"""Switches of each row of the ablation: those of the preset; pixels sampled uniformly, or by the residual alone; each part that
+is on switched off alone, and each that is off switched on. A row that equals an earlier one is left out."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
@@ -59,20 +60,17 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
     """Return the rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
 
     Raises:
-        UsageError: The configuration has the sampling off already, so there is nothing to ablate.
+        UsageError: The configuration has no sampling events, so there is nothing to ablate.
     """
-    method = base.method
-    off = [name for name in SWITCHES if not getattr(method, name)]
-    if off:
-        raise UsageError(
-            f"preset {base.preset!r} has {', '.join(off)} switched off already; ablate a preset of the full method"
-        )
+    if not base.method.events:
+        raise UsageError(f"preset {base.preset!r} has no sampling events; ablate a preset with them, such as default")
     variants: dict[str, FitConfig] = {}
     marks: dict[str, tuple[bool, ...]] = {}
     for row, switches in ABLATION_ROWS.items():
-        changed = dataclasses.replace(method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
-        variants[row] = dataclasses.replace(base, method=changed)
-        marks[row] = tuple(getattr(changed, name) for name in SWITCHES)
+        changed = dataclasses.replace(base.method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
+        if all(changed != earlier.method for earlier in variants.values()):
+            variants[row] = dataclasses.replace(base, method=changed)
+            marks[row] = tuple(getattr(changed, name) for name in SWITCHES)
     return variants, marks
 
 

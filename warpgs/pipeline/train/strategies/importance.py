@@ -30,26 +30,36 @@ class ImportanceConfig:
     """Weight of the semantic score (paper, w2)."""
     geometry: float = 0.4
     """Weight of the geometric score (paper, w3)."""
+    residual: str = "length"
+    """Rendering residual: length (the paper), of the colour difference in the view itself; or gain, by how much a fine Gaussian
+    there would lower the squared error of all training views."""
     curvature: float = 0.5
     """Weight of the second derivatives within the geometric score (lambda_curv, which the paper leaves open)."""
 
     def __post_init__(self):
-        for name, value in vars(self).items():
-            if not 0 <= value < math.inf:
-                raise UsageError(f"importance {name} must be at least 0 and finite, not {value}")
+        if self.residual not in ("length", "gain"):
+            raise UsageError(f"importance residual {self.residual!r} is not one of length, gain")
+        for name in ("render", "semantic", "geometry", "curvature"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"importance {name} must be at least 0 and finite, not {getattr(self, name)}")
 
 
 def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
     """Blur a map [H, W] by a Gaussian of standard deviation ``sigma`` [px], its border pixels repeated outwards."""
     radius = max(1, round(3 * sigma))
-    offsets = torch.arange(-radius, radius + 1, dtype=image.dtype, device=image.device)
-    # exponentials and roots in float64: float32's have other last digits on other processors (MKL)
-    window = torch.exp(-0.5 * (offsets.double() / sigma) ** 2).to(image.dtype)
-    window = window / window.sum()
+    # on the host, where exponentials of float64 have the same digits on every processor
+    offsets = torch.arange(-radius, radius + 1, dtype=torch.float64)
+    window = torch.exp(-0.5 * (offsets / sigma) ** 2)
+    weights = (window / window.sum()).tolist()
     padded = torch.nn.functional.pad(image[None, None], (radius,) * 4, mode="replicate")[0, 0]
-    # sums of windows rather than a convolution, for which CUDA would load a library of its own
-    across = (padded.unfold(1, len(window), 1) * window).sum(-1)
-    return (across.unfold(0, len(window), 1) * window).sum(-1)
+    # shifted sums rather than a convolution, for which CUDA would load a library of its own
+    height, width = image.shape
+    across, down = torch.zeros_like(padded[:, :width]), torch.zeros_like(image)
+    for k, weight in enumerate(weights):
+        across = across + weight * padded[:, k : k + width]
+    for k, weight in enumerate(weights):
+        down = down + weight * across[k : k + height]
+    return down
 
 
 def normalized(score: torch.Tensor, valid: torch.Tensor | None = None) -> torch.Tensor:

@@ -17,7 +17,14 @@ from warpgs.pipeline.model.table import Column, DensityUpdate
 from warpgs.pipeline.train.context import Growth, Settings
 from warpgs.pipeline.train.strategies.base import Strategy, register
 from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
-from warpgs.pipeline.train.strategies.sampling_event import FINE, MAX_VIEWS, Event, MethodConfig, sampling_event
+from warpgs.pipeline.train.strategies.sampling_event import (
+    FINE,
+    MAX_VIEWS,
+    Event,
+    MethodConfig,
+    keep_contributors,
+    sampling_event,
+)
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 
@@ -115,7 +122,17 @@ class ImportanceSampling(Strategy):
 
     def due(self, step: int) -> bool:
         """Return whether the set changes after a step."""
-        return self.gradients.due(step) or self.samples_after(step)
+        return self.gradients.due(step) or self.samples_after(step) or self.shrinks_after(step)
+
+    def shrinks_after(self, step: int) -> bool:
+        """Return whether Gaussians that contribute least are removed after a step: the last of phase 2."""
+        return self.method.events and self.method.keep < 1 and step == self.context.phases.stable_start
+
+    def shrink(self, views: list[TrainingView]) -> DensityUpdate:
+        """Return the change that leaves ``method.keep`` of the Gaussians."""
+        t = self.context
+        count = max(1, round(self.method.keep * len(t.table)))
+        return keep_contributors(t.gaussians, count, views, t.render_options(), self.method.keep_by, t.generator)
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Refine, then sample, where it is time for either.
@@ -136,6 +153,8 @@ class ImportanceSampling(Strategy):
             })  # fmt: skip
             if self.on_event is not None:
                 self.on_event(step, event)
+        if self.shrinks_after(step):
+            yield self.shrink(self.context.views)
 
     def sample(self, step: int, views: list[TrainingView], method: MethodConfig) -> Event:
         """Return a sampling event on some views (docs/decisions/008-method.md)."""
@@ -148,6 +167,8 @@ class ImportanceSampling(Strategy):
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
         """Sample as many fine Gaussians per pixel in the blocks, where none were sampled so far, as there are elsewhere."""
+        if self.method.events and self.method.keep < 1:
+            yield self.shrink(self.context.views)
         pixels = sum(v.image[..., 0].numel() for v in views)
         fraction = int(self.fine.sum()) / (pixels - held) * held / pixels
         if not self.method.events or not fraction * pixels >= 1:

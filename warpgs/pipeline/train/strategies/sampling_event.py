@@ -6,7 +6,9 @@ Paper, sections "Multi-Modal Importance Assessment" and "Geometric-Aware Samplin
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,6 +17,7 @@ from warpgs import geometry
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import DensityUpdate
 from warpgs.pipeline.train.strategies import importance as scoring
+from warpgs.pipeline.train.strategies.gain import Residual, gain_map, residual_of
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig
 from warpgs.pipeline.train.strategies.sampler import (
     SamplerConfig,
@@ -79,11 +82,17 @@ class MethodConfig:
     """Protection mechanism: new fine Gaussians keep a least opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
     """Fraction of its Adam step that each mean of the coarse layer takes from phase 2 on, in [0, 1]."""
+    keep: float = 1.0
+    """Fraction of the Gaussians that stay when phase 3 begins, in (0, 1]: those that contribute most to the training views."""
+    keep_by: str = "max"
+    """Contribution by which they are ranked: sum or max of the blending weights, or random."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
 
     def __post_init__(self):
+        if not 0 < self.keep <= 1:
+            raise UsageError(f"method keep {self.keep} must lie in (0, 1]")
         if not 0 <= self.coarse_lr_factor <= 1:
             raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must lie between 0 and 1")
 
@@ -142,28 +151,59 @@ class Event:
     """Samples of each view."""
 
 
-def sample_view(
-    gaussians: Gaussians, view: TrainingView, number: int, config: MethodConfig, options: RasterizeOptions,
-    generator: torch.Generator,
-) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
-    """Score one view, sample its pixels, and return them with the rows [S, ...] of the fine Gaussians behind them."""
-    c = config.sampler
+class Rendered(NamedTuple):
+    """A view as it is before an event, and where it can be sampled."""
+
+    rgb: torch.Tensor
+    """Colours as the view shows them, shape [H, W, 3]."""
+    surface: torch.Tensor
+    """Rendered z-depth [u], shape [H, W]."""
+    depth: torch.Tensor
+    """Depth that Gaussians are placed at [u], shape [H, W]."""
+    valid: torch.Tensor
+    """Pixels that can be sampled, bool, shape [H, W]."""
+
+
+def render_before(gaussians: Gaussians, view: TrainingView, config: MethodConfig, options: RasterizeOptions) -> Rendered:
+    """Render a view for an event, and find the depths at which its pixels are placed."""
     render = rasterize(gaussians, view.camera, options)
     depth, alpha = render.depth, render.alpha
-    if c.depth == "consistent" and view.consistent is not None:
+    if config.sampler.depth == "consistent" and view.consistent is not None:
         known = view.consistent > 0
         depth = torch.where(known, view.consistent, depth)
         alpha = torch.where(known, 1.0, 0.0 if config.ra else alpha)
-    valid = valid_pixels(alpha, depth, view.countable, c)
+    return Rendered(view.seen(render.rgb), render.depth, depth, valid_pixels(alpha, depth, view.countable, config.sampler))
+
+
+def sample_view(
+    view: TrainingView, number: int, rendered: Rendered, residuals: Sequence[Residual], config: MethodConfig,
+    coefficients: int, generator: torch.Generator,
+) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
+    """Score one view, sample its pixels, and return them with the rows [S, ...] of the fine Gaussians behind them.
+
+    Args:
+        view: The view.
+        number: Its number.
+        rendered: The view before the event.
+        residuals: Residuals of all views of the event, by which gains are computed; empty where the residual is a length.
+        config: Switches and settings.
+        coefficients: Spherical-harmonics coefficients a channel.
+        generator: CPU generator, the same numbers on every device.
+    """
+    c, (rgb, _, depth, valid) = config.sampler, rendered
     known = view.semantic is not None
     semantic = view.semantic if known else torch.zeros_like(view.geometry)
-    scores = (scoring.render_score(view.seen(render.rgb), view.image, valid), semantic, view.geometry)
+    if residuals:
+        residual = scoring.normalized(gain_map(view, depth, valid, residuals), valid)
+    else:
+        residual = scoring.render_score(rgb, view.image, valid)
+    scores = (residual, semantic, view.geometry)
     score = scoring.importance(scores, config.weights(known))
     wanted = max(1, round(c.fraction * valid.numel()))
     gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
     at = sample_pixels(score, gate, wanted, generator, random=config.agp)
-    rows = fine_gaussians(view.camera, view.image, depth, at, c, gaussians.sh.shape[1])
-    return SampledView(number, render.rgb, scores, score, gate, quantile, at), rows
+    rows = fine_gaussians(view.camera, view.image, depth, at, c, coefficients)
+    return SampledView(number, rgb, scores, score, gate, quantile, at), rows
 
 
 def least_contributing(
@@ -178,6 +218,23 @@ def least_contributing(
         total += rasterize(gaussians, half_size_camera(view.camera), options).weight_sums[0]
     total = torch.where(candidates, total, torch.inf)
     return torch.topk(total, min(count, int(candidates.sum())), largest=False).indices
+
+
+@torch.no_grad()
+def keep_contributors(
+    gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions, by: str, generator: torch.Generator
+) -> DensityUpdate:
+    """Return the change that leaves the ``count`` Gaussians which contribute most to the views, by rank ``by``."""
+    weigh = dataclasses.replace(options, contributions=True)
+    total = torch.zeros(len(gaussians), device=gaussians.means.device)
+    if by == "random":
+        total = torch.rand(len(gaussians), generator=generator).to(total)
+    for view in views[:: -(-len(views) // MAX_WEIGHED)] if by != "random" else ():
+        found = rasterize(gaussians, view.camera, weigh)
+        total = total + found.weight_sums[0] if by == "sum" else torch.maximum(total, found.weight_maxima[0])
+    ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
+    none = {n: t[:0] for n, t in gaussians.tensors().items()}
+    return DensityUpdate(ids, none, ids[:0])
 
 
 @torch.no_grad()
@@ -215,7 +272,15 @@ def sampling_event(
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
         numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
-    sampled, rows = zip(*(sample_view(gaussians, views[i], i, config, options, generator) for i in numbers))
+    before = [render_before(gaussians, views[i], config, options) for i in numbers]
+    residuals: list[Residual] = []
+    if config.importance.residual == "gain" and config.weights()[0] > 0:
+        footprint = config.sampler.footprint
+        residuals = [residual_of(views[i], b.rgb, b.surface, footprint) for i, b in zip(numbers, before, strict=True)]
+    coefficients = gaussians.sh.shape[1]
+    sampled, rows = zip(
+        *(sample_view(views[i], i, b, residuals, config, coefficients, generator) for i, b in zip(numbers, before, strict=True))
+    )
     added = {name: torch.cat([r[name] for r in rows]) for name in rows[0]}
     count = len(added["means"])
 
