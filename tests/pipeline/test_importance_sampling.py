@@ -268,11 +268,11 @@ def test_gain_draws_where_all_views_ask_for_colour():
 
 
 def test_phase_3_begins_with_those_that_contribute_most():
-    """Half stay, none of which has a smaller largest blending weight than one that went; nothing changes afterwards."""
+    """Half stay, none of which has a smaller sum of blending weights than one that went; nothing changes afterwards."""
     fit = fitted(steps=27)
     options = RasterizeOptions(background=torch.zeros(3), contributions=True)
-    weights = torch.stack([rasterize(fit.gaussians, v.camera, options).weight_maxima[0] for v in fit.views]).amax(0)
-    kept = keep_contributors(fit.gaussians, len(weights) // 2, fit.views, options, "max", torch.Generator())
+    weights = torch.stack([rasterize(fit.gaussians, v.camera, options).weight_sums[0] for v in fit.views]).sum(0)
+    kept = keep_contributors(fit.gaussians, len(weights) // 2, fit.views, options)
     stays = torch.zeros(len(weights), dtype=torch.bool).index_fill(0, kept.keep, True)
     assert int(stays.sum()) == len(weights) // 2 and weights[stays].min() >= weights[~stays].max()
     whole, half = (fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(METHOD, keep=k))) for k in (1.0, 0.5))

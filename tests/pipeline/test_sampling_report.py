@@ -142,6 +142,9 @@ def test_story_follows_the_switches(run, tmp_path):
     assert "In 3 of 3 samplings the gate was widened" in words and "widened" not in story.words
     free = fitted(dataclasses.replace(CONFIG, method=dataclasses.replace(method, ra=False)), steps=8)
     assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words
+    alike = dataclasses.replace(METHOD, s_render=False, s_semantic=False, s_geometry=False)
+    words = sampling_report_of(fitted(dataclasses.replace(CONFIG, method=alike), steps=8), tmp_path).words
+    assert "sampled at random, all alike" in words and "No score has a weight" in words
     assert sampling_report_of(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
 
 

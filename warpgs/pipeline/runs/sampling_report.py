@@ -189,11 +189,15 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     if not events["count"]:
         return None
     how = "sampled at random, the likelier the higher their S_importance," if method.agp else "the highest in S_importance"
+    weighted = sum(method.weights()) > 0
+    if method.agp and not weighted:
+        how = "sampled at random, all alike,"
     consistent = method.sampler.depth == "consistent"
     words = (
         f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
-        f"had capacity. These pixels are {how} among {_open_pixels(consistent and method.ra, _asked(method))} (the gate); "
-        "S_importance is the weighted sum of the three scores; each score stands below its source."
+        f"had capacity. These pixels are {how} among {_open_pixels(consistent and method.ra, _asked(method))} (the gate). "
+        + ("S_importance is the weighted sum of the three scores" if weighted else "No score has a weight (docs/method.md)")
+        + "; each score stands below its source."
     )
     if events["widened"]:
         words += (

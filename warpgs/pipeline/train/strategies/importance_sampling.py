@@ -132,7 +132,7 @@ class ImportanceSampling(Strategy):
         """Return the change that leaves ``method.keep`` of the Gaussians."""
         t = self.context
         count = max(1, round(self.method.keep * len(t.table)))
-        return keep_contributors(t.gaussians, count, views, t.render_options(), self.method.keep_by, t.generator)
+        return keep_contributors(t.gaussians, count, views, t.render_options())
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
         """Refine, then sample, where it is time for either.

@@ -83,9 +83,8 @@ class MethodConfig:
     coarse_lr_factor: float = 0.1
     """Fraction of its Adam step that each mean of the coarse layer takes from phase 2 on, in [0, 1]."""
     keep: float = 1.0
-    """Fraction of the Gaussians that stay when phase 3 begins, in (0, 1]: those that contribute most to the training views."""
-    keep_by: str = "max"
-    """Contribution by which they are ranked: sum or max of the blending weights, or random."""
+    """Fraction of the Gaussians that stay when phase 3 begins, in (0, 1]: those with the largest sums of
+    blending weights over the training views."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
@@ -221,20 +220,17 @@ def least_contributing(
 
 
 @torch.no_grad()
-def keep_contributors(
-    gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions, by: str, generator: torch.Generator
-) -> DensityUpdate:
-    """Return the change that leaves the ``count`` Gaussians which contribute most to the views, by rank ``by``."""
+def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions) -> DensityUpdate:
+    """Return the change that leaves the ``count`` Gaussians with the largest sums of blending weights over the views.
+
+    At most `MAX_WEIGHED` views are rendered, evenly spaced.
+    """
     weigh = dataclasses.replace(options, contributions=True)
     total = torch.zeros(len(gaussians), device=gaussians.means.device)
-    if by == "random":
-        total = torch.rand(len(gaussians), generator=generator).to(total)
-    for view in views[:: -(-len(views) // MAX_WEIGHED)] if by != "random" else ():
-        found = rasterize(gaussians, view.camera, weigh)
-        total = total + found.weight_sums[0] if by == "sum" else torch.maximum(total, found.weight_maxima[0])
+    for view in views[:: -(-len(views) // MAX_WEIGHED)]:
+        total += rasterize(gaussians, view.camera, weigh).weight_sums[0]
     ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
-    none = {n: t[:0] for n, t in gaussians.tensors().items()}
-    return DensityUpdate(ids, none, ids[:0])
+    return DensityUpdate(ids, {n: t[:0] for n, t in gaussians.tensors().items()}, ids[:0])
 
 
 @torch.no_grad()
