@@ -109,6 +109,11 @@ def camera_reach(count: int, cameras: int) -> Cost:
     return Cost(REAL * (4 * count + 3 * cameras), count * (9 * cameras + 12))
 
 
+def opacity_decay(count: int) -> Cost:
+    """An exponential and two logarithms for each Gaussian."""
+    return Cost(2 * REAL * count, 30 * count)
+
+
 def pixel_size(count: int, cameras: int) -> Cost:
     """Distance, depth and a quotient for each camera and the least of them, then a logarithm, for each Gaussian."""
     return Cost(REAL * (4 * count + 9 * cameras), count * (20 * cameras + 10))

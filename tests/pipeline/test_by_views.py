@@ -16,7 +16,7 @@ from warpgs.pipeline.train.presets import PRESETS
 @pytest.mark.parametrize(("views", "width", "height"), [(3, 126, 94), (3, 504, 378), (10, 900, 1600), (54, 504, 378)])
 def test_quick_is_never_slower_than_default(device, views, width, height):
     """At most 600 steps, and on a CPU at most as many as its time has for the default; a number that is given holds."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=width, height=height))] * views
+    train = [SimpleNamespace(camera=SimpleNamespace(width=width, height=height), alpha=None)] * views
     quick, default = (settings_by_views(PRESETS[name], train, device)[0].steps for name in ("quick", "default"))
     assert 0 < quick == min(600, default)
     given = dataclasses.replace(PRESETS["quick"], steps=700)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.cuda
 
 BUSY = FitConfig(
     steps=60, sh_every=15, init=InitConfig(source="points"),
-    density=DensityConfig(start=8, every=9, gradient=1e-5, reset_every=25),
+    density=DensityConfig(start=8, every=9, gradient=1e-5, reset_every=25), optimizer=OptimizerConfig(opacities_decay=0.002),
 )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_check
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.schedule import log_linear, sh_degree
+from warpgs.pipeline.train.schedule import OptimizerConfig, log_linear, sh_degree
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Camera, PointCloud, View
@@ -31,7 +31,11 @@ from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
 BUSY = FitConfig(
-    steps=60, sh_every=15, init=InitConfig(source="points"), density=DensityConfig(start=10, every=10, reset_every=20)
+    steps=60,
+    sh_every=15,
+    init=InitConfig(source="points"),
+    density=DensityConfig(start=10, every=10, reset_every=20),
+    optimizer=OptimizerConfig(opacities_decay=0.002),
 )
 
 

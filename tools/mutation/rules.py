@@ -68,6 +68,7 @@ OPS = {
     "native": [
         "kernels/test_project.py", "kernels/test_tiles.py", "render/test_rasterize.py", LIMITS_PROJECT, LIMITS_BLEND, RECORDS,
     ],
+    "opacity_decay": ["kernels/test_opacity_decay.py"],
     "pixel_size": ["kernels/test_pixel_size.py"],
     "plane_costs": ["kernels/test_plane_costs.py"], "plane_depths": ["kernels/test_plane_depths.py"],
     "project": ["kernels/test_project.py", LIMITS_PROJECT, EXTREMES, "kernels/test_tiles.py", "render/test_rasterize.py"],

@@ -25,6 +25,9 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot tell a colour that changes with direction from an error of the shape."""
+OPACITIES_DECAY, SPARSE_VIEWS = 0.001, 9
+"""Fraction of every opacity that a step takes up to so many opaque views, with one layer; with more, or where views know their
+opacity, it takes none, and there are two layers: neither was measured there (docs/decisions/023-opacity-decay.md)."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
@@ -63,6 +66,12 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if optimizer.opacities_lr is None:
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
+    few = views <= SPARSE_VIEWS and all(v.alpha is None for v in train)
+    if optimizer.opacities_decay is None:
+        optimizer = dataclasses.replace(optimizer, opacities_decay=OPACITIES_DECAY if few else 0.0)
+    method = config.method
+    if method.hier is None:
+        method = dataclasses.replace(method, hier=not few)
     degree = config.sh_degree
     if degree is None:
         degree = sum(views >= n for n in DEGREES)
@@ -77,6 +86,8 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         f"at most {steps:,} steps{each}": config.steps, f"SH degree {degree}": config.sh_degree,
         f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
         f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
+        f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
+        "two layers" if method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
     open_ = [words for words, given in chosen.items() if given is None]
@@ -92,4 +103,5 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
                 f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
                 f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
             )
-    return dataclasses.replace(config, steps=steps, sh_degree=degree, half_resolution=half, optimizer=optimizer), notes
+    chosen_parts = {"steps": steps, "sh_degree": degree, "half_resolution": half, "optimizer": optimizer, "method": method}
+    return dataclasses.replace(config, **chosen_parts), notes

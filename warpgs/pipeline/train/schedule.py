@@ -21,6 +21,8 @@ def sh_degree(step: int, every: int, highest: int) -> int:
 
 MAX_LR = 1e6
 """Largest learning rate: far above what trains, far below what overflows within a fit."""
+MAX_DECAY = 0.1
+"""Largest fraction of an opacity that a step may take: by then nothing stays opaque."""
 
 
 def check_lrs(of: str, **rates: float | None) -> None:
@@ -52,13 +54,17 @@ class OptimizerConfig:
     without phases. 1 for a constant rate."""
     opacities_lr: float | None = 0.05
     """Learning rate of the opacity logits. None: by the number of views."""
+    opacities_decay: float | None = 0.0
+    """Fraction of every opacity that each step takes, in [0, 0.1]; 0 for none. None: by the number of views."""
     sh_lr: float = 2.5e-3
     """Learning rate of the constant colour coefficient."""
     sh_rest_factor: float = 0.05
     """Fraction of that for the other coefficients."""
 
     def __post_init__(self):
-        check_lrs("optimizer", **vars(self))
+        if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
+            raise UsageError(f"optimizer opacities-decay must lie between 0 and {MAX_DECAY}, not {self.opacities_decay}")
+        check_lrs("optimizer", **{n: v for n, v in vars(self).items() if n != "opacities_decay"})
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
         """Return the learning rate of each parameter.

@@ -23,6 +23,7 @@ from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.background import over
 from warpgs.pipeline.train.learned_views import LearnedViews, seen
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
+from warpgs.pipeline.train.opacity_decay import decay_opacities
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
 from warpgs.render.compose import compose, count_instances, inputs_of
@@ -54,6 +55,8 @@ class StepPlan:
     """Value of `Strategy.phase`."""
     limits: Limits = NO_LIMITS
     """Limits that the step holds every Gaussian to."""
+    opacity_decay: float = 0.0
+    """Fraction of every opacity that the step takes."""
 
 
 class StepBuffers:
@@ -289,6 +292,7 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
     own, of_views = found.gradients[:count], found.gradients[count:]
     table.adam_step(dict(zip(table.params, own)), found.lrs[:split], stop, strategy.lr_factors(plan.phase))
     learned.views.table.adam_step(dict(zip(learned.views.table.params, of_views)), found.lrs[split:], stop)
+    decay_opacities(table.params["logit_opacities"].detach(), plan.opacity_decay, found.going)
     strategy.after_step(plan.phase, found.settings, found.going)
     plan.limits.hold(table.params, learned.cameras, found.going)
     for name, value in found.statistics.items():

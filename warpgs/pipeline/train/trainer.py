@@ -166,7 +166,9 @@ class Trainer:
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
-        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits)
+        decay = c.optimizer.opacities_decay
+        assert decay is not None  # `settings_by_views` has chosen
+        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay)
 
     def next_view(self) -> int:
         """Return the number of the next view. The order is random; each view comes once before any comes again."""

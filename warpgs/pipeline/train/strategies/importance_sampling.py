@@ -88,7 +88,7 @@ class ImportanceSampling(Strategy):
 
     def is_layered(self, step: int) -> bool:
         """Return whether only the fine layer grows, and the coarse one moves slowly: from phase 2 on."""
-        return self.method.hier and self.method.events and step > self.context.phases.refine
+        return bool(self.method.hier) and self.method.events and step > self.context.phases.refine
 
     def growth(self) -> Growth:
         """Return the times of refinement and sampling; right after an event PSNR is up to 3 dB lower."""

@@ -64,8 +64,9 @@ class MethodConfig:
 
     events: bool = False
     """Sampling events: fine Gaussians are added in phase 2."""
-    hier: bool = False
-    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and its means move slowly."""
+    hier: bool | None = False
+    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and its means move slowly. None: by the number of
+    views."""
     s_render: bool = True
     """Weight of the rendering residual in the importance."""
     s_semantic: bool = True

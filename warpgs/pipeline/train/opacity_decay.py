@@ -1,0 +1,28 @@
+"""Decay of opacities: each step takes a fraction of every opacity, so that only what photographs ask for stays.
+
+The idea is that of Binocular3DGS (Han et al. 2024, arXiv 2410.18822); docs/decisions/023-opacity-decay.md has the measurements.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from warpgs.kernels.opacity_decay import opacity_decay
+
+LEAST_LOGIT = -15.0
+"""Logit below which no opacity decays further: the pruning threshold is far above it."""
+
+
+@torch.no_grad()
+def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor) -> None:
+    """Take a fraction of every opacity, in place; it may be part of a captured step.
+
+    Args:
+        logits: Logits of opacities, float32, shape [N].
+        fraction: Fraction of an opacity that is taken, in [0, 1); 0 changes nothing.
+        going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
+    """
+    if fraction == 0:
+        return
+    new = torch.where(logits > LEAST_LOGIT, opacity_decay(logits, 1 - fraction), logits)
+    logits.copy_(torch.where(going, new, logits))
