@@ -13,6 +13,7 @@ from warpgs.errors import NotFiniteError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train import step
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import View
