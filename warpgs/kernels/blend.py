@@ -139,16 +139,19 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     values = VALUES + channels - COLORS + 2 * settings.absgrad
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
+    deep = v_alpha is not None or v_depth is not None
     upstream = [interop.view(v_rgb.contiguous().view(-1, channels), real)]
     for v in (v_alpha, v_depth):
-        upstream.append(interop.view((torch.zeros_like(depth) if v is None else v.contiguous()).view(-1), real))
+        v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
+        upstream.append(interop.view(v.view(-1), real))
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
         interop.view(backgrounds, real),
         *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
         *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
-    _launch(blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad).backward, len(tiles.ranges), inputs, device)
+    kernels = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep)
+    _launch(kernels.backward, len(tiles.ranges), inputs, device)
     inputs = [
         interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
         interop.view(v_projected.view(-1, v_projected.shape[-1]), real),

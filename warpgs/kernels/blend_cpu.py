@@ -320,10 +320,10 @@ def make_contributions(real, tile_size: int):
 
 
 @functools.cache
-def make_kernels(real, tile_size: int, channels: int = COLORS, absgrad: bool = False):
-    """Make the forward, backward and contribution kernels for one scalar type, tile size and number of channels."""
+def make_kernels(real, tile_size: int, channels: int = COLORS, absgrad: bool = False, deep: bool = True):
+    """Make the forward, backward and contribution kernels; arguments are those of `make_backward`."""
     return SimpleNamespace(
         forward=make_forward(real, tile_size, channels),
-        backward=make_backward(real, tile_size, channels, absgrad),
+        backward=make_backward(real, tile_size, channels, absgrad, deep),
         contributions=make_contributions(real, tile_size),
     )

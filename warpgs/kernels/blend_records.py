@@ -1,4 +1,4 @@
-"""Records of the backward blending kernel in plain Warp: what it knows of pixels, strips, a Gaussian, and its gradient."""
+"""Records of the backward blending kernel in plain Warp: what it knows of pixels, and the gradient of a Gaussian."""
 
 import functools
 from types import SimpleNamespace
@@ -17,21 +17,17 @@ WIDTHS = (COLORS, 7, 11)
 
 @functools.cache
 def make_records(real, tile_size: int, channels: int, absgrad: bool):
-    """Make the records, and the functions that read an entry of their vectors, for one scalar type, tile size and channels.
+    """Make the records for one scalar type, tile size and number of channels.
 
     A tile lies in columns as wide as a strip, one beside the other; entries of its pixels follow in that order. Vectors are
     one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other, in a gradient with the
     two magnitudes behind them where ``absgrad`` asks for these.
     """
-    count = tile_size * (tile_size // STRIP)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
-    list_reals = wp.types.vector(count, real)
-    list_ints = wp.types.vector(count, wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
-    channel_reals = wp.types.vector(channels, real)
 
     @wp.struct
     class Pixels:
@@ -43,27 +39,11 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         v_z: tile_reals
         v_w: tile_reals
         end: tile_ints  # one past the last instance that was blended
-        strip_end: list_ints  # the largest of those in a strip
-
-    @wp.struct
-    class Reach:
-        """Values of a Gaussian at each strip, and the strips that it reaches."""
-
-        dx: list_reals  # from the mean to the first pixel [px]
-        dy: list_reals
-        e22: list_reals  # square of e2
-        start: list_reals  # e1 of the first pixel
-        ramp: strip_reals  # what the other pixels add to it
-        hits: list_ints  # 1 where the strip is reached
-        order: list_ints  # the strips that are reached, one after the other
 
     @wp.struct
     class Shades:
-        """Values of a Gaussian at each pixel of the strips that it reaches, in their order."""
+        """What the current instance leaves at each pixel that it reaches."""
 
-        alpha: tile_reals
-        inverse: tile_reals  # of 1 - alpha
-        slope: tile_reals  # falloff where alpha follows it, else 0
         v: tile_reals  # gradient of the falloff
         w: tile_reals  # blending weight
 
@@ -80,30 +60,4 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         color: strip_channels
         z: strip_reals
 
-    @wp.struct
-    class Projected:
-        """A projected Gaussian."""
-
-        x: real
-        y: real
-        u11: real
-        u12: real
-        u22: real
-        opacity: real
-        color: channel_reals
-        z: real
-        aside: real  # see `falloff.make_functions`
-        limit: real
-
-    @wp.func(inline=True)
-    def at(entry: wp.ref[real]) -> real:
-        """Return an entry of a vector of a record that is taken by reference; Warp would copy the vector otherwise."""
-        return entry
-
-    @wp.func(inline=True)
-    def at_int(entry: wp.ref[wp.int32]) -> wp.int32:
-        return entry
-
-    return SimpleNamespace(
-        Pixels=Pixels, Reach=Reach, Shades=Shades, Gradient=Gradient, Projected=Projected, at=at, at_int=at_int
-    )  # fmt: skip
+    return SimpleNamespace(Pixels=Pixels, Shades=Shades, Gradient=Gradient)
