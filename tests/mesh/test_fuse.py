@@ -13,8 +13,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
 from warpgs.mesh.surface_views import sample_surface, surface_view
 from warpgs.pipeline.films.rig import common_up
-from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs import mesh_of_run as run_mesh
+from warpgs.pipeline.runs.folder import METRICS_FILE, StoredRun
 from warpgs.render.rasterize import RasterizeOptions
 from warpgs.scene import Normalization
 
@@ -85,14 +85,17 @@ def test_cameras_that_see_nothing_are_an_error():
 
 
 @pytest.fixture
-def stored(monkeypatch):
-    """A run whose scene units are half of its files' units, and elsewhere."""
+def stored(monkeypatch, tmp_path_factory):
+    """A finished run whose scene units are half of its files' units, and elsewhere."""
     views = {f"{i}.png": c for i, c in enumerate(cameras(ALL_SIDES))}
-    model = FittedModel(
-        ball(), Normalization(np.array([10.0, 20, 30]), 0.5), views, tuple(views)[:9], tuple(views)[9:], "exact", (0, 0, 0), 7
-    )
-    monkeypatch.setattr(run_mesh, "open_run", lambda folder, device: model)
-    return model
+    folder = tmp_path_factory.mktemp("run")
+    (folder / METRICS_FILE).touch()
+    run = StoredRun(
+        ball(), Normalization(np.array([10.0, 20, 30]), 0.5), views, tuple(views)[:9], tuple(views)[9:], "exact", (0, 0, 0), 7,
+        folder, {},
+    )  # fmt: skip
+    monkeypatch.setattr(run_mesh, "open_run", lambda folder, device: run)
+    return run
 
 
 def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
