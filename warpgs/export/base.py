@@ -26,7 +26,7 @@ from warpgs.input_files import open_input, read_input, unread_reason
 from warpgs.plugins import Registry
 from warpgs.scene import Gaussians, Normalization
 
-_BROKEN = (
+BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
     NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
@@ -137,7 +137,7 @@ class Format:
         try:
             with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
                 arrays = self.decode(path, data if self.archive else data.read())
-        except _BROKEN as e:
+        except BROKEN as e:
             raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
         return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
 
