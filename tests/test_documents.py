@@ -90,7 +90,7 @@ def test_every_line_of_the_security_page_names_a_test_that_is_there():
 
 def named_results(text: str) -> set[str]:
     """Return the names of result files in a text; patterns such as ``ops_MACHINE.json`` are left out."""
-    kept, spelled = r"\b\w+_(?:h200|cpu\d*)\.(?:json|md|svg|csv)\b", r"(?<=bench/results/)\w+\.\w+"
+    kept, spelled = r"\b\w+_(?:h[12]00|cpu\d*)\.(?:json|md|svg|csv)\b", r"(?<=bench/results/)\w+\.\w+"
     return {name for name in re.findall(f"{kept}|{spelled}", text) if "MACHINE" not in name}
 
 
