@@ -30,8 +30,8 @@ BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
     NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
-"""What the decoders of the standard library, zstandard and our own raise about content that makes no sense: zipfile reports
-encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
+"""Errors of decoders, those of the standard library, of zstandard and our own, about content that makes no sense: zipfile
+reports encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
 
 
 class Format:
