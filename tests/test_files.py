@@ -187,6 +187,7 @@ ELSEWHERE = {
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
     ("report/scene_plot.py", "savez"): "the same",
+    ("poses/matcher.py", "savez"): "into the file of `writing`",
     ("pipeline/runs/fit_steps.py", "save"): "writes a checkpoint by warpgs.files",
     ("report/sheet.py", "save"): "Pillow, into memory",
     ("report/animation.py", "save"): "the same",

@@ -17,7 +17,7 @@ from tests.gaussians import cloud
 from warpgs.errors import DataError, UsageError
 from warpgs.export import compressed_ply, gltf, sog, splat, spz
 from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
-from warpgs.export.formats import format_of, read_file, read_gaussians, suffixes, write_gaussians
+from warpgs.export.formats import format_of, read_gaussians, read_with_antialiasing, suffixes, write_gaussians
 from warpgs.export.ply import read_ply
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
@@ -400,7 +400,7 @@ def test_files_say_that_they_are_antialiased(suffix, tmp_path):
         assert len(caught) == expected * (1 + (suffix == ".ply"))
         again = tmp_path / f"{antialiased}-again.spz"
         convert(path, again)
-        assert read_file(again, None, "file")[1] is expected
+        assert read_with_antialiasing(again, None, "file")[1] is expected
     declaring = {".ply", ".compressed.ply", ".spz", ".sog"}
     assert format_of(path).declares == (suffix in declaring)
 
@@ -412,14 +412,14 @@ def test_comments_of_other_programs(line, expected, tmp_path):
     write_gaussians(path, model(), units="file")
     before = b"comment antialiased 0"
     path.write_bytes(path.read_bytes().replace(before, b"comment SplatRenderMode: mip\ncomment " + line.encode()))
-    assert read_file(path, None, "file")[1] is expected
+    assert read_with_antialiasing(path, None, "file")[1] is expected
 
 
 def test_spz_of_version_4_says_it_too(tmp_path):
     pytest.importorskip("zstandard")
     path = tmp_path / "a.spz"
     write_gaussians(path, model(), units="file", format=spz.SPZ(spz.SPZConfig(version=4)), antialiased=True)
-    assert read_file(path, None, "file")[1]
+    assert read_with_antialiasing(path, None, "file")[1]
 
 
 def test_rows_of_splat_that_make_no_sense(tmp_path):

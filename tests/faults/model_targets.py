@@ -75,7 +75,7 @@ def ply_files(root: Path) -> list[Path]:
     return [root / "a.ply", root / "b.ply"]
 
 
-PLY = (ply.read_ply, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)
+PLY = (ply._read, parse_header, ply._locate_vertices, ply._check_properties, ply._assemble, ply_error)
 PLY_CHANGES = (ply_header(text_number), ply_header(text_line), ply_body, ply_body)
 register(Target("ply", ply_files, lambda root, path: read_gaussians(path), PLY, PLY_CHANGES, nonsense=nonsense))
 

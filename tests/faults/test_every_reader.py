@@ -26,9 +26,11 @@ PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", 
 
 READERS = {
     "export/base.py": {"Format.read": "splat"},
+    "export/compressed_ply.py": {"start_of": "ply"},
     "export/gltf.py": {"_split": "glTF"},
-    "export/ply.py": {"PLY.read": "ply", "read_ply": "ply"},
-    "export/sog.py": {"decode": "SOG", "_member": "SOG", "_pixels": "SOG"},
+    "export/ply.py": {"_read": "ply"},
+    "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
+    "export/spz.py": {"SPZ.is_antialiased": "SPZ"},
     "io/camera_files.py": {"_json": "cameras"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
     "io/decoding.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
@@ -93,7 +95,6 @@ REASONS = {
     "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
     "poses/heic.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE},
-    "poses/matcher.py": {"_read": OWN},
     "poses/worker.py": {
         "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN,
     },

@@ -5,6 +5,8 @@ each that reads through it is tried here.
 """
 
 import ast
+import importlib.machinery
+import importlib.util
 import shutil
 import signal
 from pathlib import Path
@@ -17,10 +19,14 @@ import warpgs
 from tests.io import scenes
 from tests.test_input_files import special
 from warpgs.errors import WarpgsError
+from warpgs.export.compressed_ply import start_of
 from warpgs.export.formats import read_gaussians, suffixes
+from warpgs.export.sog import SOG
+from warpgs.export.spz import SPZ
 from warpgs.files import read_file
 from warpgs.io import camera_files, folders, images
 from warpgs.io.load import load_scene
+from warpgs.io.map_files import read_numbers
 from warpgs.io.readers import READERS
 from warpgs.pipeline.farm.listing import list_jobs
 from warpgs.pipeline.farm.record import RECORD, file_digest, read_record
@@ -36,7 +42,7 @@ from warpgs.poses import record as poses_record
 from warpgs.poses import video
 from warpgs.poses.find import find_poses, source_digest
 from warpgs.poses.heic import is_heic
-from warpgs.priors import export, flow, preprocess
+from warpgs.priors import export, export_matcher, flow, preprocess
 from warpgs.priors.cache import MapCache
 from warpgs.priors.session import open_network
 from warpgs.report.events import read_events
@@ -81,9 +87,20 @@ def weights(path):
     export._fcn_resnet18(export.ExportRequest("fcn-resnet18", str(path)))
 
 
+def package(path):
+    """Read the files of an installed package whose code is special."""
+    found = importlib.machinery.ModuleSpec(export_matcher.PACKAGE, None, origin=str(path.with_name("__init__.py")))
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(importlib.util, "find_spec", lambda name: found)
+        export_matcher.package_files()
+
+
 DOORS = {
     **{f"a{suffix}": ("export.base", read_gaussians) for suffix in suffixes()},
     "b.ply": ("export.ply", warpgs.read_ply),
+    "c.ply": ("export.compressed_ply", start_of),
+    "b.spz": ("export.spz", lambda p: SPZ().is_antialiased(p)),
+    "b.sog": ("export.sog", lambda p: SOG().is_antialiased(p)),
     "cameras.json": ("io.camera_files", camera_files.read_cameras),
     "transforms.json": ("io.transforms", camera_files.read_cameras),
     **{f"a{suffix}": ("io.decoding", folders.read_mask) for suffix in images.SUFFIXES},
@@ -98,12 +115,14 @@ DOORS = {
     RECORD: ("pipeline.farm.record", job_record),
     "artefact": ("pipeline.farm.record", file_digest),
     "render.png": ("files", lambda p: read_file(p, p.parent)),
-    "model.onnx": ("priors.session", open_network),
-    "flow.onnx": ("priors.session", lambda p: flow._network(p, "255")),
+    "model.onnx": ("runtime.onnx_session", open_network),
+    "flow.onnx": ("runtime.onnx_session", lambda p: flow._network(p, "255")),
     "side.onnx": ("priors.preprocess", side_file),
     "a.flo": ("priors.flow", flow.read_flo),
     "b.flo": ("priors.flow", flow_folder),
     "map": ("priors.cache", cached),
+    "a.npy": ("io.map_files", read_numbers),
+    "model.py": ("priors.export_matcher", package),
     "fcn.safetensors": ("priors.export", weights),
     "lpips.safetensors": ("pipeline.metrics.lpips_weights", read_lpips),
     "heads.pth": ("pipeline.metrics.lpips_weights", lambda p: convert_lpips(p, p, p.parent / "out")),
@@ -241,7 +260,7 @@ ALLOWED = {
     ("poses/video.py", "VideoCapture"): "a path whose first bytes read_start read",
     ("poses/worker.py", "open"): "a database that this process makes",
     ("poses/worker.py", "read_text"): "a job that the calling process has just written",
-    ("priors/export.py", "read_bytes"): "a network that torch has just written",
+    ("priors/onnx_export.py", "read_bytes"): "a network that torch has just written",
     ("report/film.py", "VideoCapture"): "a temporary film that was just written",
     ("report/overview.py", "read_bytes"): "an image that a child has just written",
     ("report/scene_plot.py", "read_bytes"): "an image that a child has just written",

@@ -12,7 +12,7 @@ import warpgs
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
 from warpgs.export.cameras import write_cameras
-from warpgs.export.formats import read_file
+from warpgs.export.formats import read_with_antialiasing
 from warpgs.kernels.pixel_size import pixel_size
 from warpgs.pipeline.metrics.evaluate import score
 from warpgs.pipeline.model.init import InitConfig
@@ -149,7 +149,7 @@ def test_the_flag_and_the_files(tmp_path, capsys):
         assert (b"comment antialiased 1" in data[:500]) is bool(own)
         for file in ("a.spz", "a.splat"):
             assert main(["export", str(tmp_path / name), "--to", str(tmp_path / name / file), "--no-clean"]) == 0
-            assert read_file(tmp_path / name / file, None, "file")[1] is (bool(own) and file == "a.spz")
+            assert read_with_antialiasing(tmp_path / name / file, None, "file")[1] is (bool(own) and file == "a.spz")
         assert ("choose that mode where the file is shown" in capsys.readouterr().out) is bool(own)
         assert content_of_file(tmp_path / name / "a.spz").model.options().antialiased is bool(own)
         write_cameras(tmp_path / "cameras.json", ring(2))
@@ -157,4 +157,4 @@ def test_the_flag_and_the_files(tmp_path, capsys):
         assert opened.antialiased is bool(own) and any("is antialiased" in note for note in notes) is bool(own)
     assert main(["prune", str(tmp_path / "with"), "--keep-psnr", "1", "--device", "cpu"]) == 0
     assert warpgs.open_run(tmp_path / "with-pruned", "cpu").antialiased
-    assert read_file(tmp_path / "with-pruned" / "point_cloud.ply", None, "file")[1]
+    assert read_with_antialiasing(tmp_path / "with-pruned" / "point_cloud.ply", None, "file")[1]

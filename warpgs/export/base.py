@@ -26,12 +26,12 @@ from warpgs.input_files import open_input, read_input, unread_reason
 from warpgs.plugins import Registry
 from warpgs.scene import Gaussians, Normalization
 
-_BROKEN = (
+BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
     NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
-"""What the decoders of the standard library, zstandard and our own raise about content that makes no sense: zipfile reports
-encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
+"""Errors of decoders, those of the standard library, of zstandard and our own, about content that makes no sense: zipfile
+reports encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
 
 
 class Format:
@@ -137,7 +137,7 @@ class Format:
         try:
             with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
                 arrays = self.decode(path, data if self.archive else data.read())
-        except _BROKEN as e:
+        except BROKEN as e:
             raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
         return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
 

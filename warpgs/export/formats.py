@@ -128,13 +128,13 @@ def read_gaussians(
         warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units come without a
             normalization.
     """
-    gaussians, antialiased = read_file(Path(path), normalization, units, format)
+    gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)
     if antialiased:
         warn_of_antialiasing(Path(path))
     return gaussians
 
 
-def read_file(
+def read_with_antialiasing(
     path: Path, normalization: Normalization | None, units: str, format: str | type[Format] | Format | None = None
 ) -> tuple[Gaussians, bool]:
     """Return what `read_gaussians` does, and whether the file says that it is antialiased."""

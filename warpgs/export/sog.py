@@ -33,7 +33,7 @@ from warpgs.export.arrays import (
     sigmoid,
     smallest_three,
 )
-from warpgs.export.base import Format, register
+from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
 
 LEVELS = 256
@@ -343,13 +343,15 @@ class SOG(Format):
         return encode(arrays, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether meta.json says so, of a file that `decode` takes.
+        """Return whether meta.json says so.
 
         Raises:
-            DataError: The file cannot be read.
+            DataError: The file cannot be read or is malformed.
         """
         try:
             with open_input(path) as file, zipfile.ZipFile(file) as archive:
                 return _meta(path, archive).get("model") == "antialiased"
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+        except BROKEN as e:
+            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e

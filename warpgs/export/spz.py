@@ -36,7 +36,7 @@ from warpgs.export.arrays import (
     smallest_three,
     unit_quats,
 )
-from warpgs.export.base import Format, register
+from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
@@ -313,13 +313,15 @@ class SPZ(Format):
         """Return whether the header says so.
 
         Raises:
-            DataError: The file cannot be read.
+            DataError: The file cannot be read or is malformed.
         """
         try:
             with open_input(path) as file:
                 packed = file.read(2) == b"\x1f\x8b"
                 file.seek(0)
                 head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
+                return bool(HEADER.unpack(head)[5] & 1)
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        return len(head) == HEADER.size and bool(HEADER.unpack(head)[5] & 1)
+        except BROKEN as e:
+            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpgs.errors import DataError
+from warpgs.files import writing
+from warpgs.io.decoding import decode_png
 from warpgs.poses.pairs import choose_pairs
 from warpgs.runtime.onnx_session import first_line, read_model, start_session
 
@@ -166,13 +168,6 @@ def mutual_matches(a: Features, b: Features) -> np.ndarray:
     return np.stack([rows[good], best[good]], 1).astype(np.uint32)
 
 
-def _read(path: Path) -> np.ndarray:
-    """Return the copy of a photograph, uint8 RGB [H, W, 3]."""
-    import cv2
-
-    return np.ascontiguousarray(cv2.imread(str(path))[..., ::-1])
-
-
 def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
     """Return the quarter turns to the left after which photographs have the same side up, most of them none.
 
@@ -221,23 +216,28 @@ def write_matches(
     found = []
     for i, image in enumerate(images):
         progress(f"finding features: photograph {i + 1} of {len(images)}")
-        found.append(matcher.features(_read(image)))
+        found.append(matcher.features(decode_png(image)))
     pairs = [(i, j) for j in range(len(found)) for i in range(j)]
     if len(found) > exhaustive:
         pairs = choose_pairs([(f.descriptors // 16 + 128).astype(np.uint8) for f in found], kind)
     turned = []
     if kind == "photographs":
         progress("finding turned photographs")
-        turns = quarter_turns(matcher, map(_read, images), pairs)
+        turns = quarter_turns(matcher, map(decode_png, images), pairs)
         turned = [i for i, t in enumerate(turns) if t]
         for i in turned:
-            found[i] = matcher.features(_read(images[i]), turns[i])
+            found[i] = matcher.features(decode_png(images[i]), turns[i])
     matches = []
     for k, (i, j) in enumerate(pairs):
         progress(f"matching: pair {k + 1} of {len(pairs)}")
         matches.append(mutual_matches(found[i], found[j]))
-    np.savez(
-        out, keypoints=np.concatenate([f.pixels for f in found]), per_photograph=np.array([len(f.pixels) for f in found]),
-        pairs=np.array(pairs).reshape(-1, 2), matches=np.concatenate(matches), counts=np.array([len(m) for m in matches]),
-    )  # fmt: skip
+    arrays = {
+        "keypoints": np.concatenate([f.pixels for f in found]),
+        "per_photograph": np.array([len(f.pixels) for f in found]),
+        "pairs": np.array(pairs).reshape(-1, 2),
+        "matches": np.concatenate(matches),
+        "counts": np.array([len(m) for m in matches]),
+    }
+    with writing(out) as file:
+        np.savez(file, **arrays)
     return turned

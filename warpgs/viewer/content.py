@@ -12,7 +12,7 @@ import torch
 
 from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError, WarpgsError
-from warpgs.export.formats import read_file
+from warpgs.export.formats import read_with_antialiasing
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.commands import scene_of
@@ -83,7 +83,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     Raises:
         DataError: The file holds no Gaussians.
     """
-    stored, antialiased = read_file(path, None, "file")
+    stored, antialiased = read_with_antialiasing(path, None, "file")
     if not len(stored):
         raise DataError(f"{path}: holds no Gaussian; export the model again")
     means = stored.means.double().numpy()

@@ -10,7 +10,7 @@ import torch
 from warpgs.errors import DataError, UsageError
 from warpgs.export.base import Format
 from warpgs.export.cameras import holds_cameras, write_cameras
-from warpgs.export.formats import find_format, format_of, read_file, write_gaussians
+from warpgs.export.formats import find_format, format_of, read_with_antialiasing, write_gaussians
 from warpgs.io.camera_files import read_cameras
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.model.filters import limit_degree, select
@@ -58,7 +58,7 @@ def convert(
         format_of(target, unused)  # says that its name is another
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
-    gaussians, antialiased = read_file(source, None, "file", read)
+    gaussians, antialiased = read_with_antialiasing(source, None, "file", read)
     lines = _written(gaussians, None, target, kind, filters, antialiased)
     return [read.note, *lines] if read.note and not kind.note else lines
 
@@ -116,7 +116,7 @@ def _written(
 
 def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
     """Return a line on what the format rounded, from the file itself; none for what float32 rounds."""
-    back, _ = read_file(target, None, "file", kind)
+    back, _ = read_with_antialiasing(target, None, "file", kind)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
     if moved == 0 and float(scales.max()) < ROUNDING:

@@ -9,7 +9,7 @@ import numpy as np
 from warpgs.constants import LOW_PASS
 from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
-from warpgs.export.formats import format_of, read_file
+from warpgs.export.formats import format_of, read_with_antialiasing
 from warpgs.io.camera_files import colmap_folder, read_cameras
 from warpgs.io.decoding import MAX_PIXELS
 from warpgs.io.load import load_scene
@@ -57,7 +57,7 @@ def open_file(
             )
     # the unit stays that of the file, in which the near plane of a rule is given
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
-    gaussians, declared = read_file(path, normalization, "scene")
+    gaussians, declared = read_with_antialiasing(path, normalization, "scene")
     gaussians = Gaussians(**{name: t.to(where) for name, t in gaussians.tensors().items()})
     notes += [note] if (note := format_of(path).note) else []
     if declared:
