@@ -70,7 +70,7 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
         changed = dataclasses.replace(base.method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
         if all(changed != earlier.method for earlier in variants.values()):
             variants[row] = dataclasses.replace(base, method=changed)
-            marks[row] = tuple(getattr(changed, name) for name in SWITCHES)
+            marks[row] = tuple(bool(getattr(changed, name)) for name in SWITCHES)
     return variants, marks
 
 
