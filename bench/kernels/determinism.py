@@ -58,7 +58,7 @@ def cost(g: Gaussians, cam: Camera, repeats: int, device: torch.device) -> dict[
     for name in list(works):
         try:
             result[name] = {"repeats_that_differ": repeats_that_differ(works[name], 10)}
-        except (wp.WarpDeterminismError, RuntimeError) as e:  # too many records, or too much memory
+        except (RuntimeError, ValueError) as e:  # too many records, or too much memory
             result[name] = {"reason": " ".join(str(e).split())[:200]}
             del works[name]
     for name, row in zip(works, measure_in_turn(list(works.values()), device, repeats), strict=True):

@@ -1,13 +1,13 @@
-"""The measured parts of docs/accuracy.md: the error budget, the needles and the same bits.
+"""The measured parts of docs/accuracy.md: the error budget, the needles, the same bits, and gradients of other programs.
 
 The figures are those of bench/results/budget_*.json (`python -m tests.numerics.report`) and bench/results/needles_*.json
-(`python -m bench.studies.needles`), tables of the first machine, and of bench/results/same_bits.json
-(`python -m bench.fits.same_bits`).
+(`python -m bench.studies.needles`), tables of the first machine, of bench/results/same_bits.json
+(`python -m bench.fits.same_bits`), and of bench/results/gradients_*.json (`python -m bench.peers.gradient_accuracy`).
 """
 
 from __future__ import annotations
 
-from bench.lib import result_file, same_bits
+from bench.lib import rasterizers_page, result_file, same_bits
 from bench.lib.tables import markdown
 
 RENAMED = {"gsplat": "gsplat-1.5"}
@@ -85,10 +85,18 @@ def needles_text(results: dict[str, dict]) -> str:
     return "\n".join(parts)
 
 
+def gradients_text(results: dict[str, dict]) -> str:
+    """The table of gradients beside other programs, and where its figures are from."""
+    stems = sorted(results, key=len)  # that of all programs first, then the one of fast math
+    sources = "\n".join(result_file.source(f"gradients_{stem}") for stem in stems)
+    return f"{rasterizers_page.gradients_table([results[stem] for stem in stems])}\n{sources}"
+
+
 def parts() -> dict[str, str]:
     """Return the generated parts of docs/accuracy.md by name."""
     return {
         "budget": budget_text(result_file.stored("budget")),
         "needles": needles_text(result_file.stored("needles")),
+        "gradients": gradients_text(result_file.stored("gradients")),
         "same bits": same_bits.table(result_file.read(same_bits.RESULTS)["rows"]),
     }

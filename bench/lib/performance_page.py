@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 
-from bench.lib import result_file
+from bench.lib import rasterizers_page, result_file
 from bench.lib.plot import Line, Panel, chart
 from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
 from bench.lib.tables import figure, markdown
@@ -76,20 +76,6 @@ def sizes_table(results: dict[str, dict]) -> str:
                 body.append([size, result_file.machine_name(result), *map(_timing, rows)])
     head = ["Gaussians, image", "machine", "render [ms]", "with gradients [ms]", "training step [ms]"]
     return markdown(head, body, WORDS)
-
-
-def gsplat_table(result: dict) -> str:
-    """Return times and memory beside gsplat; ratios are ours over gsplat's."""
-    body = []
-    for r in result["rows"]:
-        wall, steps, peak = r["wall_ms"], r["step_wall_ms"], r["peak_ratio"]
-        cells = [figure(t["median"]) for t in (wall["warpgs"], wall["gsplat dense"])]
-        cells += [f"{r['wall_ms_ratio']['warpgs']:.3f}", f"{r['wall_ms_ratio']['warpgs, never recorded']:.3f}"]
-        cells += [figure(steps["warpgs graph"]["median"]), figure(steps["gsplat"]["median"]), f"{r['step_ratio']:.3f}"]
-        cells += [f"{peak['warpgs']:.3f}", f"{peak['warpgs atomic']:.3f}"]
-        body.append([r["configuration"].replace(" at ", ", ").replace("x", " x "), *cells])
-    head = ["Gaussians, image", "warpgs [ms]", "gsplat [ms]", "ratio", "ratio, `record=False`", "step [ms]", "gsplat step [ms]"]
-    return markdown([*head, "ratio", "memory ratio", "atomic sums"], body, WORDS)
 
 
 def fits_table(results: dict[str, dict]) -> str:
@@ -203,11 +189,14 @@ def plots(results: dict[str, dict]) -> dict[str, str]:
 
 def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
-    ops, gsplat, turns = (result_file.stored(kind) for kind in ("ops", "gsplat", "turns"))
-    sources = _sources("ops", ops)
+    ops, others, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "turns"))
+    sources, beside = _sources("ops", ops), next(iter(others.values()))
     return {
         "sizes": sizes_table(ops) + sources,
-        "gsplat": gsplat_table(gsplat["h200"]) + _sources("gsplat", gsplat),
+        "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
+        "many channels": rasterizers_page.channels_table(beside),
+        "steps": rasterizers_page.steps_table(beside),
+        "buffers": rasterizers_page.buffers_table(beside),
         "whole fits": fits_table(turns) + _sources("turns", turns),
         "ops": ops_table(ops),
         "other programs": peers_table(ops),

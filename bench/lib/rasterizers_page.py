@@ -10,6 +10,8 @@ from bench.lib.tables import figure, markdown
 LEFT = ("Gaussians, image", "program", "scene", "cut-offs", "buffer")
 DIRECTIONS = ("image", "forward", "both")
 MIB = 2**20
+ALIKE = 0.95
+"""Figures above this fraction of ours count as ours."""
 
 
 def _size(row: dict) -> str:
@@ -88,10 +90,11 @@ def gradients_table(results: list[dict]) -> str:
                 behind += [
                     f"{t} of `{scene}` ({who} {_e(own[t]['p99'])}, ours {_e(programs[OURS][t]['p99'])})"
                     for t in TENSORS
-                    if own[t]["p99"] < programs[OURS][t]["p99"]
+                    if own[t]["p99"] < ALIKE * programs[OURS][t]["p99"]
                 ]
     head = ["scene", "cut-offs", "program", *(f"p99: {t}" for t in TENSORS), "median", "largest", "1 - cosine", "bias"]
-    said = f"Not lowest at the 99th percentile: {'; '.join(behind)}." if behind else "Ours are lowest at every 99th percentile."
+    said = "Ours are lowest at every 99th percentile, or within 5 % of the lowest"
+    said += f", but for: {'; '.join(behind)}." if behind else "."
     judge = max(results[0]["judge"].values())
     said += f" Our float64 pass is within {_e(judge)} (relative L2) of torch's derivative of a plain program."
     return markdown(head, body, LEFT) + f"\n{said}\n"
