@@ -1,7 +1,8 @@
 """A training step on a CPU from two checkouts in turn, on a seeded cloud: wall time and processor time of a step.
 
-OLD and NEW are folders of two checkouts. A process of each waits while the other steps, with a kernel cache of its own. Processor
-time is that of all threads, and disturbed less by other programs. ``--targets haswell`` compiles for processors without AVX-512.
+OLD and NEW are folders of two checkouts. A process of each waits while the other steps, with a kernel cache of its own.
+Processor time is that of all threads, and disturbed less by other programs. ``--targets haswell`` compiles for processors
+without AVX-512.
 """
 
 from __future__ import annotations
