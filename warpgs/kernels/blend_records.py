@@ -42,7 +42,7 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
 
     @wp.struct
     class Shades:
-        """What the current instance leaves at each pixel that it reaches."""
+        """Gradient and weight of the current instance at each pixel that it reaches."""
 
         v: tile_reals  # gradient of the falloff
         w: tile_reals  # blending weight
