@@ -23,7 +23,7 @@ def step_bytes(sizes: StepSizes) -> Needs:
     slots, states = blend_cuda.instance_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0)
     images = (COLORS + 2) * FLOAT * sizes.pixels  # colour, alpha, depth
     kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
-    lean = sizes.cuda and not (sizes.depth or sizes.cutout)  # there only colour has a gradient
+    lean = not (sizes.depth or sizes.cutout)  # only colour has a gradient
     upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
     whole = images + upstream if sizes.chunked else 0  # images of the frame stand beside those of a chunk
     return {
