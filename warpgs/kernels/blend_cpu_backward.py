@@ -242,7 +242,9 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
         v_e1 = opacity * totals[0]
         v_e2 = opacity * u22 * totals[1]
         v_slots[slot, 0] = u11 * v_e1
-        v_slots[slot, 1] = at(g.u12[j]) * v_e1 + f.apart(u22 * v_e2)  # else the compiler chooses which product is fused
+        product = u22 * v_e2
+        product = wp.where(real(1.0e30) < product, real(wp.inf), product)  # so that it is rounded, and not fused with the sum
+        v_slots[slot, 1] = at(g.u12[j]) * v_e1 + product
         v_slots[slot, 2] = -opacity * totals[2]
         v_slots[slot, 3] = -opacity * totals[3]
         v_slots[slot, 4] = -opacity * u22 * totals[4]
