@@ -15,7 +15,7 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs import precompile
 from warpgs.pipeline.runs.precompile import fit_kernels
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
@@ -46,6 +46,7 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
     )
     config = FitConfig(
         steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"),
+        optimizer=OptimizerConfig(opacities_decay=0.001),
         strategy=strategy, method=method,
         loss_terms=(DepthCorrelation(0.1, 0.5),),
         density=DensityConfig(start=2, every=2), phases=PhaseConfig(4, 6, every=2),

@@ -22,6 +22,7 @@ from warpgs.kernels import (
     camera_reach,
     dropout,
     knn,
+    opacity_decay,
     project,
     scanlines,
     ssim_cpu,
@@ -55,7 +56,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         *((tiles_emit.make_emit(real, cuda, slotted), THREADS) for slotted in (True, False)),
         *((tiles_emit.make_find_ranges(slotted), THREADS) for slotted in (True, False)),
         (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
-        (camera_reach.make_kernel(), THREADS),
+        (camera_reach.make_kernel(), THREADS), (opacity_decay.make_kernel(), THREADS),
         (step_buffers.make_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),
     ]  # fmt: skip
     if not cuda:
@@ -63,9 +64,11 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             blend_cpu.make_kernels(real, TILE_SIZE),
             [ssim_cpu.make_kernels(real, summed) for summed in (True, False)],
         )
+        without_depth = blend_cpu.make_kernels(real, TILE_SIZE, deep=False)
         updates = [adam.make_kernel(real, split, adam.LANES) for split in (True, False)]
         own = [
-            blending.forward, blending.backward, blending.contributions, blend.make_segments(real).sum_gradients,
+            blending.forward, blending.backward, without_depth.backward, blending.contributions,
+            blend.make_segments(real).sum_gradients,
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
