@@ -130,7 +130,7 @@ def png_rows(data: bytes, rng: np.random.Generator) -> bytes:
         ]
     else:
         rows = bytearray(rows)
-        for _ in range(int(rng.integers(1, 9))):
+        for _ in range(int(rng.integers(1, 9)) if rows else 0):  # a change before may have left none
             rows[int(rng.integers(len(rows)))] = int(rng.integers(256))
         rows = bytes(rows) if rng.random() < 0.8 else damage(bytes(rows), rng)
     packed, end = zlib.compress(rows), min(len(others), max(1, len(others) - 1))
