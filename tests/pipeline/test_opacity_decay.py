@@ -38,9 +38,9 @@ def test_what_is_faint_or_infinite_stays_and_nothing_hides_a_nan():
 
 
 def test_a_step_that_is_not_taken_changes_nothing():
-    """Nor does a decay of 0."""
+    """Nor does a decay of 0, or of less than a rounding."""
     logits = torch.linspace(-3, 3, 7)
-    for fraction, going in ((0.1, torch.tensor([False])), (0.0, GOING)):
+    for fraction, going in ((0.1, torch.tensor([False])), (0.0, GOING), (1e-300, GOING)):
         now = logits.clone()
         decay_opacities(now, fraction, going)
         assert torch.equal(now, logits)

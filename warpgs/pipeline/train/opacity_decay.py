@@ -22,7 +22,8 @@ def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor) 
         fraction: Fraction of an opacity that is taken, in [0, 1); 0 changes nothing.
         going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
     """
-    if fraction == 0:
+    kept = 1 - fraction
+    if kept == 1:  # also a fraction below the rounding of float64
         return
-    new = torch.where(logits > LEAST_LOGIT, opacity_decay(logits, 1 - fraction), logits)
+    new = torch.where(logits > LEAST_LOGIT, opacity_decay(logits, kept), logits)
     logits.copy_(torch.where(going, new, logits))
