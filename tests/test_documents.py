@@ -63,6 +63,31 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
 
 
+SLOW_TO_READ = re.compile(
+    r"\b(?:is|are) of (?:one|a|the|--)|\bis no \w+|\bwho(?:ever|se)\b|\b(?:is|are) (?:said|told)\b|\bnobody\b|\bstrangers?\b"
+    r"|\b[Ww]hat (?:is|was|are|they|it|no|one|only|all|falls|comes|stands|varies|became)\b"
+    r"|\bwhere there (?:is|are) (?:any|none|some)\b"
+    r"|\b(?:photographs?|views?|images?|scenes?|numbers?|it|EXIF) (?:say|says|tell|tells|know|knows|contradict)\b"
+)
+"""Phrases that readers from the field have to read twice; a few may be right where they stand."""
+
+
+def test_pages_are_plain():
+    """Fewer than one such phrase in 1,000 words of any page, code left out."""
+    pages = [
+        *PAGES,
+        *(ROOT / n for n in ("SECURITY.md", "CHANGELOG.md", "bench/README.md")),
+        *(ROOT / "docs/decisions").glob("*.md"),
+    ]
+    broken = []
+    for page in pages:
+        text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+        found = [m[0] for m in SLOW_TO_READ.finditer(text)]
+        if 1000 * len(found) >= max(1000, len(text.split())):
+            broken.append(f"{page.name}: {', '.join(map(repr, found))}")
+    assert not broken, "\n".join(broken)
+
+
 def test_the_way_of_one_photograph_names_functions_that_exist():
     """Each row of its table names a file of the package and a function in it; no function comes twice."""
     text = (ROOT / "docs/architecture.md").read_text("utf-8")
