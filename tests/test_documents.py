@@ -63,6 +63,37 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
 
 
+BY_HAND = {
+    ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
+    ("evaluation.md", "| key | definition"): "definitions",
+    ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
+    ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
+    ("install.md", "| part | size"): "sizes by du",
+    ("method.md", "| fine Gaussians"): "means of two results, in decision 022",
+    ("mutation.md", "| sample | run"): "counts that tools/mutation prints",
+    ("presets.md", "| setting | rule"): "compared with the rule itself, below",
+    ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
+    ("scenes.md", "| fault | key"): "limits in the code",
+    ("scenes.md", "| input | limit"): "limits in the code",
+    ("tiles.md", "| bound | margin"): "derived margins",
+}
+"""Tables with numbers that no file of results holds: page, first words, reason."""
+
+
+def test_tables_of_numbers_are_generated():
+    """Each table of a page with numbers in most rows is made by `python -m bench.document`, or is named here with a reason."""
+    broken = []
+    for page in PAGES:
+        text = re.sub(r"(<!-- [\w ]+): written by.*?<!-- end of", "", page.read_text("utf-8"), flags=re.DOTALL)
+        for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+            rows = table.splitlines()[2:]
+            numbers = [r for r in rows if re.search(r"\d\.\d|\d,\d{3}|\d (?:ms|s|dB|[KMG]i?B|%)", r)]
+            named = any(name == page.name and table.startswith(words) for name, words in BY_HAND)
+            if len(rows) > 1 and 2 * len(numbers) > len(rows) and not named:
+                broken.append(f"{page.name}: {table.splitlines()[0]}")
+    assert not broken, "\n".join(broken)
+
+
 SLOW_TO_READ = re.compile(
     r"\b(?:is|are) of (?:one|a|the|--)|\bis no \w+|\bwho(?:ever|se)\b|\b(?:is|are) (?:said|told)\b|\bnobody\b|\bstrangers?\b"
     r"|\b[Ww]hat (?:is|was|are|they|it|no|one|only|all|falls|comes|stands|varies|became)\b"
