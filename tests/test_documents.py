@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+from collections import defaultdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,8 @@ from warpgs.pipeline.train.by_views import settings_by_views
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Decisions and the changelog are left out: they tell what was, too."""
+GONE_FLAGS = {"fused-adam"}
+"""Flags that a decision tells of as gone."""
 HOMES = [ROOT, ROOT / "tests", ROOT / "warpgs", ROOT / "warpgs/pipeline"]
 
 
@@ -38,8 +41,8 @@ def test_named_flags_are_there():
     folders = ("warpgs", "bench", "tools", "tests", "examples")
     known = {w for folder in folders for p in (ROOT / folder).rglob("*.py") for w in re.findall(r"\w+", p.read_text("utf-8"))}
     missing = []
-    for page in PAGES:
-        flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8")))
+    for page in [*PAGES, *sorted((ROOT / "docs/decisions").glob("*.md"))]:
+        flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8"))) - GONE_FLAGS
         parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
         missing += [
             f"{page.name}: --{f}" for f, names in sorted(parts.items()) if not {n.removeprefix("no_") for n in names} <= known
@@ -159,6 +162,18 @@ def gone_presets(command: str) -> set[str]:
         elif taking:
             names |= {part.split(":")[0].split("/")[-1] for part in word.split(",") if "=" not in part.split(":")[0]}
     return names - set(PRESETS) - {"gsplat", ""}
+
+
+def test_scores_of_the_readme_are_means_of_results():
+    """Each PSNR is the mean over the seeds of a preset with three photographs of fern."""
+    groups: dict[tuple, list[float]] = defaultdict(list)
+    for path in (ROOT / "bench/results").glob("*.json"):
+        for r in json.loads(path.read_text("utf-8"))["rows"]:
+            if r.get("row") == "fern:3" and not r.get("left_out") and "psnr" in r:
+                groups[path.name, r["preset"]].append(r["psnr"])
+    means = {f"{sum(v) / len(v):.1f}" for v in groups.values()}
+    stated = re.findall(r"(\d+\.\d+) dB", (ROOT / "README.md").read_text("utf-8"))
+    assert len(stated) >= 2 and {*stated} <= means
 
 
 def test_pages_and_kept_results_agree():
