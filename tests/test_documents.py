@@ -3,6 +3,7 @@
 import ast
 import json
 import re
+from collections import defaultdict
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,6 +13,8 @@ from warpgs.pipeline.train.by_views import settings_by_views
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 """Decisions and the changelog are left out: they tell what was, too."""
+GONE_FLAGS = {"fused-adam"}
+"""Flags that a decision tells of as gone."""
 HOMES = [ROOT, ROOT / "tests", ROOT / "warpgs", ROOT / "warpgs/pipeline"]
 
 
@@ -38,8 +41,8 @@ def test_named_flags_are_there():
     folders = ("warpgs", "bench", "tools", "tests", "examples")
     known = {w for folder in folders for p in (ROOT / folder).rglob("*.py") for w in re.findall(r"\w+", p.read_text("utf-8"))}
     missing = []
-    for page in PAGES:
-        flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8")))
+    for page in [*PAGES, *sorted((ROOT / "docs/decisions").glob("*.md"))]:
+        flags = set(re.findall(r"(?<![\w-])--([a-z][a-z0-9.-]*[a-z0-9])", page.read_text("utf-8"))) - GONE_FLAGS
         parts = {flag: [part.replace("-", "_") for part in flag.split(".")] for flag in flags}
         missing += [
             f"{page.name}: --{f}" for f, names in sorted(parts.items()) if not {n.removeprefix("no_") for n in names} <= known
@@ -61,6 +64,62 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
             config.optimizer.opacities_decay, 1 + config.method.hier, config.half_resolution,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
+
+
+BY_HAND = {
+    ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
+    ("evaluation.md", "| key | definition"): "definitions",
+    ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
+    ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
+    ("install.md", "| part | size"): "sizes by du",
+    ("method.md", "| fine Gaussians"): "means of two results, in decision 022",
+    ("mutation.md", "| sample | run"): "counts that tools/mutation prints",
+    ("presets.md", "| setting | rule"): "compared with the rule itself, below",
+    ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
+    ("scenes.md", "| fault | key"): "limits in the code",
+    ("scenes.md", "| input | limit"): "limits in the code",
+    ("tiles.md", "| bound | margin"): "derived margins",
+}
+"""Tables with numbers that no file of results holds: page, first words, reason."""
+
+
+def test_tables_of_numbers_are_generated():
+    """Each table of a page with numbers in most rows is made by `python -m bench.document`, or is named here with a reason."""
+    broken = []
+    for page in PAGES:
+        text = re.sub(r"(<!-- [\w ]+): written by.*?<!-- end of", "", page.read_text("utf-8"), flags=re.DOTALL)
+        for table in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+            rows = table.splitlines()[2:]
+            numbers = [r for r in rows if re.search(r"\d\.\d|\d,\d{3}|\d (?:ms|s|dB|[KMG]i?B|%)", r)]
+            named = any(name == page.name and table.startswith(words) for name, words in BY_HAND)
+            if len(rows) > 1 and 2 * len(numbers) > len(rows) and not named:
+                broken.append(f"{page.name}: {table.splitlines()[0]}")
+    assert not broken, "\n".join(broken)
+
+
+SLOW_TO_READ = re.compile(
+    r"\b(?:is|are) of (?:one|a|the|--)|\bis no \w+|\bwho(?:ever|se)\b|\b(?:is|are) (?:said|told)\b|\bnobody\b|\bstrangers?\b"
+    r"|\b[Ww]hat (?:is|was|are|they|it|no|one|only|all|falls|comes|stands|varies|became)\b"
+    r"|\bwhere there (?:is|are) (?:any|none|some)\b"
+    r"|\b(?:photographs?|views?|images?|scenes?|numbers?|it|EXIF) (?:say|says|tell|tells|know|knows|contradict)\b"
+)
+"""Phrases that readers from the field have to read twice; a few may be right where they stand."""
+
+
+def test_pages_are_plain():
+    """Fewer than one such phrase in 1,000 words of any page, code left out."""
+    pages = [
+        *PAGES,
+        *(ROOT / n for n in ("SECURITY.md", "CHANGELOG.md", "bench/README.md")),
+        *(ROOT / "docs/decisions").glob("*.md"),
+    ]
+    broken = []
+    for page in pages:
+        text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+        found = [m[0] for m in SLOW_TO_READ.finditer(text)]
+        if 1000 * len(found) >= max(1000, len(text.split())):
+            broken.append(f"{page.name}: {', '.join(map(repr, found))}")
+    assert not broken, "\n".join(broken)
 
 
 def test_the_way_of_one_photograph_names_functions_that_exist():
@@ -103,6 +162,18 @@ def gone_presets(command: str) -> set[str]:
         elif taking:
             names |= {part.split(":")[0].split("/")[-1] for part in word.split(",") if "=" not in part.split(":")[0]}
     return names - set(PRESETS) - {"gsplat", ""}
+
+
+def test_scores_of_the_readme_are_means_of_results():
+    """Each PSNR is the mean over the seeds of a preset with three photographs of fern."""
+    groups: dict[tuple, list[float]] = defaultdict(list)
+    for path in (ROOT / "bench/results").glob("*.json"):
+        for r in json.loads(path.read_text("utf-8"))["rows"]:
+            if r.get("row") == "fern:3" and not r.get("left_out") and "psnr" in r:
+                groups[path.name, r["preset"]].append(r["psnr"])
+    means = {f"{sum(v) / len(v):.1f}" for v in groups.values()}
+    stated = re.findall(r"(\d+\.\d+) dB", (ROOT / "README.md").read_text("utf-8"))
+    assert len(stated) >= 2 and {*stated} <= means
 
 
 def test_pages_and_kept_results_agree():

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
-from bench.lib import accuracy_page, performance_page, result_file, results_page, trade_page
+from bench.lib import accuracy_page, performance_page, result_file, results_page, trade_page, use_pages
 
 DOCS = result_file.ROOT / "docs"
-PARTS = {
+PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "accuracy.md": accuracy_page.parts,
+    "farm.md": lambda: {"packing": use_pages.packing(), "captures": use_pages.captures()},
+    "formats.md": lambda: {"formats": use_pages.formats()},
+    "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
+    "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
     "performance.md": performance_page.parts,
     "results.md": results_page.parts,
     "trade.md": trade_page.parts,

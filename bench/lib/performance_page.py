@@ -92,6 +92,17 @@ def fits_table(results: dict[str, dict]) -> str:
     return markdown(["capture", "steps", "start [s]", "training [s]", "whole command [s]", "PSNR [dB]"], body, WORDS)
 
 
+def cpu_step_table(result: dict) -> str:
+    """Return processor times of a training step by two versions, the older one first."""
+    medians = {(r["target"], r["threads"], r["gaussians"], r["side"]): r["cpu_median_ms"] for r in result["rows"]}
+    counts = sorted({key[2] for key in medians})
+    body = []
+    for target, threads in dict.fromkeys(key[:2] for key in medians):
+        cells = [", ".join(figure(medians[target, threads, n, side]) for side in ("old", "new")) for n in counts]
+        body.append([{"native": "AVX-512"}.get(target, target), f"{threads}", *cells])
+    return markdown(["target", "threads", *(f"{n:,} Gaussians" for n in counts)], body, ("target",))
+
+
 def _roof(rows: list[dict], op: str, direction: str) -> str:
     """Return the fraction of the roof of one of our tasks, where it was measured at its heaviest."""
     own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, OURS, direction) and "roof_ms" in r and _plain(r)]
@@ -198,6 +209,7 @@ def parts() -> dict[str, str]:
         "steps": rasterizers_page.steps_table(beside),
         "buffers": rasterizers_page.buffers_table(beside),
         "whole fits": fits_table(turns) + _sources("turns", turns),
+        "cpu step": cpu_step_table(result_file.stored("step")["cpu2"]) + "\n" + result_file.source("step_cpu2"),
         "ops": ops_table(ops),
         "other programs": peers_table(ops),
     }

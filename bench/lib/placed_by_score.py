@@ -76,6 +76,11 @@ class Studied(ImportanceSampling):
         """Return settings that read no other view."""
         return StudiedConfig("uniform")
 
+    @classmethod
+    def needs_priors(cls, settings):
+        """Return True: its scores read priors whatever the weights are."""
+        return True
+
     def columns(self):
         """Return the columns of the method, and the number of each Gaussian in the event that is followed."""
         return {**super().columns(), "birth": Column(-1, torch.int32, inherited=False)}

@@ -81,6 +81,7 @@ def test_prune_keeps_its_promise(run, tmp_path, capsys):
     assert main(["prune", str(run), "--keep-psnr", "0.2", "--out", str(tmp_path / "small"), "--device", "cpu"]) == 0
     words = capsys.readouterr().out
     assert "Gaussians, mean SH degree" in words and "times smaller" in words and "held-out PSNR" in words
+    assert "trying smaller models: number 1" in words and "scoring the smaller model" in words
     assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
     record = json.loads((tmp_path / "small" / "config.json").read_text())["pruned"]
     whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "small"))

@@ -112,6 +112,24 @@ def test_tiles_show_what_the_event_saw(run):
     assert wanted.sum() == len(drawn.at) > 5 and np.array_equal(marked, wanted)
 
 
+def test_uniform_events_show_no_scores(tmp_path):
+    """Nor a disparity, as no prior was made; the words say that nothing was scored."""
+    sampler = dataclasses.replace(METHOD.sampler, gate_quantile=0.0)
+    method = dataclasses.replace(METHOD, s_render=False, s_semantic=False, s_geometry=False, sampler=sampler)
+    fit, seen = Trainer(photos(3), seeds(), dataclasses.replace(CONFIG, method=method), CPU), []
+    with images_kept(fit, NAMES, tmp_path):
+        fit.strategy.on_event = lambda step, event: seen.append(event)
+        while not seen:
+            fit.advance()
+    drawn, view = seen[0].views[1], fit.views[1]
+    assert fit.disparities == [] and not any(s.any() for s in drawn.scores)
+    sheet = view_sheet("01.png", 8, view, None, drawn, method)
+    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * HEAD) + 2 * MARGIN + round(1.25 * TITLE_SIZE) + 18
+    assert sheet.shape[0] == one_row  # render, image, gate, pixels, words
+    words = sampling_report_of(fit, tmp_path).words
+    assert "all alike" in words and "No score has a weight, so none was computed." in words
+
+
 def test_figures_add_up(run):
     """Counts are those of the fit's own list; layers make up the set."""
     fit, _, seen = run

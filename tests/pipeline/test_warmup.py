@@ -18,8 +18,10 @@ from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.setup import prepare
 from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
+from warpgs.pipeline.train.strategies.sampler import SamplerConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.warmup import POINTS, STEPS, background_warmup, warm_up
+from warpgs.priors.view_prior import PriorConfig
 from warpgs.scene import ViewDepth
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
@@ -98,10 +100,32 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     views = photos(3)
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
     monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
-    config = dataclasses.replace(PRESETS["default"], **changes)
+    method = dataclasses.replace(PRESETS["default"].method, s_semantic=True)
+    config = dataclasses.replace(PRESETS["default"], method=method, **changes)
     made = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))
     swept = ["ready", "cpu" if "memory_limit" in changes else "cuda"] if "init" not in changes else []
     assert order == ["semantics", *swept, "ready"] and len(made.start.cloud) > 100
+
+
+@pytest.mark.parametrize(
+    ("setting", "needed"),
+    [
+        ({}, False), ({"s_render": True}, False), ({"s_semantic": True}, True), ({"s_geometry": True}, True),
+        ({"sampler": SamplerConfig(gate_quantile=0.6)}, True), ({"events": False, "s_semantic": True}, False),
+    ],
+)  # fmt: skip
+def test_priors_are_made_where_an_event_reads_them(setting, needed, monkeypatch):
+    """Not for uniform sampling; a network that is named all the same gets a note."""
+    asked = []
+    monkeypatch.setattr(setup, "view_priors", lambda *a, **k: (asked.append(1), ([], []))[-1])
+    base = PRESETS["default"]
+    config = dataclasses.replace(
+        base, method=dataclasses.replace(base.method, **setting), init=InitConfig(source="random"),
+        priors=PriorConfig(segmentation_model="labels.onnx"),
+    )  # fmt: skip
+    made = prepare(photos(2), None, config, np.random.default_rng(0), CPU, None, lambda: None)
+    assert bool(asked) == needed
+    assert any("--segmentation-model is not used" in note for note in made.notes) != needed
 
 
 def consistent(views):

@@ -75,12 +75,12 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_files_that_are_refused(tmp_path, name):
+def test_files_that_are_refused(tmp_path, name, capsys):
     data, message = REFUSED[name]
     path = nw.write(tmp_path / "m.onnx", data)
     with pytest.raises(DataError, match=message) as e:
         open_network(path)
-    assert path in str(e.value)
+    assert path in str(e.value) and capsys.readouterr().out == ""
 
 
 OUTSIDE = nw.external_tensor("k", (1,), "weights.bin")
@@ -194,9 +194,21 @@ def test_cuda_where_onnxruntime_has_none(tmp_path, monkeypatch):
     # it may also promise CUDA and then run without: libraries are missing
     monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"])
     start = onnxruntime.InferenceSession
-    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda data, options, providers: start(data, options))
+    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda data, options, **_: start(data, options))
     with pytest.raises(ResourceError, match="finds no cuda libraries or device"):
         open_network(path, provider="cuda")
+
+    # or fail on the device, which a damaged file would do on the CPU, too
+    def broken(data, options, providers, **_):
+        if providers == ["CUDAExecutionProvider"]:
+            raise RuntimeError("CUDA failure 100: no device")
+        return start(data, options, providers=providers)
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", broken)
+    with pytest.raises(ResourceError, match=r"--onnx-provider cuda: onnxruntime cannot use it \(CUDA failure 100"):
+        open_network(path, provider="cuda")
+    with pytest.raises(DataError, match="cannot load it"):
+        open_network(nw.write(tmp_path / "m.onnx", REFUSED["unknown operator"][0]), provider="cuda")
 
 
 @pytest.mark.parametrize(

@@ -63,6 +63,16 @@ def test_time_left_is_that_of_the_steps_to_come(capsys, clock):
     assert "step 410 of 1,000" in second and "per step 2000 ms" in second and "left 19 min 40 s" in second
 
 
+def test_a_line_of_a_stage_is_shown_once(clock):
+    """However often it is said; other lines of its stage come every few seconds."""
+    lines = []
+    stages = Stages(lines.append, live=False)
+    for line in ("compiling", "finding: 1 of 2", "compiling", "finding: 1 of 2", "finding: 2 of 2"):
+        stages(line)
+        clock[0] += 60
+    assert lines == ["compiling", "finding: 1 of 2", "finding: 2 of 2"]
+
+
 def test_nothing_done_prints_nothing(capsys):
     with Progress(10, live=False):
         pass

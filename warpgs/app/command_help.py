@@ -50,6 +50,21 @@ def help_text(kind: type, program: str, description: str) -> str:
     return "\n".join([*lines, *(line for title, rows in more for line in (title, *rows))])
 
 
+def flag_names(kind: type, prefix: str = "") -> Iterator[str]:
+    """Yield the names of all flags of a dataclass, those of nested settings and of ``no-`` included, with their dashes."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        hint, markers = _parts(hints[field.name])
+        if dataclasses.is_dataclass(hint):
+            yield from flag_names(typing.cast(type, hint), prefix + _prefix(field.name, markers))
+        elif "Positional" not in str(markers):
+            name = f"{prefix}{field.name}".replace("_", "-")
+            parent, _, last = name.rpartition(".")
+            yield f"--{name}"
+            if hint is bool:
+                yield f"--{parent}{'.' * bool(parent)}no-{last}"
+
+
 def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Return the type and the markers of an annotation; None is left out of a union."""
     markers: tuple[Any, ...] = ()

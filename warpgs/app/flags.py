@@ -8,10 +8,11 @@ import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
 
-from warpgs.app.command_help import help_text
+from warpgs.app.command_help import flag_names, help_text
 from warpgs.errors import UsageError
 from warpgs.field_docs import field_docs
 from warpgs.runtime.terminal import say
+from warpgs.suggestion import did_you_mean
 
 Settings = TypeVar("Settings")
 
@@ -110,8 +111,8 @@ def _number_rule(info: Any) -> Any:
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
     """Return an instance of a dataclass of flags from the words of a command line; ``--help`` prints one screen.
 
-    Numbers are finite and written in the digits 0 to 9. Where a word is wrong, tyro says which, and the process ends with exit
-    code 2.
+    Numbers are finite and written in the digits 0 to 9. For all other faults than unknown flags tyro prints the reason and ends
+    the process with exit code 2.
 
     Args:
         kind: The dataclass.
@@ -121,6 +122,7 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
 
     Raises:
         SystemExit: A word is wrong, or help was asked for.
+        UsageError: There is no such flag.
     """
     import tyro
 
@@ -135,9 +137,22 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
     try:
         with contextlib.redirect_stderr(complaint):
             return tyro.cli(kind, args=arguments, prog=program, description=description, registry=registry)
-    finally:
+    except SystemExit:
+        if complaint.getvalue():
+            _refuse_unknown_flag(kind, arguments, program)
         for line in re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue()).splitlines():
             say(line, error=True)
+        raise
+
+
+def _refuse_unknown_flag(kind: type, arguments: list[str], program: str) -> None:
+    """Raise UsageError for the first word that looks like a flag and is none of a dataclass of flags."""
+    known = {*flag_names(kind), "--help"}
+    for word in arguments:
+        flag = word.partition("=")[0].replace("_", "-")
+        if flag.startswith("--") and flag not in known:
+            hint = did_you_mean(flag, known) or f"`{program} --help-all` lists the flags"
+            raise UsageError(f"unknown flag {flag}; {hint}")
 
 
 def check_range(flag: str, value: float, low: float, high: float) -> None:

@@ -193,7 +193,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
 
     data = read_model(path)
     try:
-        session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
+        session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"], enable_fallback=0)
     except Exception as e:
         raise DataError(f"{path}: onnxruntime cannot open it ({str(e).splitlines()[0]}); export the network again") from e
     inputs = session.get_inputs()

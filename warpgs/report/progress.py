@@ -99,12 +99,12 @@ class Stages:
 
     What stands before the last colon names a stage; where numbers follow, ``7 of 24``, there is a bar. In a terminal one line
     is written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`.
-    Elsewhere the first line of a stage is shown at once, and then one every few seconds.
+    Elsewhere the first line of a stage is shown at once, and then one every few seconds; the same line is shown once.
     """
 
     def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
         """Show plain lines by ``show``; ``live`` None writes in place where ``show`` is left out and stdout is a terminal."""
-        self.show, self.printed = show, {}
+        self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
 
     def __enter__(self) -> Stages:
@@ -126,8 +126,9 @@ class Stages:
 
     def _print(self, line: str) -> None:
         stage, now = line.rpartition(":")[0] or line, time.perf_counter()
-        if now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
+        if line not in self.shown and now - self.printed.get(stage, -STAGE_INTERVAL) >= STAGE_INTERVAL:
             self.printed[stage] = now
+            self.shown.add(line)
             self.show(line)
 
     def clear(self) -> None:

@@ -68,8 +68,12 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
     options.log_severity_level = ERRORS_ONLY
     options.use_deterministic_compute = True
     try:
-        session = ort.InferenceSession(data, options, providers=[PROVIDERS[provider]])
+        # without onnxruntime's own second try on the CPU, which it prints
+        session = ort.InferenceSession(data, options, providers=[PROVIDERS[provider]], enable_fallback=0)
     except Exception as e:
+        if provider != "cpu":
+            start_session(data, path, "cpu", threads)  # DataError where the file is at fault
+            raise ResourceError(f"--onnx-provider {provider}: onnxruntime cannot use it ({first_line(e)}). {remedy}") from e
         raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({first_line(e)}); export it again, perhaps "
                         "with an older operator set") from e  # fmt: skip
     # onnxruntime goes on without a provider whose libraries are missing

@@ -26,7 +26,8 @@ def run(arguments: list[str], about: str) -> int:
 
     a = parse_flags(Prune, arguments, "warpgs prune", about)
     from warpgs.pipeline.runs.prune import prune
+    from warpgs.report.progress import Stages
 
-    for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader):
+    for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader, Stages()):
         say(line)
     return 0

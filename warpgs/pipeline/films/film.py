@@ -123,7 +123,7 @@ def render_film(
         settings: Settings of the film.
         coverage: As in `render_path`; of a folder only.
         sheet: Whether to write six frames in one image, too: sheet.png in the folder, or beside the film.
-        tell: Takes a line on each frame before it is rendered.
+        tell: Takes a line on each frame before it is rendered, and one before the film is finished.
 
     Raises:
         ResourceError: A file cannot be written, or another process writes into the folder.
@@ -153,6 +153,8 @@ def render_film(
             if i in in_sheet:
                 chosen.append(image)
             yield image
+        if one_size and tell is not None:
+            tell(f"writing {film.name}")
 
     with hold_folder(folder, *([] if alone else [COVERAGE])) as notes:
         if training is not None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,6 @@ from warpgs.pipeline.runs.folder import CONFIG, StoredRun, camera_values, open_r
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.options import RasterizeOptions
-from warpgs.report.progress import waiting
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Gaussians, Normalization, View
@@ -66,7 +67,10 @@ def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, 
     return notes
 
 
-def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None) -> list[str]:
+def prune(
+    folder: Path, keep_psnr: float, out: Path | None, device_name: str, reader: str | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> list[str]:  # fmt: skip
     """Shrink a run's model so that the mean PSNR over its training views falls by no more than ``keep_psnr`` [dB].
 
     The new folder holds config.json, a checkpoint that stores each Gaussian's real degree, and the PLY file; `warpgs eval`,
@@ -78,6 +82,7 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
         out: Folder to write; None for the run's name with ``-pruned``.
         device_name: auto, cpu or cuda.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        tell: Called with a line for the user on what is being done.
 
     Returns:
         Lines for the user.
@@ -92,12 +97,11 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
-    tell = waiting()
     _, train, test = scene_of(stored, reader, tell)
     before, options = stored.gaussians(), stored.options()
     tell("ranking Gaussians")
-    made = _pruned(stored, train, options, keep_psnr)
-    tell("scoring")
+    made = _pruned(stored, train, options, keep_psnr, tell)
+    tell("scoring the smaller model")
 
     degrees = compress.stored_degrees(before.sh)
     sizes = [model_bytes(d) for d in (degrees, made.degrees)]
@@ -123,7 +127,9 @@ def prune(folder: Path, keep_psnr: float, out: Path | None, device_name: str, re
     return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {out}` scores it, `warpgs render {out}` renders it"]
 
 
-def _pruned(stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float) -> compress.Pruned:
+def _pruned(
+    stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float, tell: Callable[[str], object]
+) -> compress.Pruned:
     """Prune the model of a run; DataError where its PSNR on the training views is not finite."""
     before = stored.gaussians()
     device = before.means.device
@@ -134,7 +140,11 @@ def _pruned(stored: StoredRun, train: list[View], options: RasterizeOptions, kee
         )
     kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
     view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
-    made = compress.prune_model(
-        before, kinds, view_set, lambda g, fraction: mean_psnr(g, train, options) >= whole - fraction * keep_psnr
-    )
+    tried = itertools.count(1)
+
+    def accepted(gaussians: Gaussians, fraction: float) -> bool:
+        tell(f"trying smaller models: number {next(tried)}, {len(gaussians):,} Gaussians")
+        return mean_psnr(gaussians, train, options) >= whole - fraction * keep_psnr
+
+    made = compress.prune_model(before, kinds, view_set, accepted)
     return dataclasses.replace(made, gaussians=compress.drop_unused_sh(made.gaussians))

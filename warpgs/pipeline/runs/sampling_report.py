@@ -50,47 +50,46 @@ def _open_pixels(consistent: bool, quantile: float) -> str:
     return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
 
 
-def _asked(method: MethodConfig) -> float:
-    """Return the quantile of S_geometry that the gate of a fit starts from."""
-    return method.sampler.gate_quantile if method.ra else 0.0
-
-
 def view_sheet(
-    name: str, step: int, view: TrainingView, disparity: np.ndarray, sampled: SampledView, config: MethodConfig
+    name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, config: MethodConfig
 ) -> np.ndarray:
-    """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, scores, gate, sampled pixels.
+    """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, gate, sampled pixels, scores.
+
+    Scores are shown where one of them has a weight, the disparity where the view has a prior.
 
     Args:
         name: Name of the view.
         step: Steps done.
         view: The view.
-        disparity: Its relative inverse depth, shape [H, W].
+        disparity: Its relative inverse depth, shape [H, W]; None without a prior.
         sampled: Maps of the event and the pixels it took.
         config: Switches and settings of the fit.
     """
     image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
-    render, semantic, geometry = (t.cpu().numpy() for t in sampled.scores)
     at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
     weights = config.weights(view.semantic is not None)
     # each score stands below what it comes from
     tiles = [
         Tile("render before", rendered),
         Tile("image", image),
-        Tile("disparity, near is 1", disparity, "TURBO"),
+        *([] if disparity is None else [Tile("disparity, near is 1", disparity, "TURBO")]),
         Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
         Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
-        Tile(f"{weights[0]:.2f} S_render", render),
-        Tile(f"{weights[1]:.2f} S_semantic", semantic),
-        Tile(f"{weights[2]:.2f} S_geometry", geometry),
-        Tile("S_importance", score),
     ]
+    scored = sum(weights) > 0
+    if scored:
+        names = ("S_render", "S_semantic", "S_geometry")
+        tiles += [Tile(f"{w:.2f} {n}", s.cpu().numpy()) for w, n, s in zip(weights, names, sampled.scores, strict=True)]
+        tiles.append(Tile("S_importance", score))
     consistent = config.ra and config.sampler.depth == "consistent" and view.consistent is not None
-    widened = f"; too few passed at the {_asked(config):g} quantile" if sampled.quantile < _asked(config) else ""
+    widened = f"; too few passed at the {config.asked_quantile:g} quantile" if sampled.quantile < config.asked_quantile else ""
     lines = [
         f"{len(at):,} pixels sampled of the {gate.sum():,} that the gate leaves open, {gate.mean():.0%} of the view.",
         f"Gate: {_open_pixels(consistent, sampled.quantile)}{widened}.",
-        f"Their mean importance is {score[at[:, 0], at[:, 1]].mean() if len(at) else 0:.2f}, the view's {score.mean():.2f}.",
     ]
+    if scored:
+        mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
+        lines.append(f"Their mean importance is {mean:.2f}, the view's {score.mean():.2f}.")
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
@@ -121,6 +120,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
         out: Run folder.
     """
     config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
+    disparities = fit.disparities or [None] * len(names)
     lost: list[int] = []
     writing: list[Future[None]] = []
 
@@ -133,7 +133,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
         return
 
     def write(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
-        sheets = [view_sheet(names[d.view], step, v, fit.disparities[d.view], d, config) for v, d in zip(views, kept)]
+        sheets = [view_sheet(names[d.view], step, v, disparities[d.view], d, config) for v, d in zip(views, kept)]
         try:
             make_folder(out / FOLDER)
             write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
@@ -169,7 +169,7 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
         ``events``: their number, the Gaussians added and evicted, the samplings (views over all events) and those for which the
         gate was widened; ``layers``: Gaussians in the coarse and the fine one.
     """
-    asked = _asked(fit.config.method)
+    asked = fit.config.method.asked_quantile
     layered = isinstance(fit.strategy, ImportanceSampling)
     events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
     quantiles = [q for e in events for q in e["quantiles"]]
@@ -193,16 +193,17 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     if method.agp and not weighted:
         how = "sampled at random, all alike,"
     consistent = method.sampler.depth == "consistent"
+    gate = _open_pixels(consistent and method.ra, method.asked_quantile)
     words = (
         f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
-        f"had capacity. These pixels are {how} among {_open_pixels(consistent and method.ra, _asked(method))} (the gate). "
-        + ("S_importance is the weighted sum of the three scores" if weighted else "No score has a weight (docs/method.md)")
-        + "; each score stands below its source."
-    )
+        f"had capacity. These pixels are {how} among {gate} (the gate). "
+        + ("S_importance is the weighted sum of the three scores; each score stands below its source."
+           if weighted else "No score has a weight, so none was computed.")
+    )  # fmt: skip
     if events["widened"]:
         words += (
             f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened: fewer than {SUPPORT} times "
-            f"as many pixels as are sampled passed at the {_asked(method):g} quantile."
+            f"as many pixels as are sampled passed at the {method.asked_quantile:g} quantile."
         )
     table = [
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],

@@ -96,6 +96,8 @@ def prepare(
         priors, notes = view_priors(
             train, config.priors, depths=lambda: start().depths, regions=regions, cache=cache, tell=progress
         )
+    elif priors is None:
+        notes = _unused_networks(config)
     if config.priors.depth_guides and priors is not None:
         train = [
             v if v.depth is not None else dataclasses.replace(v, depth=GivenDepth(p.disparity, "disparity"))
@@ -106,6 +108,13 @@ def prepare(
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
     return Preparation(train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
+
+
+def _unused_networks(config: FitConfig) -> list[str]:
+    """Return notes on the networks that are named although nothing in the fit reads priors."""
+    switches = {"depth": "--depth-guides or --method.s-geometry", "segmentation": "--method.s-semantic"}
+    named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
+    return [f"--{kind}-model is not used, since no part of this fit reads its map; {switches[kind]} does" for kind in named]
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
@@ -119,13 +128,14 @@ def _check_models(train: list[View], config: FitConfig) -> None:
 
 
 def samples(config: FitConfig) -> bool:
-    """Return whether the strategy samples by importance, for which views need priors and scores."""
+    """Return whether the strategy places Gaussians behind pixels, for which depths of views are compared."""
     return find_strategy(config.strategy).samples(config.groups())
 
 
 def needs_priors(config: FitConfig) -> bool:
-    """Return whether sampling, a loss term or a network's depth in place of a given one needs the priors of the views."""
-    return samples(config) or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
+    """Return whether the strategy, a loss term or a network's depth in place of a given one needs the priors of the views."""
+    by_strategy = find_strategy(config.strategy).needs_priors(config.groups())
+    return by_strategy or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 
 
 def terms_of(config: FitConfig, cutout: bool = False, depth: bool = False, normals: bool = False) -> tuple[LossTerm, ...]:
@@ -145,8 +155,8 @@ def prepared_views(
 ) -> tuple[list[TrainingView], list[np.ndarray]]:
     """Return the training views on the device, with their scores and the maps of loss terms.
 
-    Also returns each view's disparity, relative inverse depth in [0, 1], shape [H, W], where views are scored: only images of
-    events show it.
+    Also returns each view's disparity, relative inverse depth in [0, 1], shape [H, W], where sampled views have priors: only
+    images of events show it.
 
     Raises:
         UsageError: Two loss terms ask for a map of one name.
@@ -154,7 +164,7 @@ def prepared_views(
     views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
     priors, depths = made.priors or [None] * len(train), made.start.depths or [None] * len(train)
     if samples(config):
-        disparities = [p.disparity for p in priors]
+        disparities = [p.disparity for p in made.priors or ()]
         views = [scored(v, p, d, config.method) for v, p, d in zip(views, priors, depths, strict=True)]
     found = []
     for view, given, depth, prior in zip(views, train, depths, priors, strict=True):

@@ -46,7 +46,12 @@ class Strategy:
 
     @classmethod
     def samples(cls, settings: Settings) -> bool:
-        """Return whether it samples by importance, for which views need priors and scores; settings are those of the fit."""
+        """Return whether it places Gaussians behind pixels, for which depths of views are compared; settings are the fit's."""
+        return False
+
+    @classmethod
+    def needs_priors(cls, settings: Settings) -> bool:
+        """Return whether it reads scores that priors of the views give; settings are those of the fit."""
         return False
 
     @classmethod

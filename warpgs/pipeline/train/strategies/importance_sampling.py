@@ -72,6 +72,12 @@ class ImportanceSampling(Strategy):
         """Return whether ``method.events`` is on."""
         return settings[MethodConfig].events
 
+    @classmethod
+    def needs_priors(cls, settings: Settings) -> bool:
+        """Return whether an event reads the semantic or the geometric score."""
+        method = settings[MethodConfig]
+        return method.events and method.needs_priors
+
     @property
     def fine(self) -> torch.Tensor:
         """Gaussians of the fine layer, bool, shape [N]."""

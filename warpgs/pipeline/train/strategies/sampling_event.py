@@ -104,19 +104,31 @@ class MethodConfig:
         semantic = self.s_semantic and semantics
         return scoring.weights(self.importance, render=self.s_render, semantic=semantic, geometry=self.s_geometry)
 
+    @property
+    def asked_quantile(self) -> float:
+        """Quantile of the geometric score that the gate starts from; 0 for no such gate."""
+        return self.sampler.gate_quantile if self.ra else 0.0
 
-def scored(view: TrainingView, prior: Prior, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
-    """Return the view with the scores of its prior and its geometrically consistent depth."""
+    @property
+    def needs_priors(self) -> bool:
+        """True where an event reads the semantic or the geometric score, which are made from priors."""
+        _, semantic, geometry = self.weights()
+        return semantic > 0 or geometry > 0 or self.asked_quantile > 0
+
+
+def scored(view: TrainingView, prior: Prior | None, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
+    """Return the view with its geometrically consistent depth and, where it has a prior, the scores of that."""
+    if depth is not None and depth.valid.any():
+        consistent = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=view.image.device)
+        view = dataclasses.replace(view, consistent=consistent)
+    if prior is None:
+        return view
     maps = {n: torch.as_tensor(getattr(prior, n), dtype=torch.float32, device=view.image.device)
             for n in ("disparity", "confidence", "boundary", "foreground")}  # fmt: skip
     valid = None if view.countable is None else view.countable > 0
     geometry = scoring.geometry_score(maps.pop("disparity"), config.importance.curvature, valid)
     semantic = scoring.semantic_score(**maps)
-    consistent = None
-    if depth is not None and depth.valid.any():
-        consistent = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=view.image.device)
-    known = semantic if bool(semantic.any()) else None
-    return dataclasses.replace(view, semantic=known, geometry=geometry, consistent=consistent)
+    return dataclasses.replace(view, semantic=semantic if bool(semantic.any()) else None, geometry=geometry)
 
 
 @dataclass(frozen=True)
@@ -128,7 +140,7 @@ class SampledView:
     rendered: torch.Tensor
     """Colours before the event, shape [H, W, 3]."""
     scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-    """Render, semantic and geometric score, each [H, W] in [0, 1]."""
+    """Render, semantic and geometric score, each [H, W] in [0, 1]; 0 everywhere where nothing was computed."""
     score: torch.Tensor
     """Their weighted sum, shape [H, W]."""
     gate: torch.Tensor
@@ -192,15 +204,18 @@ def sample_view(
     """
     c, (rgb, _, depth, valid) = config.sampler, rendered
     known = view.semantic is not None
-    semantic = view.semantic if known else torch.zeros_like(view.geometry)
+    geometry, semantic = (torch.zeros_like(depth) if s is None else s for s in (view.geometry, view.semantic))
+    weights = config.weights(known)
     if residuals:
         residual = scoring.normalized(gain_map(view, depth, valid, residuals), valid)
-    else:
+    elif sum(weights) > 0:
         residual = scoring.render_score(rgb, view.image, valid)
-    scores = (residual, semantic, view.geometry)
-    score = scoring.importance(scores, config.weights(known))
+    else:
+        residual = torch.zeros_like(depth)
+    scores = (residual, semantic, geometry)
+    score = scoring.importance(scores, weights)
     wanted = max(1, round(c.fraction * valid.numel()))
-    gate, quantile = geometry_gate(view.geometry, valid, c.gate_quantile if config.ra else 0.0, wanted)
+    gate, quantile = geometry_gate(geometry, valid, config.asked_quantile, wanted)
     at = sample_pixels(score, gate, wanted, generator, random=config.agp)
     rows = fine_gaussians(view.camera, view.image, depth, at, c, coefficients)
     return SampledView(number, rgb, scores, score, gate, quantile, at), rows

@@ -1,0 +1,93 @@
+"""The generated parts of the pages on use: farms, several GPUs, meshes, formats."""
+
+from __future__ import annotations
+
+import statistics
+
+from bench.lib import result_file
+from bench.lib.results_page import table
+from bench.lib.tables import markdown
+
+SCENES = {"fern:3": 3, "fern:9": 9, "horns:54": 54}
+"""Rows of the presets' result that the page on farms shows, and their training views."""
+MODELS = {
+    "horns": "horns, 54 views of 504 x 378 px, {:,} Gaussians",
+    "garden": "garden, 1920 x 1080 px, {:,} Gaussians",
+}
+FORMATS = {
+    ".ply": ("Kerbl et al. 2023, float32", "0 to 4", "every tool"),
+    ".compressed.ply": ("PlayCanvas, 8 to 11 bits", "0 to 3", "SuperSplat, PlayCanvas"),
+    ".spz": ("Niantic, fixed point and 8 bits, gzip", "0 to 3", "Scaniverse, Babylon.js, SuperSplat"),
+    ".sog": ("PlayCanvas, 8-bit images in a zip archive", "0 to 3", "SuperSplat, PlayCanvas"),
+    ".glb": ("glTF 2.0, `KHR_gaussian_splatting`, float32", "0 to 3", "Cesium, engines"),
+    ".gltf": ("the same as text", "0 to 3", "Cesium, engines"),
+    ".splat": ("antimatter15, 8 bits", "0", "small viewers"),
+}
+"""Encoding, SH degrees and programs of each file format."""
+
+
+def _result(name: str) -> tuple[dict, str]:
+    return result_file.read(result_file.FOLDER / f"{name}.json"), "\n" + result_file.source(name)
+
+
+def packing() -> str:
+    """Return the table of fits that share a GPU."""
+    result, source = _result("farm_h200")
+    body = []
+    for r in result["rows"]:
+        gpus = "" if r["gpus"] == 1 else f" on each of {r['gpus']} H200"
+        body.append([f"{r['per_gpu']}{gpus}", f"{r['fits_per_hour']:,.0f}", f"{r['mean_seconds_of_a_fit']:.1f} s"])
+    return table(["`--per-gpu`", "fits per hour", "time per fit"], body) + source
+
+
+def captures() -> str:
+    """Return the table of time and size by the number of views, many fits at a time."""
+    result, source = _result("presets_h200")
+    body = []
+    for name, views in SCENES.items():
+        rows = [r for r in result["rows"] if r["row"] == name and r["preset"] == "default" and "error" not in r]
+        seconds = statistics.mean(r["setup"] + r["training"] for r in rows)
+        size = statistics.mean(r["bytes"] for r in rows)
+        hourly = rows[0]["jobs"] * views * 3600 / seconds
+        body.append([f"{views}", f"{seconds:.0f} s", f"{hourly:,.0f}", f"{1e6 / hourly:.0f}", f"{size / 1e6:.1f} MB"])
+    head = ["views per scene", "time per fit", "images per hour", "GPU hours per million images", "PLY file"]
+    return table(head, body) + source
+
+
+def ranks() -> str:
+    """Return the table of steps on one and two GPUs."""
+    result, source = _result("ranks_h200")
+    body = []
+    for case, words in MODELS.items():
+        one, two = sorted((r for r in result["rows"] if r["case"] == case), key=lambda r: r["ranks"])
+        times = [f"{r['step_ms']:.1f} ms" for r in (one, two)]
+        body.append([words.format(one["gaussians"]), *times, f"{two['efficiency']:.2f}"])
+    return table(["model", "1 GPU", "2 GPUs", "scaling efficiency"], body) + source
+
+
+def surfaces() -> str:
+    """Return the table of meshes by the depth that is fused, at the default voxel size."""
+    result, source = _result("mesh_cpu2")
+    rows = {r["depth"]: r for r in result["rows"] if r["row"] == "mesh"}  # the default comes last
+    body = []
+    for r in (rows["median"], rows["mean"]):
+        cells = [r["depth"], f"{r['triangles']:,}"]
+        for key in ("accuracy", "completeness"):
+            cells.append(f"{100 * r[f'{key}_mean_of_radius']:.2f} ({100 * r[f'{key}_median_of_radius']:.2f})")
+        body.append([*cells, f"{100 * r['completeness_within_0.01_of_radius']:.0f} %"])
+    head = ["depth", "triangles", "accuracy, mean (median)", "completeness, mean (median)", "observed points within 1 %"]
+    return table(head, body) + source
+
+
+def formats() -> str:
+    """Return the table of file formats: encoding, bytes of a Gaussian, loss; without filters, SPZ in its default version."""
+    result, source = _result("formats_fern_cpu2")
+    rows = {r["format"]: r for r in result["rows"] if not r["clean"]}
+    body = []
+    for name, (encoding, degrees, programs) in FORMATS.items():
+        r = rows[name]
+        cells = [f"{r['bytes'] / r['gaussians']:.0f}", f"{r['loss_db']:.3f}"]
+        body.append([f"`{name}`", encoding, degrees, *cells, programs])
+    body.append(["`.html`", "compressed, with a viewer of 0.8 MB", "0", "about 35", "", "any browser"])
+    head = ["file", "encoding", "SH degrees", "bytes per Gaussian", "loss [dB]", "opens in"]
+    return markdown(head, body, ("file", "encoding", "SH degrees", "opens in")) + source
