@@ -50,6 +50,28 @@ def test_values_equal_reference(device, dtype):
     close("projection", projected[..., 9], depths)
 
 
+def test_a_gaussian_does_not_see_its_neighbours(device, dtype):
+    """A task of the CPU takes 16 Gaussians: culled and broken ones among them, or fewer, change no bit of the others."""
+    count = 37
+    gaussians, cam = cloud(count, dtype=dtype, device=device), camera(cameras=1, dtype=dtype, device=device)
+    tensors = [t.detach().clone() for t in gaussians.tensors().values()]
+    tensors[0][3], tensors[0][5, 2], tensors[1][8], tensors[2][18] = math.nan, -1.0, 0.0, math.inf
+    tensors[3][20], tensors[4][33, 0, 0] = math.nan, 1e7
+    broken = [3, 5, 8, 18, 20, 33]
+
+    def results(rows):
+        own = [t[rows].requires_grad_() for t in tensors]
+        projected, counts = project(*own, cam.viewmat, cam.K, width=cam.width, height=cam.height, degree=1, rule=EXACT)
+        return [projected[0], counts[0], *torch.autograd.grad(projected.square().sum(), own)]
+
+    together = results(list(range(count)))
+    assert not together[1][broken].any()
+    kept = [n for n in range(count) if n not in broken]
+    for rows in (kept, kept[11:12], list(range(16, 33))):
+        for whole, part in zip(together, results(rows), strict=True):
+            assert torch.equal(whole[rows], part)
+
+
 def test_gradients_equal_reference(device, dtype):
     """Gradients of a random weighting of the results, for Gaussians, poses and intrinsics."""
     gaussians, cam = leaves(hand_placed(dtype, device)), camera(cameras=2, dtype=dtype, device=device)

@@ -86,7 +86,7 @@ CUDA_OPS = {
     "cuda_graph": ["render/test_graphed_cuda.py", "pipeline/test_step.py"],
     "interop": [BODIES, "kernels/test_project.py", "pipeline/test_step.py"],
     "median_depth": [GUARDS], "native": [BODIES, GUARDS], "project": [GUARDS],
-    "project_backward": [GUARDS], "ssim": [GUARDS],
+    "project_backward": [GUARDS], "project_cuda": [BODIES, GUARDS], "ssim": [GUARDS],
     "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
 }  # fmt: skip
 """More tests for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""

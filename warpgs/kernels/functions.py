@@ -74,14 +74,20 @@ def make_types(real):
     )  # fmt: skip
 
 
+SHRINKS = 6
+"""Divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
+
+
 @functools.cache
-def make_projection(real, camera_model: str, parameters: str = "stored"):
+def make_projection(real, camera_model: str, parameters: str = "stored", lanes: bool = False):
     """Make the steps of the projection that forward and backward share (derivation: docs/project.md).
 
     Args:
         real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
         parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        lanes: True for loops that the compiler vectorises: without branches and calls, so a Gaussian is computed to the end
+            even where it is culled, with scales and opacities that were activated before.
     """
     r = make_rotations(real)
     factor = make_covariance(real).factor
@@ -115,6 +121,8 @@ def make_projection(real, camera_model: str, parameters: str = "stored"):
 
     @wp.func
     def finite3(v: vec3) -> wp.bool:
+        if wp.static(lanes):  # the other is a call
+            return (v[0] - v[0]) + (v[1] - v[1]) + (v[2] - v[2]) == real(0.0)
         return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
 
     @wp.func
@@ -126,7 +134,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored"):
 
     @wp.func
     def scales_of(stored: vec3) -> vec3:
-        if wp.static(parameters == "activated"):
+        if wp.static(parameters == "activated" or lanes):
             return stored
         return vec3(wp.exp(stored[0]), wp.exp(stored[1]), wp.exp(stored[2]))
 
@@ -148,37 +156,57 @@ def make_projection(real, camera_model: str, parameters: str = "stored"):
         )
         e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
         # Guards are phrased so that a NaN fails them.
-        if not camera.in_range(e.position, lens, near):
-            return e
+        before = camera.in_range(e.position, lens, near)
+        if wp.static(not lanes):
+            if not before:
+                return e
         pixel = camera.pixel_of(e.position, K, lens)
-        if not (wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)):
-            return e
+        near_image = wp.abs(pixel[0]) <= real(FARTHEST_PIXEL) and wp.abs(pixel[1]) <= real(FARTHEST_PIXEL)
+        if wp.static(not lanes):
+            if not near_image:
+                return e
         e.pixel = pixel
         e.expansion_point = camera.expansion_point(pixel, width, height)
+        turned = wp.bool(True)
+        sized = wp.bool(True)
         if wp.static(parameters == "covariances"):
             e.axes = rotation * factor(q, log_scale)  # NaN where there is none, which is culled below
         else:
             e.quat_length = r.quat_length(q)
-            if not (e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)):
-                return e
+            turned = e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)
+            if wp.static(not lanes):
+                if not turned:
+                    return e
             e.quat = q / e.quat_length
             e.scales = scales_of(log_scale)
-            if not finite3(e.scales):  # the logarithm of 0 is -inf, and no error
-                return e
+            sized = finite3(e.scales)  # the logarithm of 0 is -inf, and no error
+            if wp.static(not lanes):
+                if not sized:
+                    return e
             e.axes = rotation * r.rotation(e.quat) * wp.diag(e.scales)
         rows = camera.project_axes(e.position, K, lens, e.expansion_point, e.axes)
         m1 = rows.first
         m2 = rows.second
-        if not (finite3(m1) and finite3(m2)):
-            return e
+        finite = finite3(m1) and finite3(m2)
+        if wp.static(not lanes):
+            if not finite:
+                return e
         # det grows with the fourth power of the axes: shrink them below 2^16 px by exact powers of two.
         largest = wp.max(wp.max(wp.abs(m1)), wp.max(wp.abs(m2)))
-        if not (largest <= real(LARGEST_AXIS)):
-            return e
+        short = largest <= real(LARGEST_AXIS)
+        if wp.static(not lanes):
+            if not short:
+                return e
         shrink = real(1.0)
-        while largest > real(65536.0):
-            largest *= real(1.0 / 65536.0)
-            shrink *= real(1.0 / 65536.0)
+        if wp.static(lanes):
+            for _ in range(wp.static(SHRINKS)):
+                times = wp.where(largest > real(65536.0), real(1.0 / 65536.0), real(1.0))
+                largest *= times
+                shrink *= times
+        else:
+            while largest > real(65536.0):
+                largest *= real(1.0 / 65536.0)
+                shrink *= real(1.0 / 65536.0)
         e.shrink = shrink
         e.m1 = m1 * shrink
         e.m2 = m2 * shrink
@@ -191,9 +219,20 @@ def make_projection(real, camera_model: str, parameters: str = "stored"):
         e.a = aa + blur
         e.b = wp.dot(e.m1, e.m2)
         e.c = cc + blur
-        if e.det >= real(SMALLEST_DETERMINANT) and e.c >= real(SMALLEST_DETERMINANT):
+        if wp.static(lanes):
+            valid = before and near_image and turned and sized and finite and short
+            valid = valid and e.det >= real(SMALLEST_DETERMINANT) and e.c >= real(SMALLEST_DETERMINANT)
+            e.valid = wp.where(valid, 1, 0)
+        elif e.det >= real(SMALLEST_DETERMINANT) and e.c >= real(SMALLEST_DETERMINANT):
             e.valid = 1
         return e
+
+    @wp.func
+    def factor_of(e: Ellipse) -> vec3:
+        """Return u11, u12 and u22 [1/px] (docs/project.md, section 4)."""
+        inv_c = real(1.0) / wp.sqrt(e.c)
+        inv_det = real(1.0) / wp.sqrt(e.det)
+        return vec3(e.c * inv_c * inv_det, -e.b * inv_c * inv_det, inv_c) * e.shrink
 
     @wp.func
     def compensation(e: Ellipse) -> real:
@@ -214,15 +253,26 @@ def make_projection(real, camera_model: str, parameters: str = "stored"):
             view[0, 2] * view[0, 3] + view[1, 2] * view[1, 3] + view[2, 2] * view[2, 3],
         )
         largest = wp.max(wp.abs(centered))
-        if not (largest > real(0.0) and wp.isfinite(largest)):
-            return vec4()
+        if wp.static(lanes):
+            apart = wp.where(largest > real(0.0), largest - largest == real(0.0), False)
+        else:
+            apart = largest > real(0.0) and wp.isfinite(largest)
+            if not apart:
+                return vec4()
         d = centered / largest
         length = wp.sqrt(wp.dot(d, d))
         d = d / length
+        if wp.static(lanes):
+            none = real(0.0)
+            return vec4(
+                wp.where(apart, d[0], none), wp.where(apart, d[1], none), wp.where(apart, d[2], none),
+                wp.where(apart, length * largest, none),
+            )  # fmt: skip
         return vec4(d[0], d[1], d[2], length * largest)
 
     return SimpleNamespace(
-        Ellipse=Ellipse, ellipse=ellipse, compensation=compensation, sigmoid=sigmoid, opacity_of=opacity_of,
+        Ellipse=Ellipse, ellipse=ellipse, factor_of=factor_of, compensation=compensation,
+        sigmoid=sigmoid, opacity_of=opacity_of, scales_of=scales_of,
         direction=direction, finite3=finite3, project_axes=camera.project_axes,
         rotation=r.rotation, rotation_backward=r.rotation_backward,
         depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
@@ -231,31 +281,36 @@ def make_projection(real, camera_model: str, parameters: str = "stored"):
 
 
 @functools.cache
-def make_spans(real):
+def make_spans(real, lanes: bool = False):
     """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md).
 
     Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its
     own arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
     """
+    vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     vec2i = wp.types.vector(2, wp.int32)
 
     @wp.func
-    def pixel_range(lo: real, hi: real, begin: wp.int32, size: wp.int32) -> vec2i:
-        """Return the first and last pixel, from ``begin`` on, whose centres lie in [lo, hi]; clipped before the cast to int."""
+    def tile_range(lo: real, hi: real, begin: wp.int32, size: wp.int32, tile_size: wp.int32) -> vec2i:
+        """Return the first tile of the image, and one past the last, with pixel centres of [lo, hi] in the window."""
         limit = real(begin + size)
+        # clipped before the cast to int
         first = wp.ceil(wp.clamp(lo - real(0.5), real(begin), limit))
         last = wp.floor(wp.clamp(hi - real(0.5), real(begin) - real(1.0), limit - real(1.0)))
-        return vec2i(int(first), int(last))
+        if wp.static(lanes):  # divisions of integers do not vectorise; those of floats below 2^24 round to no other integer
+            side = real(tile_size)
+            end = wp.where(last < first, 0, int(last / side) + 1)
+            return vec2i(wp.where(last < first, 0, int(first / side)), end)
+        if last < first:
+            return vec2i(0, 0)
+        return vec2i(int(first) // tile_size, int(last) // tile_size + 1)
 
     @wp.func
     def tile_rows(my: real, half_height: real, origin_y: wp.int32, height: wp.int32, tile_size: wp.int32) -> vec2i:
         """Return the first tile row of the image, and one past the last, that my +- half_height touches in the window."""
         margin = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
-        rows = pixel_range(my - half_height - margin, my + half_height + margin, origin_y, height)
-        if rows[1] < rows[0]:
-            return vec2i(0, 0)
-        return vec2i(rows[0] // tile_size, rows[1] // tile_size + 1)
+        return tile_range(my - half_height - margin, my + half_height + margin, origin_y, height, tile_size)
 
     @wp.func
     def tile_columns(
@@ -284,10 +339,7 @@ def make_spans(real):
             dy = wp.clamp(-turn, top, bottom)
             e = factor[2] * dy
             left = (-wp.sqrt(wp.max(reach * reach - e * e, real(0.0))) - factor[1] * dy) / factor[0]
-        columns = pixel_range(mx + left - margin, mx + right + margin, origin_x, width)
-        if columns[1] < columns[0]:
-            return vec2i(0, 0)
-        return vec2i(columns[0] // tile_size, columns[1] // tile_size + 1)
+        return tile_range(mx + left - margin, mx + right + margin, origin_x, width, tile_size)
 
     @wp.func
     def reach_of(opacity: real, alpha_cut: real, square_sigma: real) -> real:
@@ -297,6 +349,22 @@ def make_spans(real):
             return wp.sqrt(real(2.0) * wp.log(opacity / alpha_cut) + real(1.0e-5)) * real(1.00001)
         return real(0.0)
 
+    @wp.func
+    def half_sides(a: real, b: real, c: real, shrink: real, reach: real, alpha_cut: real, square_sigma: real) -> vec2:
+        """Return half width and half height [px] of the box; ``a``, ``b`` and ``c`` are the covariance times shrink^2."""
+        half_width = real(1.0e30)  # without a cut every tile is touched
+        half_height = real(1.0e30)
+        if square_sigma > real(0.0):
+            middle = real(0.5) * (a + c)
+            longest = middle + wp.sqrt(real(0.25) * (a - c) * (a - c) + b * b)
+            half_width = wp.ceil(square_sigma * wp.sqrt(longest) / shrink)
+            half_height = half_width
+        elif alpha_cut > real(0.0):
+            half_width = reach * wp.sqrt(a) / shrink
+            half_height = reach * wp.sqrt(c) / shrink
+        return vec2(half_width, half_height)
+
     return SimpleNamespace(
-        pixel_range=pixel_range, tile_rows=tile_rows, tile_columns=tile_columns, reach_of=reach_of, vec2i=vec2i
-    )
+        tile_range=tile_range, tile_rows=tile_rows, tile_columns=tile_columns, reach_of=reach_of, half_sides=half_sides,
+        vec2i=vec2i,
+    )  # fmt: skip

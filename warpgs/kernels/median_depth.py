@@ -15,7 +15,7 @@ from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.blend_settings import BlendSettings, make_struct
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import STRIP, make_functions
-from warpgs.kernels.project import PROJECTED_SIZE
+from warpgs.kernels.project_inputs import PROJECTED_SIZE
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
 from warpgs.runtime.cuda_source import source

@@ -1,30 +1,23 @@
 """Projection of 3D Gaussians to ellipses in the image: activations, EWA covariance and its factor, colour, tile counts."""
 
-import functools
 import math
 from collections.abc import Sequence
 
 import torch
 import warp as wp
 
-from warpgs.constants import LARGEST_COEFFICIENT, Rule
+from warpgs.constants import Rule
 from warpgs.errors import UsageError
-from warpgs.kernels import sh
+from warpgs.kernels import project_cpu, project_cpu_backward, project_cuda, sh
 from warpgs.kernels.cameras.base import CAMERA_MODELS
-from warpgs.kernels.functions import make_projection, make_spans, make_types
-from warpgs.kernels.native import BLOCK, make_color
-from warpgs.kernels.native import make_functions as make_native
-from warpgs.kernels.project_backward import make_backward
-from warpgs.kernels.project_inputs import ProjectInputs, ProjectSettings, checked_factors
+from warpgs.kernels.functions import make_types
+from warpgs.kernels.native import BLOCK
+from warpgs.kernels.project_cpu import LANES
+from warpgs.kernels.project_inputs import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.derivatives import first_order
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
-
-PROJECTED_SIZE = 12
-"""Numbers of a projected Gaussian, 16-byte aligned in float32:
-0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
-10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
@@ -39,149 +32,6 @@ def step_bytes(sizes: StepSizes) -> Needs:
     }  # fmt: skip
 
 
-@functools.cache
-def make_forward(
-    real, native: bool, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
-):  # fmt: skip
-    """Make the forward kernel.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        native: True for CUDA and float32.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        antialiased: True to multiply opacities by `compensation`.
-        bases: Number of basis values that a colour may have (`sh.bases_for`).
-    """
-    m = make_projection(real, camera_model, parameters)
-    s = make_spans(real)
-    basis = sh.make_functions(real, bases).basis
-    vec3 = m.vec3
-    color_of = make_color(bases).color if native else None
-    vec12 = wp.types.vector(PROJECTED_SIZE, real)
-
-    @wp.func
-    def store_values(projected: wp.array2d(dtype=real), i: int, values: vec12):
-        for k in range(wp.static(PROJECTED_SIZE)):
-            projected[i, k] = values[k]
-
-    store = make_native().store_row if native else store_values
-    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.forward.{real.__name__}.{int(native)}.{camera_model}{variant}"
-
-    @wp.func
-    def project_one(
-        i: int, n: int, view: m.mat44, K: m.mat33, lens: wp.array(dtype=real),
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
-        coefficients: wp.array2d(dtype=m.vec3),
-        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
-        tile_size: int, sh_count: int,
-        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
-    ):  # fmt: skip
-        """Project Gaussian n; return the number of tiles it touches. Where that is 0 it is culled, and nothing is written."""
-        e = m.ellipse(
-            means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
-        )  # fmt: skip
-        if e.valid == 0 or not (m.depth_of(e.position) <= far):
-            return 0
-        opacity = m.opacity_of(logit_opacities[n])
-        if opacity_factors.shape[0] > 0:
-            opacity *= opacity_factors[n]
-        if wp.static(antialiased):
-            opacity *= m.compensation(e)
-        if not (wp.isfinite(opacity) and opacity > real(0.0) and opacity >= alpha_cut):
-            return 0
-
-        inv_c = real(1.0) / wp.sqrt(e.c)
-        inv_det = real(1.0) / wp.sqrt(e.det)
-        factor = vec3(e.c * inv_c * inv_det, -e.b * inv_c * inv_det, inv_c) * e.shrink
-        if not m.finite3(factor):
-            return 0
-
-        reach = s.reach_of(opacity, alpha_cut, square_sigma)
-        half_width = real(1.0e30)  # without a cut every tile is touched
-        half_height = real(1.0e30)
-        if square_sigma > real(0.0):
-            middle = real(0.5) * (e.a + e.c)
-            longest = middle + wp.sqrt(real(0.25) * (e.a - e.c) * (e.a - e.c) + e.b * e.b)
-            half_width = wp.ceil(square_sigma * wp.sqrt(longest) / e.shrink)
-            half_height = half_width
-        elif alpha_cut > real(0.0):
-            half_width = reach * wp.sqrt(e.a) / e.shrink
-            half_height = reach * wp.sqrt(e.c) / e.shrink
-
-        rows = s.tile_rows(e.pixel[1], half_height, origin_y, window_height, tile_size)
-        tiles = int(0)
-        for row in range(rows[0], rows[1]):
-            columns = s.tile_columns(
-                e.pixel[0], e.pixel[1], factor, reach, half_width, half_height, row, origin_x, window_width, tile_size
-            )
-            tiles += columns[1] - columns[0]
-        if tiles == 0:
-            return 0
-
-        # last, since it reads the most
-        d = m.direction(means[n], view)
-        y = basis(vec3(d[0], d[1], d[2]))
-        color = vec3(real(0.5), real(0.5), real(0.5))
-        largest = real(0.0)
-        if wp.static(native):
-            shaded = color_of(coefficients, n, sh_count, y)
-            color += vec3(shaded[0], shaded[1], shaded[2])
-            largest = shaded[3]
-        else:
-            for k in range(wp.static(bases)):
-                if k < sh_count:
-                    color += y[k] * coefficients[n, k]
-                    largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
-        if not (m.finite3(color) and largest <= real(LARGEST_COEFFICIENT)):  # the maximum passes a NaN by, the colour has it
-            return 0
-        result = vec12()
-        result[0] = e.pixel[0]
-        result[1] = e.pixel[1]
-        result[2] = factor[0]
-        result[3] = factor[1]
-        result[4] = factor[2]
-        result[5] = opacity
-        for channel in range(3):
-            result[6 + channel] = wp.max(color[channel], real(0.0))
-        result[9] = m.depth_of(e.position)
-        result[10] = half_width
-        result[11] = half_height
-        store(projected, i, result)
-        return tiles
-
-    @wp.kernel(enable_backward=False, module=module)
-    def forward(
-        begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
-        opacity_factors: wp.array(dtype=real),
-        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
-        tile_size: int, sh_count: int,
-        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real,
-        # outputs
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        count = means.shape[0]
-        camera = i // count
-        n = i - camera * count
-        tiles = project_one(
-            i, n, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
-            logit_opacities, opacity_factors, coefficients,
-            width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
-            near, far, low_pass, alpha_cut, square_sigma, projected,
-        )  # fmt: skip
-        tile_counts[i] = tiles
-        if tiles == 0:
-            store(projected, i, vec12())
-
-    return forward
-
-
 def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
     """Return the first eight inputs as the kernels take them."""
     real = interop.real_of(inputs[0])
@@ -191,7 +41,7 @@ def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
 
 
 def _native(tensor: torch.Tensor) -> bool:
-    """Return whether the CUDA variants of the kernels apply."""
+    """Return whether the kernels of `project_cuda` apply."""
     return tensor.is_cuda and tensor.dtype == torch.float32
 
 
@@ -217,8 +67,11 @@ def project_tensors(
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
     ]  # fmt: skip
-    kernel = make_forward(real, _native(means), *settings.variant())
-    interop.launch(kernel, cameras * count, arguments, means.device, cost=5)
+    if _native(means):
+        kernel, tasks, cost = project_cuda.make_forward(*settings.variant()), cameras * count, 5
+    else:
+        kernel, tasks, cost = project_cpu.make_forward(real, *settings.variant()), cameras * -(-count // LANES), 5 * LANES
+    interop.launch(kernel, tasks, arguments, means.device, cost=cost)
     return projected, tile_counts
 
 
@@ -269,11 +122,7 @@ def project_gradients(
     real, device = interop.real_of(projected), projected.device
     t, (width, height), rule = make_types(real), settings.size, settings.rule
     v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
-    native = _native(projected)  # writes zeros itself
     found = [allocator.output(tensor.shape, tensor.dtype, device) for tensor in inputs[:5]]
-    if not native:
-        for gradient in found:
-            gradient.zero_()
     cameras, count = len(inputs[5]), len(inputs[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
@@ -282,11 +131,15 @@ def project_gradients(
         *_views(inputs[:8]), width, height, settings.sh_count, rule.near, rule.low_pass,
         interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
         interop.view(v_projected.view(-1, PROJECTED_SIZE), real),
-        int(wants_camera), *outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33),
     ]  # fmt: skip
-    threads = -(-count // BLOCK) * BLOCK if native else count
-    kernel = make_backward(real, native, *settings.variant())
-    interop.launch(kernel, threads, arguments, device, cost=10 * cameras, block_dim=BLOCK)
+    if _native(projected):
+        kernel, tasks, cost = project_cuda.make_backward(*settings.variant()), -(-count // BLOCK) * BLOCK, 10
+        arguments.append(int(wants_camera))
+    else:
+        kernel = project_cpu_backward.make_backward(real, *settings.variant(), wants_camera)
+        tasks, cost = -(-count // LANES), 10 * LANES
+    arguments += [*outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33)]
+    interop.launch(kernel, tasks, arguments, device, cost=cost * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]
     # in float64, whose rounding no number of threads shows in float32

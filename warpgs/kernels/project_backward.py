@@ -1,4 +1,4 @@
-"""The backward kernel of `project`. Comments name the sections of docs/project.md, which has the derivation."""
+"""Gradients of one projected Gaussian, for all backward kernels of `project`. Comments name sections of docs/project.md."""
 
 import functools
 from types import SimpleNamespace
@@ -8,14 +8,23 @@ import warp as wp
 from warpgs.kernels import sh
 from warpgs.kernels.covariance import make_covariance
 from warpgs.kernels.functions import make_projection
-from warpgs.kernels.native import make_color
-from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.project_inputs import PROJECTED_SIZE
 
 
 @functools.cache
-def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int):
-    """Make the functions that take the gradients of one projected Gaussian to those of its parameters."""
-    m = make_projection(real, camera_model, parameters)
+def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int, lanes: bool = False):
+    """Make the functions that take the gradients of one projected Gaussian to those of its parameters.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        camera_model: Name of the camera model, whose functions are compiled in.
+        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        antialiased: True where opacities were multiplied by `compensation`.
+        bases: Number of basis values that a colour may have (`sh.bases_for`).
+        lanes: As in `make_projection`. Functions then take a projected Gaussian and its gradient as vectors, not as rows of
+            arrays.
+    """
+    m = make_projection(real, camera_model, parameters, lanes)
     vec2 = m.vec2
     vec3 = m.vec3
     vec4 = m.vec4
@@ -23,6 +32,16 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     mat33 = m.mat33
     basis_backward = sh.make_functions(real, bases).basis_backward
     c = make_covariance(real)
+
+    row = wp.types.vector(PROJECTED_SIZE, real) if lanes else wp.array2d(dtype=real)
+
+    @wp.func
+    def at(values: row, i: int, k: int) -> real:
+        """Return a number of a projected Gaussian."""
+        if wp.static(lanes):
+            return values[k]
+        else:
+            return values[i, k]
 
     @wp.struct
     class ShapeGradient:
@@ -38,15 +57,15 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
 
     @wp.func
     def covariance_2d(
-        e: m.Ellipse, projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, low_pass: real
+        e: m.Ellipse, projected: row, v_projected: row, i: int, low_pass: real
     ) -> vec3:  # fmt: skip
         """Return the gradients of xx, of each xy and of yy of the projected covariance [px^2] (section 9)."""
-        u11 = projected[i, 2]
-        u12 = projected[i, 3]
-        u22 = projected[i, 4]
-        h11 = v_projected[i, 2] * u11 + v_projected[i, 3] * u12
-        h12 = v_projected[i, 3] * u22
-        h22 = v_projected[i, 4] * u22
+        u11 = at(projected, i, 2)
+        u12 = at(projected, i, 3)
+        u22 = at(projected, i, 4)
+        h11 = at(v_projected, i, 2) * u11 + at(v_projected, i, 3) * u12
+        h12 = at(v_projected, i, 3) * u22
+        h22 = at(v_projected, i, 4) * u22
         V = real(-0.5) * vec3(
             h11 * u11 * u11,
             (h11 * u12 + h12 * u22) * u11,
@@ -57,7 +76,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             if compensation > real(0.0):
                 aa = wp.dot(e.m1, e.m1)
                 cc = wp.dot(e.m2, e.m2)
-                by_opacity = real(0.5) * v_projected[i, 5] * (projected[i, 5] / compensation) / compensation
+                by_opacity = real(0.5) * at(v_projected, i, 5) * (at(projected, i, 5) / compensation) / compensation
                 by_opacity *= low_pass * e.shrink * e.shrink * e.shrink * e.shrink / e.det
                 V += by_opacity * (vec3(cc * e.c + e.b * e.b, -e.b * (cc + e.a), aa * e.a + e.b * e.b) / e.det)
         return V
@@ -66,7 +85,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     def shape(
         mean: vec3, quat: vec4, log_scale: vec3, view: m.mat44, K: mat33, lens: wp.array(dtype=real),
         width: real, height: real, near: real, low_pass: real,
-        projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int,
+        projected: row, v_projected: row, i: int,
     ) -> ShapeGradient:  # fmt: skip
         g = ShapeGradient()
         e = m.ellipse(mean, quat, log_scale, view, K, lens, width, height, near, low_pass)
@@ -79,13 +98,13 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
         inv_c = real(1.0) / wp.sqrt(e.c)
         inv_det = real(1.0) / wp.sqrt(e.det)
-        t11 = v_projected[i, 2] * e.shrink * (e.c * inv_c * inv_det)
-        t12 = v_projected[i, 3] * e.shrink * (-e.b * inv_c * inv_det)
-        t22 = v_projected[i, 4] * e.shrink * inv_c
+        t11 = at(v_projected, i, 2) * e.shrink * (e.c * inv_c * inv_det)
+        t12 = at(v_projected, i, 3) * e.shrink * (-e.b * inv_c * inv_det)
+        t22 = at(v_projected, i, 4) * e.shrink * inv_c
         # twice v_det det and v_c c, times shrink; det and c divide vectors of their own size, or needles overflow
         s_det = -(t11 + t12) * e.shrink
         s_c = (t11 - t12 - t22) * e.shrink
-        v_b = -v_projected[i, 3] * e.shrink * inv_c * (e.shrink * inv_det)
+        v_b = -at(v_projected, i, 3) * e.shrink * inv_c * (e.shrink * inv_det)
         blur = low_pass * e.shrink * e.shrink
         normal = wp.cross(e.m1, e.m2)
         per_det = real(1.0) / e.det
@@ -96,7 +115,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             compensation = m.compensation(e)
             if compensation > real(0.0):
                 unit = wp.normalize(normal / wp.max(wp.abs(normal)))  # divided, since its square could underflow
-                v_compensation = v_projected[i, 5] * (projected[i, 5] / compensation) * e.shrink
+                v_compensation = at(v_projected, i, 5) * (at(projected, i, 5) / compensation) * e.shrink
                 by_normal = blur * (wp.dot(e.m1, e.m1) + wp.dot(e.m2, e.m2) + blur) * per_det * inv_det
                 by_blur = compensation * (blur * per_det)
                 v_m1 += v_compensation * (by_normal * wp.cross(e.m2, unit) - by_blur * e.m1)
@@ -129,9 +148,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
 
         # mean in the image, Jacobian and depth -> position in the camera (section 3)
-        v_pixel = vec2(v_projected[i, 0], v_projected[i, 1])
+        v_pixel = vec2(at(v_projected, i, 0), at(v_projected, i, 1))
         p = m.position_backward(
-            e.position, K, lens, e.pixel, e.expansion_point, e.axes, v_m1, v_m2, v_pixel, v_projected[i, 9]
+            e.position, K, lens, e.pixel, e.expansion_point, e.axes, v_m1, v_m2, v_pixel, at(v_projected, i, 9)
         )  # fmt: skip
         g.position = p.v_position
         g.mean = wp.transpose(rotation) * g.position
@@ -141,11 +160,11 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         return g
 
     @wp.func
-    def color(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int) -> vec3:
+    def color(projected: row, v_projected: row, i: int) -> vec3:
         """Return the gradient of the colour before its clamp at zero (section 5)."""
-        v_color = vec3(v_projected[i, 6], v_projected[i, 7], v_projected[i, 8])
+        v_color = vec3(at(v_projected, i, 6), at(v_projected, i, 7), at(v_projected, i, 8))
         for channel in range(3):
-            if not (projected[i, 6 + channel] > real(0.0)):  # clamped at zero
+            if not (at(projected, i, 6 + channel) > real(0.0)):  # clamped at zero
                 v_color[channel] = real(0.0)
         return v_color
 
@@ -153,152 +172,46 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     def centered(d: vec4, w: values) -> vec3:
         """Return the gradient of the mean by way of its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
         v_centered = vec3()
-        if d[3] > real(0.0):
-            unit = vec3(d[0], d[1], d[2])
+        unit = vec3(d[0], d[1], d[2])
+        if wp.static(lanes):
+            v_unit = basis_backward(unit, w)
+            v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / wp.where(d[3] > real(0.0), d[3], real(wp.inf))
+        elif d[3] > real(0.0):
             v_unit = basis_backward(unit, w)
             v_centered = (v_unit - unit * wp.dot(unit, v_unit)) / d[3]
         return v_centered
 
     @wp.func
-    def logit(projected: wp.array2d(dtype=real), v_projected: wp.array2d(dtype=real), i: int, logit_opacity: real) -> real:
+    def logit(projected: row, v_projected: row, i: int, logit_opacity: real) -> real:
         """Return the gradient of the opacity's logit, or of the opacity itself (section 6)."""
         if wp.static(parameters != "stored"):
-            return v_projected[i, 5] * (projected[i, 5] / logit_opacity)  # the factor of the opacity, or 1
-        return v_projected[i, 5] * projected[i, 5] * m.sigmoid(-logit_opacity)
+            return at(v_projected, i, 5) * (at(projected, i, 5) / logit_opacity)  # the factor of the opacity, or 1
+        return at(v_projected, i, 5) * at(projected, i, 5) * m.sigmoid(-logit_opacity)
 
-    return SimpleNamespace(shape=shape, color=color, centered=centered, logit=logit)
+    @wp.func
+    def view_gradient(
+        view: m.mat44, mean: vec3, quat: vec4, log_scale: vec3, position: vec3, turned: mat33, unit: vec4, v_centered: vec3
+    ) -> m.mat44:  # fmt: skip
+        """Return the gradient of the view matrix; arguments are a Gaussian, fields of its ShapeGradient, and `centered`."""
+        rotation = mat33(
+            view[0, 0], view[0, 1], view[0, 2],
+            view[1, 0], view[1, 1], view[1, 2],
+            view[2, 0], view[2, 1], view[2, 2],
+        )  # fmt: skip
+        t = vec3(view[0, 3], view[1, 3], view[2, 3])
+        if wp.static(parameters == "covariances"):
+            turning = c.factor(quat, log_scale)
+        else:
+            turning = m.rotation(unit)
+        v_rotation = wp.outer(position, mean) + wp.outer(t, v_centered) + turned * wp.transpose(turning)
+        v_t = position + rotation * v_centered
+        v_view = m.mat44()
+        for row in range(3):
+            for column in range(3):
+                v_view[row, column] = v_rotation[row, column]
+            v_view[row, 3] = v_t[row]
+        return v_view
 
-
-@functools.cache
-def make_backward(
-    real, native: bool, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
-):  # fmt: skip
-    """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        native: True for CUDA and float32. The Gaussians that some camera sees are then dealt to the first threads of each
-            block.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        antialiased: True where opacities were multiplied by `compensation`.
-        bases: Number of basis values that a colour may have (`sh.bases_for`).
-    """
-    m = make_projection(real, camera_model, parameters)
-    f = make_functions(real, camera_model, parameters, antialiased, bases)
-    c = make_covariance(real)
-    functions = sh.make_functions(real, bases)
-    vec3 = m.vec3
-    vec4 = m.vec4
-    values = functions.values
-    mat33 = m.mat33
-    compact = make_native().compact if native else None
-    clear_rows = make_native().clear_rows if native else None
-    color_backward = make_color(bases).color_backward if native else None
-
-    # four blocks to a multiprocessor
-    registers = {"cuda_max_registers": 128} if native else {}
-    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.backward.{real.__name__}.{int(native)}.{camera_model}{variant}"
-
-    @wp.kernel(enable_backward=False, module=module, **registers)
-    def backward(
-        begin: int,
-        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
-        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
-        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
-        width: int, height: int, sh_count: int, near: real, low_pass: real,
-        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
-        camera_gradients: int,
-        # outputs, zero on entry where not native
-        v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
-        v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
-        v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
-    ):  # fmt: skip
-        n = begin + wp.tid()
-        count = means.shape[0]
-        if wp.static(native):
-            seen = int(0)
-            if n < count:
-                for camera in range(viewmats.shape[0]):
-                    seen += tile_counts[camera * count + n]
-                if seen == 0:
-                    v_means[n] = vec3()
-                    v_quats[n] = vec4()
-                    v_log_scales[n] = vec3()
-                    v_logit_opacities[n] = real(0.0)
-            clear_rows(n, seen, v_coefficients)
-            n = compact(n, seen)
-            if n < 0:
-                return
-        v_mean = vec3()
-        v_quat = vec4()
-        v_log_scale = vec3()
-        v_logit = real(0.0)
-        stored = int(0)
-        for camera in range(viewmats.shape[0]):
-            i = camera * count + n
-            if tile_counts[i] > 0:
-                view = viewmats[camera]
-                g = f.shape(
-                    means[n],
-                    quats[n],
-                    log_scales[n],
-                    view,
-                    Ks[camera],
-                    lenses[camera],
-                    real(width),
-                    real(height),
-                    near,
-                    low_pass,
-                    projected,
-                    v_projected,
-                    i,
-                )
-                v_mean += g.mean
-                v_quat += g.quat
-                v_log_scale += g.log_scale
-                # before the colour: its loads need not wait for what is stored there
-                v_logit += f.logit(projected, v_projected, i, logit_opacities[n])
-
-                d = m.direction(means[n], view)
-                basis = functions.basis(vec3(d[0], d[1], d[2]))
-                v_color = f.color(projected, v_projected, i)
-                w = values()
-                if wp.static(native):
-                    w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
-                    stored += 1
-                else:
-                    for k in range(wp.static(bases)):
-                        if k < sh_count:
-                            v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
-                            w[k] = wp.dot(coefficients[n, k], v_color)
-                v_centered = f.centered(d, w)
-                v_mean += v_centered
-
-                if camera_gradients != 0:  # section 6
-                    rotation = mat33(
-                        view[0, 0], view[0, 1], view[0, 2],
-                        view[1, 0], view[1, 1], view[1, 2],
-                        view[2, 0], view[2, 1], view[2, 2],
-                    )  # fmt: skip
-                    t = vec3(view[0, 3], view[1, 3], view[2, 3])
-                    if wp.static(parameters == "covariances"):
-                        turning = c.factor(quats[n], log_scales[n])
-                    else:
-                        turning = m.rotation(g.unit)
-                    v_rotation = wp.outer(g.position, means[n]) + wp.outer(t, v_centered) + g.turned * wp.transpose(turning)
-                    v_t = g.position + rotation * v_centered
-                    v_view = m.mat44()
-                    for row in range(3):
-                        for column in range(3):
-                            v_view[row, column] = v_rotation[row, column]
-                        v_view[row, 3] = v_t[row]
-                    v_viewmats[camera, n] = v_view
-                    v_Ks[camera, n] = g.K
-        v_means[n] = v_mean
-        v_quats[n] = v_quat
-        v_log_scales[n] = v_log_scale
-        v_logit_opacities[n] = v_logit
-
-    return backward
+    return SimpleNamespace(
+        ShapeGradient=ShapeGradient, shape=shape, color=color, centered=centered, logit=logit, view_gradient=view_gradient
+    )

@@ -13,6 +13,11 @@ from warpgs.kernels import sh
 from warpgs.runtime import interop
 from warpgs.runtime.derivatives import first_order
 
+PROJECTED_SIZE = 12
+"""Numbers of a projected Gaussian, 16-byte aligned in float32:
+0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
+10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
+
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
 """Rows and columns of the entries of a covariance above the diagonal, in the order in which they are packed."""
 

@@ -23,8 +23,11 @@ from warpgs.kernels import (
     dropout,
     knn,
     opacity_decay,
-    project,
+    project_cpu,
+    project_cpu_backward,
+    project_cuda,
     scanlines,
+    sh,
     ssim_cpu,
     ssim_cuda,
     step_buffers,
@@ -51,7 +54,6 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """
     real = wp.float32
     common = [
-        (project.make_forward(real, cuda, CAMERA_MODEL), THREADS), (project.make_backward(real, cuda, CAMERA_MODEL), BLOCK),
         (tiles.make_kernels(real, cuda).pack_counts, THREADS),
         *((tiles_emit.make_emit(real, cuda, slotted), THREADS) for slotted in (True, False)),
         *((tiles_emit.make_find_ranges(slotted), THREADS) for slotted in (True, False)),
@@ -66,14 +68,17 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         )
         without_depth = blend_cpu.make_kernels(real, TILE_SIZE, deep=False)
         updates = [adam.make_kernel(real, split, adam.LANES) for split in (True, False)]
+        variant = CAMERA_MODEL, "stored", False, sh.BASES
         own = [
+            project_cpu.make_forward(real, *variant), project_cpu_backward.make_backward(real, *variant, False),
             blending.forward, blending.backward, without_depth.backward, blending.contributions,
             blend.make_segments(real).sum_gradients,
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
     blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
-    own = [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
+    own = [(project_cuda.make_forward(CAMERA_MODEL), THREADS), (project_cuda.make_backward(CAMERA_MODEL), BLOCK)]
+    own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
     own += [(blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without

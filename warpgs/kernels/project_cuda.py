@@ -1,0 +1,235 @@
+"""The kernels of `project` for CUDA and float32; `project_cpu` has those of other devices and types."""
+
+import functools
+
+import warp as wp
+
+from warpgs.constants import LARGEST_COEFFICIENT
+from warpgs.kernels import project_backward, sh
+from warpgs.kernels.functions import make_projection, make_spans
+from warpgs.kernels.native import make_color
+from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.project_inputs import PROJECTED_SIZE
+
+
+@functools.cache
+def make_forward(camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
+    """Make the forward kernel.
+
+    Args:
+        camera_model: Name of the camera model, whose functions are compiled in.
+        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        antialiased: True to multiply opacities by `compensation`.
+        bases: Number of basis values that a colour may have (`sh.bases_for`).
+    """
+    real = wp.float32
+    m = make_projection(real, camera_model, parameters)
+    s = make_spans(real)
+    basis = sh.make_functions(real, bases).basis
+    vec3 = m.vec3
+    color_of = make_color(bases).color
+    vec12 = wp.types.vector(PROJECTED_SIZE, real)
+
+    store = make_native().store_row
+    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
+    module = f"warpgs.kernels.project.forward.cuda.{camera_model}{variant}"
+
+    @wp.func
+    def project_one(
+        i: int, n: int, view: m.mat44, K: m.mat33, lens: wp.array(dtype=real),
+        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
+        logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
+        coefficients: wp.array2d(dtype=m.vec3),
+        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
+        tile_size: int, sh_count: int,
+        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        """Project Gaussian n; return the number of tiles it touches. Where that is 0 it is culled, and nothing is written."""
+        e = m.ellipse(
+            means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
+        )  # fmt: skip
+        if e.valid == 0 or not (m.depth_of(e.position) <= far):
+            return 0
+        opacity = m.opacity_of(logit_opacities[n])
+        if opacity_factors.shape[0] > 0:
+            opacity *= opacity_factors[n]
+        if wp.static(antialiased):
+            opacity *= m.compensation(e)
+        if not (wp.isfinite(opacity) and opacity > real(0.0) and opacity >= alpha_cut):
+            return 0
+
+        factor = m.factor_of(e)
+        if not m.finite3(factor):
+            return 0
+
+        reach = s.reach_of(opacity, alpha_cut, square_sigma)
+        half = s.half_sides(e.a, e.b, e.c, e.shrink, reach, alpha_cut, square_sigma)
+        rows = s.tile_rows(e.pixel[1], half[1], origin_y, window_height, tile_size)
+        tiles = int(0)
+        for row in range(rows[0], rows[1]):
+            columns = s.tile_columns(
+                e.pixel[0], e.pixel[1], factor, reach, half[0], half[1], row, origin_x, window_width, tile_size
+            )
+            tiles += columns[1] - columns[0]
+        if tiles == 0:
+            return 0
+
+        # last, since it reads the most
+        d = m.direction(means[n], view)
+        y = basis(vec3(d[0], d[1], d[2]))
+        color = vec3(real(0.5), real(0.5), real(0.5))
+        shaded = color_of(coefficients, n, sh_count, y)
+        color += vec3(shaded[0], shaded[1], shaded[2])
+        largest = shaded[3]
+        if not (m.finite3(color) and largest <= real(LARGEST_COEFFICIENT)):  # the maximum passes a NaN by, the colour has it
+            return 0
+        result = vec12()
+        result[0] = e.pixel[0]
+        result[1] = e.pixel[1]
+        result[2] = factor[0]
+        result[3] = factor[1]
+        result[4] = factor[2]
+        result[5] = opacity
+        for channel in range(3):
+            result[6 + channel] = wp.max(color[channel], real(0.0))
+        result[9] = m.depth_of(e.position)
+        result[10] = half[0]
+        result[11] = half[1]
+        store(projected, i, result)
+        return tiles
+
+    @wp.kernel(enable_backward=False, module=module)
+    def forward(
+        begin: int,
+        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
+        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
+        opacity_factors: wp.array(dtype=real),
+        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
+        tile_size: int, sh_count: int,
+        near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real,
+        # outputs
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        count = means.shape[0]
+        camera = i // count
+        n = i - camera * count
+        tiles = project_one(
+            i, n, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
+            logit_opacities, opacity_factors, coefficients,
+            width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
+            near, far, low_pass, alpha_cut, square_sigma, projected,
+        )  # fmt: skip
+        tile_counts[i] = tiles
+        if tiles == 0:
+            store(projected, i, vec12())
+
+    return forward
+
+
+@functools.cache
+def make_backward(camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
+    """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
+
+    The Gaussians that some camera sees are dealt to the first threads of each block.
+
+    Args:
+        camera_model: Name of the camera model, whose functions are compiled in.
+        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
+        antialiased: True where opacities were multiplied by `compensation`.
+        bases: Number of basis values that a colour may have (`sh.bases_for`).
+    """
+    real = wp.float32
+    m = make_projection(real, camera_model, parameters)
+    f = project_backward.make_functions(real, camera_model, parameters, antialiased, bases)
+    functions = sh.make_functions(real, bases)
+    vec3 = m.vec3
+    vec4 = m.vec4
+    compact = make_native().compact
+    clear_rows = make_native().clear_rows
+    color_backward = make_color(bases).color_backward
+
+    # four blocks to a multiprocessor
+    registers = {"cuda_max_registers": 128}
+    variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
+    module = f"warpgs.kernels.project.backward.cuda.{camera_model}{variant}"
+
+    @wp.kernel(enable_backward=False, module=module, **registers)
+    def backward(
+        begin: int,
+        means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
+        logit_opacities: wp.array(dtype=real), coefficients: wp.array2d(dtype=m.vec3),
+        viewmats: wp.array(dtype=m.mat44), Ks: wp.array(dtype=m.mat33), lenses: wp.array2d(dtype=real),
+        width: int, height: int, sh_count: int, near: real, low_pass: real,
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
+        camera_gradients: int,
+        # outputs
+        v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
+        v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
+        v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
+    ):  # fmt: skip
+        n = begin + wp.tid()
+        count = means.shape[0]
+        seen = int(0)
+        if n < count:
+            for camera in range(viewmats.shape[0]):
+                seen += tile_counts[camera * count + n]
+            if seen == 0:
+                v_means[n] = vec3()
+                v_quats[n] = vec4()
+                v_log_scales[n] = vec3()
+                v_logit_opacities[n] = real(0.0)
+        clear_rows(n, seen, v_coefficients)
+        n = compact(n, seen)
+        if n < 0:
+            return
+        v_mean = vec3()
+        v_quat = vec4()
+        v_log_scale = vec3()
+        v_logit = real(0.0)
+        stored = int(0)
+        for camera in range(viewmats.shape[0]):
+            i = camera * count + n
+            if tile_counts[i] > 0:
+                view = viewmats[camera]
+                g = f.shape(
+                    means[n],
+                    quats[n],
+                    log_scales[n],
+                    view,
+                    Ks[camera],
+                    lenses[camera],
+                    real(width),
+                    real(height),
+                    near,
+                    low_pass,
+                    projected,
+                    v_projected,
+                    i,
+                )
+                v_mean += g.mean
+                v_quat += g.quat
+                v_log_scale += g.log_scale
+                # before the colour: its loads need not wait for what is stored there
+                v_logit += f.logit(projected, v_projected, i, logit_opacities[n])
+
+                d = m.direction(means[n], view)
+                basis = functions.basis(vec3(d[0], d[1], d[2]))
+                v_color = f.color(projected, v_projected, i)
+                w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
+                stored += 1
+                v_centered = f.centered(d, w)
+                v_mean += v_centered
+
+                if camera_gradients != 0:  # section 6
+                    v_viewmats[camera, n] = f.view_gradient(
+                        view, means[n], quats[n], log_scales[n], g.position, g.turned, g.unit, v_centered
+                    )
+                    v_Ks[camera, n] = g.K
+        v_means[n] = v_mean
+        v_quats[n] = v_quat
+        v_log_scales[n] = v_log_scale
+        v_logit_opacities[n] = v_logit
+
+    return backward
