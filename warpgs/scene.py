@@ -341,18 +341,20 @@ class Render:
     tile_counts: torch.Tensor
     """Number of tiles that a Gaussian touches, int32, shape [C, N]; 0 where it is culled."""
     weight_sums: torch.Tensor | None = None
-    """Sum over pixels of a Gaussian's blending weight, shape [C, N]; only where contributions were requested."""
+    """Sum over pixels of a Gaussian's blending weight, shape [C, N]; only where contributions were requested. To take a
+    gradient of it is an error."""
     weight_maxima: torch.Tensor | None = None
-    """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only where contributions were requested."""
+    """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only where contributions were requested. To take a
+    gradient of it is an error."""
     overflow: torch.Tensor | None = None
     """1 where the instances did not fit into the capacity, and the images must not be used; else 0. Int32, shape [1]; only
     where a capacity was given."""
     median_depth: torch.Tensor | None = None
-    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. No
-    gradients flow into it; only where it was requested."""
+    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2.
+    To take a gradient of it is an error; only where it was requested."""
     error_bound: torch.Tensor | None = None
     """Upper bound of the error of ``rgb`` against rule `exact`, over all channels, shape [..., H, W]; see
-    ``RasterizeOptions.error_bound``. No gradients flow into it; only where it was requested."""
+    ``RasterizeOptions.error_bound``. To take a gradient of it is an error; only where it was requested."""
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
 
@@ -374,7 +376,7 @@ class Render:
 
         After it ``means2d.grad`` holds their gradients, shape [C, N, 2], and ``means2d.absgrad``, with
         ``RasterizeOptions.absgrad``, the sums over pixels of the gradients' magnitudes. They are a copy for a strategy to hold:
-        no gradient flows through them into the Gaussians.
+        to take a gradient of them is an error.
         """
         means2d = self.projected.detach()[..., :2]
         columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if self.absgrad else {})
@@ -384,8 +386,11 @@ class Render:
                 before, found = getattr(means2d, name, None), gradient.detach()[..., part]
                 setattr(means2d, name, found if before is None else before + found)
 
+        def refuse(gradient: torch.Tensor) -> None:
+            raise RuntimeError("means2d has no gradient into the Gaussians: take Render.projected[..., :2], which has one")
+
         if self.projected.requires_grad:
-            means2d.requires_grad_()
+            means2d.requires_grad_().register_hook(refuse)
             self.projected.register_hook(keep)
         return means2d
 

@@ -113,20 +113,6 @@ def test_the_public_op_gives_them_on_request(device, dtype):
         assert torch.equal(getattr(window, name), found[:, 16:, 16:]) and torch.equal(getattr(single, name), found[1]), name
 
 
-@pytest.mark.parametrize("most", [None, 100])
-def test_a_gradient_is_refused(device, most):
-    """Through weights it is an error, in chunks, too; beside them, and of detached weights, the images keep theirs."""
-    gaussians, cam = cloud(50, device=device), camera(40, 24, dtype=torch.float32, device=device)
-    gaussians.means.requires_grad_()
-    r = rasterize(gaussians, cam, RasterizeOptions(heaviest=2, max_instances=most))
-    with pytest.raises(UsageError, match="no gradient"):
-        r.heaviest_weights.sum().backward()
-    (r.rgb.sum() * r.heaviest_weights.detach().sum()).backward()
-    assert bool(gaussians.means.grad.any())
-    with torch.no_grad():
-        assert not rasterize(gaussians, cam, RasterizeOptions(heaviest=2)).heaviest_weights.requires_grad
-
-
 def test_what_cannot_be_is_refused():
     """A number below 1, and tiles of another image."""
     projected, tiles = layers([0.5], "cpu")

@@ -142,14 +142,6 @@ def test_the_public_op_gives_it_on_request(device, dtype):
     assert torch.equal(rasterize(gaussians, single, options).median_depth, whole.median_depth[1])
 
 
-def test_no_gradient_flows(device):
-    """The images keep theirs; median depth has none."""
-    gaussians, cam = cloud(50, device=device), camera(20, 12, dtype=torch.float32, device=device)
-    gaussians.means.requires_grad_()
-    r = rasterize(gaussians, cam, RasterizeOptions(median_depth=True))
-    assert r.rgb.requires_grad and not r.median_depth.requires_grad
-
-
 def test_tiles_of_another_image_are_refused():
     """The error is that of `blend`."""
     projected, tiles = layers([0.5], "cpu")

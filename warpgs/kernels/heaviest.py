@@ -10,7 +10,6 @@ import torch
 import warp as wp
 
 from warpgs.constants import Rule
-from warpgs.errors import UsageError
 from warpgs.kernels.blend import check_tiles, is_native, tile_inputs
 from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.blend_settings import BlendSettings, make_struct
@@ -130,34 +129,12 @@ def make_native(tile_size: int):
     return heaviest
 
 
-class _WithoutGradient(torch.autograd.Function):
-    """Weights that hang on what they were made from, so that a gradient through them is refused and not dropped."""
-
-    @staticmethod
-    def forward(ctx, weights, projected):
-        return weights.view_as(weights)
-
-    @staticmethod
-    def backward(ctx, v_weights):
-        raise UsageError(
-            "weights of the heaviest Gaussians have no gradient: detach them, or take rgb, alpha, depth or features"
-        )
-
-
-def without_gradient(weights: torch.Tensor, projected: torch.Tensor) -> torch.Tensor:
-    """Return weights [..., k], through which a gradient is an error where ``projected`` [C, N, 12] requires gradients."""
-    if not projected.requires_grad:
-        return weights
-    found: torch.Tensor = _WithoutGradient.apply(weights, projected)
-    return found
-
-
 def heaviest(
     projected: torch.Tensor, tiles: Tiles, k: int, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the k Gaussians of largest blending weight alpha * T in each pixel, the heaviest first; the nearer one of a tie.
 
-    Weights have no gradient, and a gradient through them is an error. Bitwise repeatable, whatever the number of threads.
+    Not differentiable. Bitwise repeatable, whatever the number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
@@ -179,19 +156,19 @@ def heaviest(
     check_tiles(projected, tiles, width, height)
     if k < 1:
         raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
-    detached = projected.detach().contiguous()
-    real, device, (cameras, per_camera) = interop.real_of(detached), detached.device, detached.shape[:2]
+    projected = projected.detach().contiguous()
+    real, device, (cameras, per_camera) = interop.real_of(projected), projected.device, projected.shape[:2]
     settings, shape = BlendSettings(origin, width, height, rule), (cameras, height, width)
-    weights = detached.new_zeros(*shape, k)
+    weights = projected.new_zeros(*shape, k)
     ids = torch.full((*shape, k), -1, dtype=torch.int32, device=device)
     counts = torch.zeros(shape, dtype=torch.int32, device=device)
     outputs = [interop.view(weights.view(-1), real), *(interop.view(t.view(-1), wp.int32) for t in (ids, counts))]
     own, rest = settings.struct(tiles.size, real), [per_camera, k, *outputs]
-    if is_native(detached):
+    if is_native(projected):
         lists = [interop.view(t.view(-1), wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
-        inputs, pixels = [own, interop.view(detached.view(-1), real), *lists, *rest], tiles.size * tiles.size
+        inputs, pixels = [own, interop.view(projected.view(-1), real), *lists, *rest], tiles.size * tiles.size
         interop.launch(make_native(tiles.size), len(tiles.ranges) * pixels, inputs, device, block_dim=pixels)
     else:
-        inputs = [own, *tile_inputs(detached, tiles, real), *rest]
+        inputs = [own, *tile_inputs(projected, tiles, real), *rest]
         interop.launch(make_kernel(real, tiles.size), len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
-    return ids, without_gradient(weights, projected), counts
+    return ids, weights, counts

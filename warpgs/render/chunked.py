@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from warpgs.kernels.heaviest import without_gradient
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render.compose import Images, bin_and_blend, bin_projected, heaviest_of, median_depth_of, weights_of
@@ -173,13 +172,13 @@ def heaviest_chunked(
     _, _, width, height = frame.settings.window
     shape = (len(projected), height, width)
     ids, counts = (projected.new_empty(s, dtype=torch.int32) for s in ((*shape, k), shape))
-    weights, own = projected.new_empty(*shape, k), projected.detach()
+    weights = projected.new_empty(*shape, k)
     for settings, tile_counts in chunks(frame, inputs.detached()):
         rows, columns = _place(frame, settings.window)
-        parts = heaviest_of(own, bin_projected(own, tile_counts, settings, slotted=False), settings, k)
+        parts = heaviest_of(projected, bin_projected(projected, tile_counts, settings, slotted=False), settings, k)
         for image, part in zip((ids, weights, counts), parts, strict=True):
             image[:, rows, columns] = part
-    return ids, without_gradient(weights, projected), counts
+    return ids, weights, counts
 
 
 def blend_chunked(

@@ -35,7 +35,7 @@ from warpgs.render.pixels import at_pixels, checked_pixels, listed_tiles, window
 from warpgs.render.settings import RenderSettings, Window
 from warpgs.rules import rule_named
 from warpgs.runtime import interop
-from warpgs.runtime.derivatives import refuse_transforms
+from warpgs.runtime.derivatives import refuse_transforms, without_gradient
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
 
@@ -47,6 +47,9 @@ BOUND_ROUNDING = 2.0**-29
 colour is off by at most 2 e: an alpha moves its weight between its own colour and those behind, and the weights sum to 1. The
 unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
 
+
+WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
+"""Outputs of real numbers without a gradient: `Render` refuses one through them."""
 
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
@@ -275,7 +278,17 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
         maps = {name: None if image is None else at_pixels(image, pixels, window) for name, image in maps.items()}
     render = _as_render(camera, images, *found, **maps)
     bound = _error_bound(render.rgb.detach(), gaussians, camera, options) if options.error_bound else None
-    return replace(render, absgrad=options.absgrad, error_bound=bound)
+    return _refusing_gradients(replace(render, absgrad=options.absgrad, error_bound=bound))
+
+
+def _refusing_gradients(render: Render) -> Render:
+    """Return the render with outputs that have no gradient such that a gradient through them is an error."""
+    refusing: dict[str, Any] = {}
+    for name in WITHOUT_GRADIENT:
+        values, source = getattr(render, name), render.rgb if name == "error_bound" else render.projected
+        if values is not None:
+            refusing[name] = without_gradient(name, values, source)
+    return replace(render, **refusing)
 
 
 @torch.no_grad()

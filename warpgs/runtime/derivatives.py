@@ -45,6 +45,31 @@ def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
     return once
 
 
+class _WithoutGradient(torch.autograd.Function):
+    """Values that hang on the tensors that they were made from, so that a gradient through them is refused and not dropped."""
+
+    @staticmethod
+    def forward(ctx: Any, name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
+        ctx.name = name
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
+        raise UsageError(f"{ctx.name} has no gradient: detach it, or take rgb, alpha, depth or features")
+
+
+def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
+    """Return values of any shape [...], through which a gradient is an error where ``source`` [...] requires gradients.
+
+    Args:
+        name: Name of the values in the error.
+        values: Values that were computed from ``source`` without autograd, shape [...].
+        source: Tensor that the gradient would go to, shape [...].
+    """
+    found: torch.Tensor = _WithoutGradient.apply(name, values, source)
+    return found
+
+
 def refuse_transforms() -> None:
     """Check that no transform of torch.func is active.
 
