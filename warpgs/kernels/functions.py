@@ -134,7 +134,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
     @wp.func
     def scales_of(stored: vec3) -> vec3:
-        if wp.static(parameters == "activated" or lanes):
+        if wp.static(parameters != "stored" or lanes):
             return stored
         return vec3(wp.exp(stored[0]), wp.exp(stored[1]), wp.exp(stored[2]))
 
