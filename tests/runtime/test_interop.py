@@ -214,20 +214,25 @@ def test_a_recorded_launch_takes_structs_by_value():
     assert first.__ctype__().count == 1 and second.__ctype__().count == 3
 
 
-def test_a_thread_launches_with_its_own_arguments():
-    """Launches of one kernel from two threads at a time, each over other memory of another size, recorded once for each thread."""
-    meeting, counts = threading.Barrier(2), (1000, 30)
+def test_a_thread_launches_with_its_own_arguments(monkeypatch):
+    """One kernel from two threads at a time, over memory of other sizes; each thread is interrupted between patch and launch."""
+    patch, meeting, counts = interop._Recorded._patch, threading.Barrier(2), (1000, 30)
 
     def launches(count):
         visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
-        for _ in range(200):
-            meeting.wait()
+        for _ in range(3):
             interop.launch(mark, count, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
         return visits
 
+    def interrupted(recorded, *given):
+        patch(recorded, *given)
+        meeting.wait(10)
+
+    monkeypatch.setattr(interop._Recorded, "_patch", interrupted)
+
     with ThreadPoolExecutor(2) as pool:
         for count, visits in zip(counts, pool.map(launches, counts), strict=True):
-            assert visits.tolist() == [200] * count
+            assert visits.tolist() == [3] * count
 
 
 def test_items_are_numbered_in_31_bits():
