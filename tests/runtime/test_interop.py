@@ -1,6 +1,8 @@
 """Launches are cut into ranges that cover every item once; arguments are checked by name."""
 
 import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -210,6 +212,29 @@ def test_a_recorded_launch_takes_structs_by_value():
     assert totals == [[n] * 4 for n in (0.5, 6.5, 12.5, 13.0)]
     assert (first.count, first.step, second.count, second.step) == (1, 0.5, 3, 2.0)
     assert first.__ctype__().count == 1 and second.__ctype__().count == 3
+
+
+def test_a_thread_launches_with_its_own_arguments(monkeypatch):
+    """One kernel from two threads at a time, over memory of other sizes, each interrupted between patch and launch."""
+    patch, meeting, counts = interop._Recorded._patch, threading.Barrier(2), (1000, 30)
+
+    def launches(count):
+        visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
+        found = []
+        for _ in range(3):
+            interop.launch(mark, count, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+            found.append(visits.tolist())
+        return found
+
+    def interrupted(recorded, *given):
+        patch(recorded, *given)
+        meeting.wait(10)
+
+    monkeypatch.setattr(interop._Recorded, "_patch", interrupted)
+
+    with ThreadPoolExecutor(2) as pool:
+        for count, found in zip(counts, pool.map(launches, counts), strict=True):
+            assert found == [[times] * count for times in (1, 2, 3)]
 
 
 def test_items_are_numbered_in_31_bits():

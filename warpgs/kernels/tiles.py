@@ -9,7 +9,9 @@ import warp as wp
 
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.errors import ResourceError
+from warpgs.kernels import tiles_emit_cpu
 from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.project_cpu import LANES
 from warpgs.kernels.tiles_emit import make_emit, make_find_ranges
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
@@ -306,8 +308,10 @@ def bin_tiles(
             rule.square_sigma, columns, columns * rows, no_tile, total,
             *(interop.view(t, wp.int32) for t in (starts, keys, slots, owners, overflow)),
         ]  # fmt: skip
-        threads = -(-visible // 256) * 256 if native else visible
-        interop.launch(make_emit(real, native, slotted), threads, inputs, device, cost=10)
+        if native:
+            interop.launch(make_emit(real, slotted), -(-visible // 256) * 256, inputs, device, cost=10)
+        else:
+            interop.launch(tiles_emit_cpu.make_emit(real, slotted), -(-visible // LANES), inputs, device, cost=10 * LANES)
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)

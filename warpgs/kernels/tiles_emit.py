@@ -38,18 +38,8 @@ def make_find_ranges(slotted: bool):
 
 
 @functools.cache
-def make_emit(real, native: bool, slotted: bool):
-    """Make the kernel that writes the instances of each Gaussian, row by row of tiles.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        native: True for CUDA: a warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes.
-        slotted: True to write the slot and the owner of each instance; False to write its owner alone, in place of the slot.
-    """
-    s = make_spans(real)
-    vec3 = wp.types.vector(3, real)
-    vec2i = s.vec2i
-    lanes = make_native() if native else None
+def make_write(slotted: bool):
+    """Make the function that writes an instance; arguments are those of `make_emit`."""
 
     @wp.func
     def write(
@@ -62,6 +52,25 @@ def make_emit(real, native: bool, slotted: bool):
         else:
             slots[slot] = owner
 
+    return write
+
+
+@functools.cache
+def make_emit(real, slotted: bool):
+    """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `tiles_emit_cpu`).
+
+    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        slotted: True to write the slot and the owner of each instance; False to write its owner alone, in place of the slot.
+    """
+    s = make_spans(real)
+    vec3 = wp.types.vector(3, real)
+    vec2i = s.vec2i
+    lanes = make_native()
+    write = make_write(slotted)
+
     @wp.func
     def span_of(
         projected: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
@@ -73,7 +82,7 @@ def make_emit(real, native: bool, slotted: bool):
             projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(native)}.{int(slotted)}")
+    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}")
     def emit(
         begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
@@ -105,49 +114,41 @@ def make_emit(real, native: bool, slotted: bool):
         if touched > 0:
             rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
         first_tile = (i // per_camera) * tiles - corner
-        if wp.static(native):
-            # The warp writes the rows of its 32 Gaussians together: a lane finds the columns of a row, then each a tile.
-            lane = wp.tid() % 32
-            row_end = lanes.running_sum(rows[1] - rows[0])
-            row_begin = row_end - (rows[1] - rows[0])
-            row_count = lanes.broadcast(row_end, 31)
-            batch = int(0)
-            while batch < row_count:
-                owner = lanes.holder(row_end, batch + lane)
-                g = lanes.broadcast(i, owner)
-                row = lanes.broadcast(rows[0], owner) + batch + lane - lanes.broadcast(row_begin, owner)
-                span = vec2i(0, 0)
-                if batch + lane < row_count:
-                    span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
-                tile_end = lanes.running_sum(span[1] - span[0])
-                tile_begin = tile_end - (span[1] - span[0])
-                tile_count = lanes.broadcast(tile_end, 31)
-                # a Gaussian's slots go on from where its rows of the last batch ended
-                first = wp.max(row_begin - batch, 0)
-                to_slot = lanes.broadcast(slot, owner) - lanes.broadcast(tile_begin, lanes.broadcast(first, owner))
-                to_key = lanes.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
-                limit = lanes.broadcast(end, owner)
-                done = int(0)
-                while done < tile_count:
-                    at = lanes.holder(tile_end, done + lane)
-                    to = done + lane + lanes.broadcast(to_slot, at)
-                    key = done + lane + lanes.broadcast(to_key, at)
-                    owner_of = lanes.broadcast(g, at)
-                    if to < lanes.broadcast(limit, at) and done + lane < tile_count:
-                        write(to, key, owner_of, keys, slots, owners)
-                    done += 32
-                written = lanes.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
-                written -= lanes.broadcast(tile_begin, wp.min(first, 31))
-                if row_begin < batch + 32 and row_end > batch and rows[1] > rows[0]:
-                    slot += written
-                batch += 32
-        else:
-            for row in range(rows[0], rows[1]):
-                span = span_of(projected, i, row, alpha_cut, square_sigma, origin_x, width, tile_size)
-                for column in range(span[0], span[1]):
-                    if slot < end:
-                        write(slot, first_tile + row * columns + column, i, keys, slots, owners)
-                        slot += 1
+        # The warp writes the rows of its 32 Gaussians together: a lane finds the columns of a row, then each a tile.
+        lane = wp.tid() % 32
+        row_end = lanes.running_sum(rows[1] - rows[0])
+        row_begin = row_end - (rows[1] - rows[0])
+        row_count = lanes.broadcast(row_end, 31)
+        batch = int(0)
+        while batch < row_count:
+            owner = lanes.holder(row_end, batch + lane)
+            g = lanes.broadcast(i, owner)
+            row = lanes.broadcast(rows[0], owner) + batch + lane - lanes.broadcast(row_begin, owner)
+            span = vec2i(0, 0)
+            if batch + lane < row_count:
+                span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+            tile_end = lanes.running_sum(span[1] - span[0])
+            tile_begin = tile_end - (span[1] - span[0])
+            tile_count = lanes.broadcast(tile_end, 31)
+            # a Gaussian's slots go on from where its rows of the last batch ended
+            first = wp.max(row_begin - batch, 0)
+            to_slot = lanes.broadcast(slot, owner) - lanes.broadcast(tile_begin, lanes.broadcast(first, owner))
+            to_key = lanes.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
+            limit = lanes.broadcast(end, owner)
+            done = int(0)
+            while done < tile_count:
+                at = lanes.holder(tile_end, done + lane)
+                to = done + lane + lanes.broadcast(to_slot, at)
+                key = done + lane + lanes.broadcast(to_key, at)
+                owner_of = lanes.broadcast(g, at)
+                if to < lanes.broadcast(limit, at) and done + lane < tile_count:
+                    write(to, key, owner_of, keys, slots, owners)
+                done += 32
+            written = lanes.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
+            written -= lanes.broadcast(tile_begin, wp.min(first, 31))
+            if row_begin < batch + 32 and row_end > batch and rows[1] > rows[0]:
+                slot += written
+            batch += 32
         # Two compilations of one formula may round apart, and then a margin tile is counted but not found again.
         while slot < end:
             write(slot, no_tile, i, keys, slots, owners)

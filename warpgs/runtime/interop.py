@@ -168,10 +168,11 @@ def _copied(struct):
 
 
 class _Recorded:
-    """A CUDA kernel with a launch that is recorded once and then only patched.
+    """A kernel with a launch that is recorded once and then only patched.
 
     ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
-    here take. The recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
+    here take, and at 140 us on a CPU of 2.6 GHz. The recorded launch keeps the packed arguments; a call writes pointers, sizes
+    and scalars into them.
     """
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
@@ -181,17 +182,21 @@ class _Recorded:
 
     def launch(self, count: int, inputs: Sequence, stream: wp.Stream) -> None:
         with self.lock:
-            if self.command is None:
-                load_module(self.kernel.module, self.device, self.block_dim)
-                own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
-                self.command = wp.launch(
-                    self.kernel, count, inputs=[0, *own], device=self.device, block_dim=self.block_dim, record_cmd=True
-                )
-                self.command.fwd_args = None  # else the first call's arrays would stay in memory
-                self.known = [None] * len(inputs)
-            else:
-                self._patch(count, inputs)
-            self.command.launch(stream)
+            self.patched(count, inputs).launch(stream)
+
+    def patched(self, count: int, inputs: Sequence) -> wp.Launch:
+        """Return the recorded launch with these arguments; the first call records it."""
+        if self.command is None:
+            load_module(self.kernel.module, self.device, self.block_dim)
+            own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
+            self.command = wp.launch(
+                self.kernel, count, inputs=[0, *own], device=self.device, block_dim=self.block_dim, record_cmd=True
+            )
+            self.command.fwd_args = None  # else the first call's arrays would stay in memory
+            self.known = [None] * len(inputs)
+        else:
+            self._patch(count, inputs)
+        return self.command
 
     def _patch(self, count: int, inputs: Sequence) -> None:
         command, known = self.command, self.known
@@ -227,6 +232,16 @@ def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
     return _Recorded(kernel, device, block_dim)
 
 
+class _OfThread(threading.local):
+    """Recorded launches of a thread on the CPU by kernel: threads launch one kernel at the same time, with other arguments."""
+
+    def __init__(self):
+        self.recorded: dict[object, _Recorded] = {}
+
+
+_OF_THREAD = _OfThread()
+
+
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
 
@@ -251,18 +266,25 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         with _current(device):
             _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
-    inputs = [a.array() if isinstance(a, View) else a for a in inputs]
-    with _LOADING:  # launches on a CPU are compiled for blocks of one thread
-        load_module(kernel.module, warp_device(device), 1)
-    threads = torch.get_num_threads()
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
-    debugging = wp.config.mode == "debug"
-    if threads == 1 or count == 1 or count * cost < SERIAL_WORK or debugging:
-        with _LOADING if debugging else contextlib.nullcontext():
-            wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_tape=False)
+    if wp.config.mode == "debug":
+        with _LOADING:
+            arrays = [a.array() if isinstance(a, View) else a for a in inputs]
+            load_module(kernel.module, warp_device(device), 1)
+            wp.launch(kernel, count, inputs=[0, *arrays], device="cpu", record_tape=False)
+        return
+    recorded = _OF_THREAD.recorded.get(kernel)
+    if recorded is None:
+        with _LOADING:  # launches on a CPU are compiled for blocks of one thread
+            recorded = _OF_THREAD.recorded[kernel] = _Recorded(kernel, device, 1)
+            first = recorded.patched(count, inputs)
+    else:
+        first = recorded.patched(count, inputs)
+    threads = torch.get_num_threads()
+    if threads == 1 or count == 1 or count * cost < SERIAL_WORK:
+        first.launch()
         return
     warn_if_spinning()
-    first = wp.launch(kernel, count, inputs=[0, *inputs], device="cpu", record_cmd=True)
     chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
     left = iter(range(chunks))  # threads take the next range when they are done with one
 

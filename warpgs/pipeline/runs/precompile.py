@@ -33,6 +33,7 @@ from warpgs.kernels import (
     step_buffers,
     tiles,
     tiles_emit,
+    tiles_emit_cpu,
 )
 from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
@@ -55,7 +56,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     real = wp.float32
     common = [
         (tiles.make_kernels(real, cuda).pack_counts, THREADS),
-        *((tiles_emit.make_emit(real, cuda, slotted), THREADS) for slotted in (True, False)),
+        *(((tiles_emit if cuda else tiles_emit_cpu).make_emit(real, slotted), THREADS) for slotted in (True, False)),
         *((tiles_emit.make_find_ranges(slotted), THREADS) for slotted in (True, False)),
         (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
         (camera_reach.make_kernel(), THREADS), (opacity_decay.make_kernel(), THREADS),
