@@ -79,7 +79,7 @@ def test_strategies_of_gsplat_are_driven(strategy, tmp_path, monkeypatch, capsys
     """Gaussians are added where gradients are large. The real classes are used where they are installed, and run."""
     if importlib.util.find_spec("gsplat") is None or (strategy == "MCMCStrategy" and not torch.cuda.is_available()):
         monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(**{strategy: StandIn}))
-    flags = ["--strategy", strategy, "--steps", "40", "--size", "40", "--out", str(tmp_path / "fitted.png")]
+    flags = ["--strategy", strategy, "--steps", "50", "--size", "40", "--out", str(tmp_path / "fitted.png")]
     assert run("09_gsplat_strategy", flags) > 3
     before, after = re.match(r"(\d+) -> (\d+) Gaussians", capsys.readouterr().out).groups()
     assert int(after) > int(before)
