@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from bench.lib import pareto, tradeoff_kernel
+from bench.lib import pareto, selected_rules, tradeoff_kernel
 from bench.lib.depth_order import depth_order
 from bench.lib.frozen import scenes
 from bench.lib.settings import UNCUT, Setting, settings
@@ -89,3 +89,22 @@ def test_fog_is_lost_under_the_cut():
     fog = next(f for f in (m() for m in scenes(CPU, 16, 12, 300, None, 0)) if f.name == "fog")
     assert float(Setting("t", "t", UNCUT).render(fog.gaussians, fog.camera).mean()) > 0.4
     assert float(Setting("e", "e").render(fog.gaussians, fog.camera).max()) == 0
+
+
+def test_selected_rules_keep_their_limits():
+    """In every small scene the true error is within the limit; haze that a rule drops is left to a slower one."""
+    rows = []
+    for scene in selected_rules.measured_scenes(24, 60, 1, None):
+        rows += selected_rules.measure(scene, 2)
+    assert {r["kind"] for r in rows} == {"haze", "needles", "far"} and len(rows) == 6 * (5 + 2)
+    kept = [r for r in rows if r["rule"] != "none"]
+    assert all(r["error"] <= r["bound"] <= r["limit"] for r in kept) and len(kept) > 30
+    assert {r["rule"] for r in rows if r["kind"] == "haze"} == {"fast", "balanced", "exact"}
+    (row,) = selected_rules.summary([r for r in rows if (r["kind"], r["measure"], r["limit"]) == ("haze", "mean", 1e-2)])
+    assert sum(row["rules"].values()) == 5 and row["rules"]["exact"] == 2 and row["typical"] <= row["worst"] <= 1e-2
+
+
+def test_a_limit_that_no_rule_keeps_counts_as_none():
+    """The summary leaves times and errors out where all scenes are refused."""
+    row = {"kind": "far", "measure": "max", "limit": 1e-4, "rule": "none", "time": None, "error": 1e-3, "pixel_max": 1e-3}
+    assert selected_rules.summary([row, row]) == [{"kind": "far", "measure": "max", "limit": 1e-4, "rules": {"none": 2}}]

@@ -79,10 +79,19 @@ def test_strategies_of_gsplat_are_driven(strategy, tmp_path, monkeypatch, capsys
     """Gaussians are added where gradients are large. The real classes are used where they are installed, and run."""
     if importlib.util.find_spec("gsplat") is None or (strategy == "MCMCStrategy" and not torch.cuda.is_available()):
         monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(**{strategy: StandIn}))
-    flags = ["--strategy", strategy, "--steps", "40", "--size", "40", "--out", str(tmp_path / "fitted.png")]
+    flags = ["--strategy", strategy, "--steps", "50", "--size", "40", "--out", str(tmp_path / "fitted.png")]
     assert run("09_gsplat_strategy", flags) > 3
     before, after = re.match(r"(\d+) -> (\d+) Gaussians", capsys.readouterr().out).groups()
     assert int(after) > int(before)
+
+
+def test_the_splatfacto_example_densifies_and_mends_its_cameras(tmp_path, capsys):
+    """Gaussians are added, and cameras that were turned come back most of the way."""
+    flags = ["--steps", "80", "--width", "48", "--count", "200", "--pose-noise", "1", "--out", str(tmp_path / "out.png")]
+    assert run("11_splatfacto", flags) > 4 and np.asarray(Image.open(tmp_path / "out.png")).std() > 5
+    printed = capsys.readouterr().out
+    before, after, first, last = map(float, re.match(r"(\d+) -> (\d+) G.*cameras (\S+) -> (\S+) degrees", printed).groups())
+    assert after > 1.2 * before and last < 0.6 * first, printed
 
 
 @pytest.mark.parametrize("name", ["02_fit_scene", "04_own_loss"])

@@ -73,12 +73,12 @@ def needles(count: int, seed: int) -> Gaussians:
     return _make(means, scales, _normal(g, count), _uniform(g, count, 3), _normal(g, count, 4))
 
 
-def fog(layers: int, seed: int) -> Gaussians:
-    """Layers that fill the image, each of alpha 0.0039, just below 1/255: 98 % opaque together, nothing after the cut."""
+def fog(layers: int, seed: int, alpha: float = 0.0039) -> Gaussians:
+    """Layers that fill the image; of alpha 0.0039, just below 1/255, they are 98 % opaque together, nothing after the cut."""
     g = torch.Generator().manual_seed(seed)
     means = torch.zeros(layers, 3, dtype=torch.float64)
     means[:, 2] = torch.linspace(2, 6, layers, dtype=torch.float64)
-    logits = torch.full((layers,), float(torch.logit(torch.tensor(0.0039, dtype=torch.float64))), dtype=torch.float64)
+    logits = torch.full((layers,), float(torch.logit(torch.tensor(alpha, dtype=torch.float64))), dtype=torch.float64)
     return _make(means, torch.full((layers, 3), 5.0, dtype=torch.float64), logits, _uniform(g, layers, 3))
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -170,7 +171,9 @@ def loaded(view: View, device: torch.device, scale: float) -> _Loaded:
     return _Loaded(*there, None if view.mask is None else torch.as_tensor(view.mask, device=device))
 
 
-def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float) -> dict:
+def train(
+    views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float, draw: Callable = render
+) -> dict:
     """Train from the positions and colours of the first Gaussians, and return gsplat's parameters in its own world.
 
     Args:
@@ -180,6 +183,7 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
         seed: Of torch, and of the order of views.
         scale: Length of our unit in gsplat's world.
         size: Size of the scene in gsplat's world.
+        draw: Rasterizer, with arguments and results of `render`.
     """
     device = first.means.device
     torch.manual_seed(seed)
@@ -193,7 +197,7 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
         order = order or torch.randperm(len(there)).tolist()
         view = there[order.pop()]
         height, width = view.image.shape[:2]
-        image, info = render(params, view.viewmat, view.K, width, height, min(step // s.sh_every, s.sh_degree))
+        image, info = draw(params, view.viewmat, view.K, width, height, min(step // s.sh_every, s.sh_degree))
         strategy.step_pre_backward(params=params, optimizers=optimizers, state=state, step=step, info=info)
         loss_of(image, view.image, view.mask, params, s).backward()
         for optimizer in optimizers.values():
@@ -205,7 +209,10 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
     return params
 
 
-def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed: int, own_units: bool = True):
+def fit(
+    scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed: int, own_units: bool = True,
+    draw: Callable = render,
+):  # fmt: skip
     """Train on views of a scene; return the parameters, and seconds, count, unit and size of the scene as figures of a row.
 
     Args:
@@ -215,6 +222,7 @@ def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed:
         s: Settings.
         seed: Of torch, and of the order of views.
         own_units: Scale the world as gsplat's parser does; else our units stay.
+        draw: Rasterizer, with arguments and results of `render`.
 
     Raises:
         UsageError: The scene is not over black, which is all that gsplat's trainer knows.
@@ -224,7 +232,7 @@ def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed:
     cameras, began = [view.camera for view in scene.views], time.perf_counter()
     unit = own_scale(cameras, scene.normalization) if own_units else 1.0
     size = scene_scale(cameras, unit)
-    params = train(views, first, s, seed=seed, scale=unit, size=size)
+    params = train(views, first, s, seed=seed, scale=unit, size=size, draw=draw)
     if first.means.is_cuda:
         torch.cuda.synchronize(first.means.device)
     row = {"points": len(first), "gaussians": len(params["means"]), "unit": unit, "scene_scale": size}
@@ -232,11 +240,12 @@ def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed:
 
 
 @torch.no_grad()
-def image_of(params, view: View, scale: float) -> np.ndarray:
-    """Return gsplat's image of a view in [0, 1], shape [H, W, 3], all coefficients in use."""
+def image_of(params, view: View, scale: float, draw: Callable = render) -> np.ndarray:
+    """Return the image of a view in [0, 1], shape [H, W, 3], all coefficients in use."""
     there = loaded(view, params["means"].device, scale)
     degree = math.isqrt(params["shN"].shape[1] + 1) - 1
-    return render(params, there.viewmat, there.K, view.camera.width, view.camera.height, degree)[0].clamp(0, 1).cpu().numpy()
+    size = (view.camera.width, view.camera.height)
+    return draw(params, there.viewmat, there.K, *size, degree)[0].clamp(0, 1).cpu().numpy()
 
 
 def compile_kernels(device: torch.device) -> None:
