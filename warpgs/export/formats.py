@@ -1,4 +1,4 @@
-"""Reading and writing of Gaussians in the format that a file's name says, or in one that is given."""
+"""Reading and writing of Gaussians in the format of a file's suffix, or in a given one."""
 
 from __future__ import annotations
 
