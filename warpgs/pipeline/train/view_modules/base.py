@@ -57,7 +57,7 @@ class ViewModule:
     """
 
     name: ClassVar[str] = ""
-    """Its name in the registry."""
+    """Name in the registry."""
 
     def check(self, views: Sequence[View]) -> None:
         """Check, before anything takes time, that the training views can have the parameters.
