@@ -23,7 +23,7 @@ html_theme = "furo"
 html_title = f"warpgs {release}"
 html_math_renderer = "mathml"
 html_static_path = ["static"]
-html_css_files = ["maths.css"]
+html_css_files = ["maths.css", "pages.css"]
 html_show_sourcelink = False
 html_copy_source = False
 

@@ -260,7 +260,7 @@ def test_counts_beyond_the_size_are_refused(tmp_path):
     refused(tmp_path / "a.spz", bomb, f"100000 Gaussians in {len(bomb)} bytes")
     lines = ["ply", "format binary_little_endian 1.0", "element chunk 99999999999", "property float min_x"]
     lines += ["element vertex 1", "property uint packed_position", "end_header\n"]
-    refused(tmp_path / "a.compressed.ply", "\n".join(lines).encode(), "cut short")
+    refused(tmp_path / "a.compressed.ply", "\n".join(lines).encode(), "truncated")
 
 
 def test_bombs_of_zstd(tmp_path):

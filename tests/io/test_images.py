@@ -173,7 +173,7 @@ def test_undistortion_agrees_with_the_analytic_image(terms, tmp_path):
     inner = (du >= 0.5) & (du <= width - 0.5) & (dv >= 0.5) & (dv <= height - 0.5)
     assert np.abs(loaded.image - smooth(u, v))[inner].max() < 0.004
     np.testing.assert_array_equal(loaded.K, K)
-    assert loaded.done == ("freed of lens distortion (OPENCV)",)
+    assert loaded.done == ("undistorted (OPENCV)",)
     if terms[0] > 0.08:  # pincushion: the corners of the pinhole lie outside the loaded
         assert not mask[0, 0] and mask[24, 32]
 
@@ -209,7 +209,7 @@ def test_colmap_models(model, parameters, terms, files, tmp_path):
 
 def test_distortion_is_noted_once_per_model(tmp_path):
     scene = load_scene(scenes.write_colmap(tmp_path, model="SIMPLE_RADIAL", parameters=(20, 8, 6, 0.5)))
-    assert "5 images freed of lens distortion (SIMPLE_RADIAL)" in scene.notes
+    assert "5 images undistorted (SIMPLE_RADIAL)" in scene.notes
     assert scene.views[0].mask is not None
 
 

@@ -214,7 +214,7 @@ def test_no_image_of_a_run_is_read_through_a_link(window, tmp_path, monkeypatch,
     monkeypatch.setattr(window.panel, "explain", told.append)
     button = SimpleNamespace(on_click=pressed.append)
     monkeypatch.setattr(window.panel.server.gui, "add_button", lambda *_, **__: button)
-    window.panel._add_importance()
+    window.panel._add_sampling()
     pressed[0](SimpleNamespace(client=SimpleNamespace(gui=SimpleNamespace(add_modal=lambda _: shown.append(1)))))
     assert not shown and len(told) == 1 and "is a link" in told[0]
 

@@ -38,7 +38,7 @@ class Format:
     """A file format of Gaussians. One of your own derives from this and defines `encode`, `decode` or both."""
 
     name: ClassVar[str] = ""
-    """Name that it is registered by."""
+    """Name in the registry."""
     suffix: ClassVar[str] = ""
     """End of the names of its files in lower case, with the dot, such as ``.spz``."""
     description: ClassVar[str] = ""

@@ -93,7 +93,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The file is malformed, cut short, or for another way of rendering.
+        DataError: The file is malformed, truncated, or for another way of rendering.
     """
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     tables = {}
@@ -171,7 +171,7 @@ def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.nd
     dtype = np.dtype(element.properties)
     end = start + element.count * dtype.itemsize
     if end > len(data):
-        raise malformed(path, f"cut short: {element.count} rows of {element.name[:40]!r} end at byte {end}, it has {len(data)}")
+        raise malformed(path, f"truncated: {element.count} rows of {element.name[:40]!r} end at byte {end}, it has {len(data)}")
     return np.frombuffer(data, dtype, element.count, start), end
 
 

@@ -1,4 +1,4 @@
-"""Reading and writing of Gaussians in the format that a file's name says, or in one that is given."""
+"""Reading and writing of Gaussians in the format of a file's suffix, or in a given one."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def read_gaussians(
         N Gaussians, torch float32 tensors on the CPU.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, cut short, announces more than its size can hold, or holds a
+        warpgs.errors.DataError: The file is missing, malformed, truncated, announces more than its size can hold, or holds a
             NaN, an infinity or a rotation of zero length.
         warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units come without a
             normalization.

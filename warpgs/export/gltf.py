@@ -112,7 +112,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY.
 
     Raises:
-        DataError: The file is malformed or cut short, needs another file, or has a kernel, colour space, transformation or
+        DataError: The file is malformed or truncated, needs another file, or has a kernel, colour space, transformation or
             number of Gaussian primitives that this program does not read.
     """
     document, body = _split(path, data)
@@ -191,7 +191,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
     body: bytes | memoryview = b""
     if data[:4] == b"glTF":
         if len(data) < 20:
-            raise malformed(path, "its header is cut short")
+            raise malformed(path, "its header is truncated")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
         if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
             raise malformed(path, f"its header announces {total} bytes, it has {len(data)}")
@@ -199,7 +199,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)
             if kind != BINARY_CHUNK or size > len(rest) - 8:
-                raise malformed(path, f"its binary part of {size} bytes is cut short")
+                raise malformed(path, f"its binary part of {size} bytes is truncated")
             body = rest[8 : 8 + size]
     else:
         text = data
@@ -217,7 +217,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
 
 
 def _inside(path: Path, uri: object) -> bytes:
-    """Return the bytes of a data URI; every other one is refused, since a file must not say which others are opened."""
+    """Return the bytes of a data URI; other URIs are refused, so that a file cannot choose other files to open."""
     head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
     if not (head.startswith("data:") and head.endswith(";base64") and comma):
         raise malformed(path, "its numbers are in another file, which is not opened; make one .glb of both")

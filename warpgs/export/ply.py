@@ -98,7 +98,7 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, cut short, or holds a NaN, another infinity or a rotation
+        warpgs.errors.DataError: The file is missing, malformed, truncated, or holds a NaN, another infinity or a rotation
             of zero length; the message names the place.
         warpgs.errors.UsageError: The units are unknown, or scene units are asked for without a normalization.
     """
@@ -123,14 +123,14 @@ def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussi
             if end > size:
                 raise ply_error(
                     path,
-                    f"cut short: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
+                    f"truncated: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
                 )
             file.seek(start)
 
             def rows(part: slice) -> np.ndarray:
                 found = np.fromfile(file, dtype=dtype, count=part.stop - part.start)
                 if len(found) != part.stop - part.start:
-                    raise ply_error(path, f"cut short: {vertex.count} Gaussians announced, {part.start + len(found)} read")
+                    raise ply_error(path, f"truncated: {vertex.count} Gaussians announced, {part.start + len(found)} read")
                 return found
 
             gaussians = _assemble(path, rows, vertex.count, rest)

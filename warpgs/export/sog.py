@@ -160,7 +160,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
     """Return the Gaussians of an open file, of which no more is read than its Gaussians can take.
 
     Raises:
-        DataError: The file is malformed, cut short, or announces more than its size can hold.
+        DataError: The file is malformed, truncated, or announces more than its size can hold.
     """
     size = file.seek(0, os.SEEK_END)
     _check_contents(path, file, size)

@@ -129,20 +129,20 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes, in the axes of PLY.
 
     Raises:
-        DataError: The file is malformed, cut short, or announces more than its size can hold.
+        DataError: The file is malformed, truncated, or announces more than its size can hold.
         UsageError: It is of version 4, and zstandard is not installed.
     """
     if data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
         head = _inflated(path, stream, HEADER.size)
         if len(head) < HEADER.size:
-            raise malformed(path, "its header is cut short")
+            raise malformed(path, "its header is truncated")
         magic, version, n, degree, bits, _, _ = HEADER.unpack(head)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (2, 3))
         sections = _parts_of_gzip(path, stream, n, sizes)
     else:
         if len(data) < HEADER_4.size:
-            raise malformed(path, "its header is cut short")
+            raise malformed(path, "its header is truncated")
         magic, version, n, degree, bits, _, count, place = HEADER_4.unpack_from(data)
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
         sections = _streams(path, data, sizes, count, place)

@@ -103,7 +103,7 @@ class GivenMaps:
         known = normals.any(-1)
         away = float((along[known] > 0).mean()) if known.any() else 1.0
         if not known.any():
-            raise DataError(f"{path}: no normal is left of it in the pixels that count; remove the file, a view needs none")
+            raise DataError(f"{path}: no pixel that counts has a normal; remove the file, normals are optional")
         if away > 0.5:
             other = "opencv" if self.options.normal_axes == "opengl" else "opengl"
             raise DataError(

@@ -179,7 +179,7 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     alpha = None
     if loaded.alpha is not None:
         alpha = cv2.remap(loaded.alpha, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    done = (*loaded.done, f"freed of lens distortion ({lens.model})")
+    done = (*loaded.done, f"undistorted ({lens.model})")
     return LoadedImage(image, None if inside.all() else inside, loaded.K, done, alpha, loaded.kept)
 
 

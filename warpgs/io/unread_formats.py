@@ -1,4 +1,4 @@
-"""Formats of photographs that are known and not read, and what to do with them.
+"""Unsupported formats of photographs, and remedies.
 
 HEIC is read where cameras are found (`warpgs.poses.heic`). RAW is left to a converter, where colour and exposure are chosen for
 all photographs alike.
@@ -17,7 +17,7 @@ RAW = "a camera's RAW file, which is not read: develop all of them alike to JPEG
 
 
 def unread_format(path: Path, head: bytes) -> str | None:
-    """Return the words on a photograph that is known and not read, as the end of a sentence; None for any other file.
+    """Return a remedy for a photograph of an unsupported format, as the end of a sentence; None for any other file.
 
     Args:
         path: Name of the file; the suffix decides for RAW alone.

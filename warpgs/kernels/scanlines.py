@@ -13,7 +13,7 @@ BLOCK = 32
 FAR_AWAY = 2**20
 """Number above every path cost."""
 LARGEST = 2**13 - 1
-"""Largest cost plus penalties for which the sum of four paths fits into 16 bits with a sign."""
+"""Largest cost plus penalties: the sum of four paths then fits into signed 16 bits."""
 
 
 @functools.cache

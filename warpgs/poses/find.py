@@ -228,7 +228,7 @@ def _notes(photographs: list[Photograph]) -> list[str]:
     """Return notes on assumptions about the photographs."""
     cameras = cameras_of(photographs, camera_groups(photographs))
     known = sum(c.focal is not None for c in cameras)
-    source = "from EXIF" if known == len(cameras) else "unknown to EXIF" if not known else f"from EXIF for {known} of them"
+    source = "from EXIF" if known == len(cameras) else "not in EXIF" if not known else f"from EXIF for {known} of them"
     many = "one camera is" if len(cameras) == 1 else f"{len(cameras)} cameras, one for each device, lens and image size, are"
     notes = [f"{many} assumed, focal length {source}"]
     turned = sum(p.orientation != 1 for p in photographs)

@@ -42,7 +42,7 @@ def read_flo(path: Path) -> np.ndarray:
     """Return the flow of a Middlebury file, float32, shape [H, W, 2]; NaN where unknown.
 
     Raises:
-        DataError: The file is missing, of another kind, or cut short.
+        DataError: The file is missing, of another kind, or truncated.
     """
     try:
         raw = read_input(path, 12 + 8 * MAX_FLOW_PIXELS)

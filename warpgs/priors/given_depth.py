@@ -24,7 +24,7 @@ MAX_RATIO = 1.25
 NEAR = 0.05
 """Relative difference of depths up to which they count as one surface."""
 GOOD, MIN_GOOD = 0.1, 0.5
-"""Relative difference of a fitted map from a reference that counts as good, and the least fraction of good ones."""
+"""Largest relative difference from a reference of a good value of a fitted map, and the least fraction of good values."""
 EXACT = 0.015
 """Median difference up to which a fitted map is taken for as good as a metric one; a network's is larger."""
 MIN_CONFIDENCE = 0.5

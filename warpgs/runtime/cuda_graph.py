@@ -158,7 +158,7 @@ class GraphPool:
 
 
 class GraphedFunction:
-    """A function of tensors that is captured for each set of addresses that it meets, up to MAX_GRAPHS."""
+    """A function of tensors, captured as a graph for each set of their addresses, up to MAX_GRAPHS."""
 
     def __init__(self, function: Callable[..., tuple[torch.Tensor, ...]], graphs: GraphPool):
         """Prepare the function; nothing is captured yet.

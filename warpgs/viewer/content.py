@@ -37,7 +37,7 @@ class Content:
     views: Mapping[str, View] = field(default_factory=dict)
     """Views by name, with their photographs; none where the scene cannot be read."""
     sheet: Path | None = None
-    """PNG that shows where importance placed Gaussians, or None."""
+    """PNG that shows where fine Gaussians were placed, or None."""
 
     def saved(self, name: str) -> Path:
         """Return the path of a file that is saved from the viewer."""

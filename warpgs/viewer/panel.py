@@ -62,7 +62,7 @@ class Panel:
         for control in (self._kind, self._degree, self._layer, self._cameras):
             control.on_update(guarded(lambda _: self.window.redraw()))
         self._add_stepping()
-        self._add_importance()
+        self._add_sampling()
         self._add_crop()
         self._add_keyframes()
         self.tell(content)
@@ -114,8 +114,8 @@ class Panel:
 
             chooser.on_update(guarded(step))
 
-    def _add_importance(self) -> None:
-        """Offer the fit's own image of where importance placed Gaussians."""
+    def _add_sampling(self) -> None:
+        """Offer the fit's own image of where fine Gaussians were placed."""
         sheet, run = self.content.sheet, self.content.stem
         if sheet is None:
             return
@@ -125,11 +125,11 @@ class Panel:
                 image = np.round(255 * decode(sheet, data=read_file(sheet, run))[0]).astype(np.uint8)
             except WarpgsError as e:
                 return self.explain(str(e))
-            with event.client.gui.add_modal("Where importance placed Gaussians") as modal:
+            with event.client.gui.add_modal("Where fine Gaussians were placed") as modal:
                 event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
-        self.server.gui.add_button("importance", hint="views of a sampling event of the fit").on_click(guarded(show))
+        self.server.gui.add_button("sampling", hint="where the fit placed fine Gaussians").on_click(guarded(show))
 
     def _add_crop(self) -> None:
         """Offer a box that is moved and turned by its handles, and saved."""

@@ -42,7 +42,7 @@ def _refuses_others(port: int) -> bool:
 
 
 def _control_of(server: viser.ViserServer, uuid: str) -> Any:
-    """Return the control with an identifier; None for those of one browser, which are buttons."""
+    """Return the shared control with an identifier; None for buttons of a single browser."""
     return server.gui._gui_input_handle_from_uuid.get(uuid)  # viser has no public way to it
 
 

@@ -131,7 +131,7 @@ def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
 def _outcome(
     request: FitRequest, record: dict[str, Any] | None, gap: str, why: str, variants: dict[str, str], others: dict[str, Any]
 ) -> Outcome:
-    """Return the outcome of `ensure_run`, or raise what keeps it from beginning."""
+    """Return the outcome of `ensure_run`, or raise the error that prevents a start."""
     folder, note, state, resume = request.out, "", "fitted", False
     if record is not None:
         # the report is what a fit writes last

@@ -47,7 +47,7 @@ class Rendered(NamedTuple):
     rgb: np.ndarray
     """Colours, shape [H, W, 3]."""
     depth: np.ndarray
-    """z-depth [u], 0 where nothing is; shape [H, W]."""
+    """z-depth [u], 0 for empty pixels; shape [H, W]."""
     alpha: np.ndarray
     """Opacity in [0, 1], shape [H, W]."""
 

@@ -20,7 +20,7 @@ from warpgs.scene import Scene
 CPU_MAX_SIDE = 800
 """Longest side of an image [px] that a fit on a CPU keeps where the user names neither a factor nor a side: four times as
 many steps fit into its time, and held-out PSNR at full size rises (decision 018)."""
-NO_SCORES = "scores: none, every photograph was trained on; --split every:8 holds some out"
+NO_SCORES = "no scores: all photographs train; --split every:8 holds some out"
 """Sentence on a fit without held-out views, with the way to scores."""
 
 

@@ -73,7 +73,7 @@ class LossTerm:
     """One term of the loss. A term of your own is a frozen dataclass that derives from this; its fields are its settings."""
 
     name: ClassVar[str] = ""
-    """Name that it is registered by."""
+    """Name in the registry."""
     needs_outputs: ClassVar[tuple[str, ...]] = ("rgb",)
     """Images of the render that the term reads (`LossInputs.outputs`). Gradients are computed for those that a term reads."""
     needs_priors: ClassVar[bool] = False

@@ -322,7 +322,8 @@ class Trainer:
         if stopping.ended == step:
             self.set_views(stopping.whole)
             stopping.whole = self.views
-            self.messages.append(f"early stopping: held-out pixels no longer improve; {self.steps:,} steps in all")
+            if self.steps < self.phases.planned:
+                self.messages.append(f"early stopping: held-out pixels no longer improve; {self.steps:,} steps in all")
             words = f"stopping: growth ended at step {step} with {len(self.table):,} Gaussians, because {stopping.why}"
             self.messages.append(Detail(f"{words}; all pixels are trained on from here"))
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)

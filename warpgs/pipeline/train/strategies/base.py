@@ -28,7 +28,7 @@ class Strategy:
     """
 
     name: ClassVar[str] = ""
-    """Name that it is registered by."""
+    """Name in the registry."""
     Config: ClassVar[type | None] = None
     """Frozen dataclass of its own settings, None for none. They become flags, grouped under the strategy's name."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)

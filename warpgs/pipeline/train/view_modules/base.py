@@ -57,7 +57,7 @@ class ViewModule:
     """
 
     name: ClassVar[str] = ""
-    """Name that it is registered by."""
+    """Name in the registry."""
 
     def check(self, views: Sequence[View]) -> None:
         """Check, before anything takes time, that the training views can have the parameters.
