@@ -16,7 +16,9 @@ from warpgs.viewer.html import SORT_FROM_DISK, write_html
 pytest.importorskip("viser")
 WIDTH, HEIGHT = 700, 600
 SHOWN = np.s_[200:, :]
-"""Rows without the browser's remark on software rendering and the page's own button."""
+"""Rows without the page's own button."""
+CORNER = np.s_[:160, :320]
+"""Place of viser's remark on software rendering, in white letters, which the page hides."""
 MILLISECONDS = 30_000
 """The browser's own time until the picture is taken: Gaussians fade in."""
 
@@ -79,6 +81,7 @@ def test_a_page_from_disk_shows_the_render(tmp_path):
     image, console = shot(path, tmp_path)
     assert image.shape == wanted.shape and wanted[SHOWN].std() > 0.1
     assert psnr(image, wanted) > 22, psnr(image, wanted)
+    assert image[CORNER].min(-1).max() < 0.4  # no white letters
     assert "Content Security Policy" not in console and "Refused" not in console, console
     path.write_text(path.read_text("utf-8").replace(SORT_FROM_DISK, ""), "utf-8")
     unsorted, console = shot(path, tmp_path)

@@ -33,6 +33,8 @@ POLICY = (
     "img-src data: blob:; font-src data:; worker-src blob: data:; connect-src data: blob:; base-uri 'none'; form-action 'none'"
 )
 """Content security policy of the page: it may use its own contents, and request nothing."""
+NO_REMARKS = "<style>.mantine-Notifications-root{display:none}</style>"
+"""Style that hides viser's remark on browsers without a GPU, which stood before the model."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
@@ -93,7 +95,7 @@ def page_of(
     finally:
         stop_server(server)
     head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
-    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}"
+    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
     notes = ["the page shows colours without view dependence; the run and its PLY keep them"]
     if gaussians.sh_degree == 0:

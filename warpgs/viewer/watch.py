@@ -171,7 +171,7 @@ def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
     """
     server = open_server(port)
     try:
-        say(f"watch the fit at {address(server)}; afterwards run `warpgs view {folder}`")
+        say(f"watch the fit at {address(server)} (afterwards with `warpgs view {folder}`)")
         live = LiveView(server, folder.resolve().name, folder)
         try:
             yield live
