@@ -17,6 +17,7 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
+from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
 
 BASE = ["SCENE", "--out", "RUN"]
 SCENE_FIELDS = {"split", "downscale", "max_side", "masks", "depths"}
@@ -95,7 +96,12 @@ def test_flags_and_their_defaults_are_those_of_the_parser(flag, word, default):
     request = request_of(BASE, "")
     name = flag.removeprefix("--").replace("-", "_")
     owner = request.scene if name in SCENE_FIELDS else request if name in ("device", "resume") else request.config
-    value = request.view_port is not None if name == "view" else getattr(owner, name)
+    if name == "view":
+        value = request.view_port is not None
+    elif name in VIEW_MODULES.names():
+        value = name in [m.name for m in request.config.view_modules]
+    else:
+        value = getattr(owner, name)
     assert default == ("" if value is None else str(value)) and (word == "") == isinstance(value, bool)
     if not word:
         assert request_of([*BASE, flag], "") != request

@@ -14,6 +14,8 @@ FLAGS = (
     ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
     ("--masks", "HOW", "ignore", "masked out: ignore it, or cutout: transparent"),
     ("--depths", "FOLDER", "", "depth maps, named as the images (docs/scenes.md)"),
+    ("--exposure", "", "False", "learn brightness and colour of each photograph"),
+    ("--refine-poses", "", "False", "correct slightly wrong poses while training"),
     ("--resume", "", "False", "continue the run in --out from its last checkpoint"),
     ("--view", "", "False", "watch in a browser while it trains"),
 )

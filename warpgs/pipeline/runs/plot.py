@@ -17,6 +17,7 @@ from warpgs.pipeline.films.rig import Rig, rig_of
 from warpgs.pipeline.model.coverage import coverage
 from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.report.progress import waiting
 from warpgs.report.scene_plot import ScenePlot, render_plot
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Camera
@@ -116,7 +117,8 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     out = folder / PLOT if out is None else out
     if out.suffix.lower() != ".png":
         raise UsageError(f"{out}: a plot is a .png file; name one")
-    stored = open_run(folder, device_name)
+    stored, tell = open_run(folder, device_name), waiting()
+    tell("rendering depth")
     cameras = stored.cameras()
     train, test = ([cameras[n] for n in names] for names in (stored.train, stored.test))
     depth, _ = depth_and_coverage(stored.gaussians(), train, stored.options())
@@ -132,6 +134,7 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
     axes = None if axes is None else axes[chosen]
     contents = ScenePlot(points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend)
+    tell("drawing the plot")
     data = render_plot(contents, settings.size, settings.background)
     with hold_folder(out.parent) as held:
         write_bytes(out, data)
