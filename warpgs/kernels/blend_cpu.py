@@ -36,7 +36,6 @@ def make_forward(real, tile_size: int, channels: int):
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(channels * STRIP, real)
     batch_channels = wp.types.vector(channels * BATCH, real)
-    count_of_channels = wp.constant(channels)
     place_z = wp.constant(6 + channels)
     tile_stride = wp.constant(tile_size * (tile_size + 1))
     side = wp.constant(tile_size)
