@@ -36,7 +36,6 @@ def make_forward(real, tile_size: int, channels: int):
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(channels * STRIP, real)
     batch_channels = wp.types.vector(channels * BATCH, real)
-    count_of_channels = wp.constant(channels)
     place_z = wp.constant(6 + channels)
     tile_stride = wp.constant(tile_size * (tile_size + 1))
     side = wp.constant(tile_size)
@@ -78,6 +77,20 @@ def make_forward(real, tile_size: int, channels: int):
         """Add the channels of a Gaussian to the sums of a pixel of a strip."""
         for c in range(wp.static(channels)):
             strip_sums[c * strip + lane] = at(strip_sums[c * strip + lane]) + w * at(color[c * batch + j])
+
+    @wp.func(inline=True)
+    def add_background(
+        camera: wp.int32, p: wp.int32, t: real, backgrounds: wp.array2d(dtype=real), sums: wp.ref[tile_channels]
+    ):
+        """Add the background to the sums of a pixel."""
+        for c in range(wp.static(channels)):
+            sums[c * tile_stride + p] = at(sums[c * tile_stride + p]) + t * backgrounds[camera, c]
+
+    @wp.func(inline=True)
+    def store_channels(o: wp.int32, p: wp.int32, sums: wp.ref[tile_channels], rgb: wp.array2d(dtype=real)):
+        """Store the channels of a pixel."""
+        for c in range(wp.static(channels)):
+            rgb[o, c] = at(sums[c * tile_stride + p])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
@@ -237,17 +250,40 @@ def make_forward(real, tile_size: int, channels: int):
             if left_open == 0:
                 first = last
 
-        for row in range(wp.min(side, settings.height - top)):
-            for lane in range(wp.min(side, settings.width - left)):
-                p = row * side + lane
-                o = (camera * settings.height + top + row) * settings.width + left + lane
-                for c in range(count_of_channels):
-                    rgb[o, c] = sums[c * tile_stride + p] + t[p] * backgrounds[camera, c]
-                alpha_out[o] = real(1.0) - t[p]
-                depth[o] = wp.where(total[p] >= smallest, z[p] / total[p], real(0.0))
-                transmittances[o] = t[p]
-                weights[o] = total[p]
-                ends[o] = end[p]
+        for p in range(pixels):
+            add_background(camera, p, t[p], backgrounds, sums)
+            z[p] = wp.where(total[p] >= smallest, z[p] / total[p], real(0.0))
+        rows = wp.min(side, settings.height - top)
+        across = wp.min(side, settings.width - left)
+        row = int(0)
+        while row < rows:
+            first_pixel = (camera * settings.height + top + row) * settings.width + left
+            o = wp.max(first_pixel, 0)
+            p = wp.max(row * side, 0)
+            row += 1
+            if across == side:
+                for lane in range(side):
+                    alpha_out[o + lane] = real(1.0) - t[p + lane]
+                    depth[o + lane] = z[p + lane]
+                    transmittances[o + lane] = t[p + lane]
+                    weights[o + lane] = total[p + lane]
+                    ends[o + lane] = end[p + lane]
+            else:
+                lane = int(0)
+                while lane < across:
+                    alpha_out[o + lane] = real(1.0) - t[p + lane]
+                    depth[o + lane] = z[p + lane]
+                    transmittances[o + lane] = t[p + lane]
+                    weights[o + lane] = total[p + lane]
+                    ends[o + lane] = end[p + lane]
+                    lane += 1
+            lane = int(0)
+            while lane < across:
+                at_pixel = first_pixel + lane
+                if at_pixel < 0:
+                    break  # never; but vectorised, these stores would be slow scatters
+                store_channels(at_pixel, wp.max(p + lane, 0), sums, rgb)
+                lane += 1
 
     return forward
 

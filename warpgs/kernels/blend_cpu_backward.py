@@ -14,7 +14,7 @@ from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.blend_batch import BATCH, make_batches
 from warpgs.kernels.blend_records import COLORS, VALUES, make_records
 from warpgs.kernels.compiler import ROLLED
-from warpgs.kernels.falloff import STRIP, make_functions
+from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 
 @functools.cache
@@ -105,7 +105,9 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
     parts = wp.constant(tile_size // STRIP)
     bits = wp.constant(tile_size * (tile_size // STRIP) - 1)
     row_bits = wp.constant(tile_size - 1)
+    column_bits = wp.constant(tile_size * STRIP - 1)
     half = wp.constant(STRIP // 2)
+    abreast = wp.constant(ABREAST)
     at = b.at
     at_int = b.at_int
 
@@ -144,19 +146,32 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
         """Walk back past a Gaussian: find its weights and the gradients of its falloff, and what lies before it."""
         u11 = at(g.u11[j])
         opacity = at(g.opacity[j])
+        e1 = f.abreast()
+        e22 = f.abreast()
         for part in range(parts):
             row = at_int(g.begin[part * batch + j])
             end = at_int(g.end[part * batch + j])
             at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - at(g.x[j])))
+            # Falloffs apart, several strips at a time: each is a long chain of operations that wait for one another.
+            k = int(0)
+            while k < end - row:
+                for lane in range(strip):
+                    for n in range(abreast):
+                        e1[n] = at_left + at(rows.e12[(row + k + n) & row_bits]) + at(rows.ramp[lane])
+                        e22[n] = at(rows.e22[(row + k + n) & row_bits])
+                    found = f.falloffs(wp.cw_mul(e1, e1) + e22)
+                    for n in range(abreast):
+                        shades.falloff[(k + n) * strip + lane] = found[n]
+                k += abreast  # the last few may lie beyond the end; their values are not read
+            k = int(0)
             while row < end:
                 o = (part * side + row) & bits
-                start = at_left + at(rows.e12[row & row_bits])
-                e22 = at(rows.e22[row & row_bits])
+                q = k & column_bits
                 row += 1
+                k += strip
                 for lane in range(strip):
                     p = o * strip + lane
-                    e1 = start + at(rows.ramp[lane])
-                    falloff = f.falloff(e1 * e1 + e22)
+                    falloff = at(shades.falloff[q + lane])
                     raw = opacity * falloff
                     alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
                     blended = alpha >= settings.alpha_cut and instance < at_int(pixels.end[p])

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpgs.kernels.falloff import STRIP
+from warpgs.kernels.falloff import ABREAST, STRIP
 
 COLORS = 3
 """Channels of a projected Gaussian as `project` makes it: a colour."""
@@ -25,6 +25,7 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     """
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
+    column_reals = wp.types.vector((tile_size + ABREAST) * STRIP, real)
     strip_reals = wp.types.vector(STRIP, real)
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
@@ -44,6 +45,7 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     class Shades:
         """Gradient and weight of the current instance at each pixel that it reaches."""
 
+        falloff: column_reals  # of one column of strips, and of a few rows beyond it
         v: tile_reals  # gradient of the falloff
         w: tile_reals  # blending weight
 
