@@ -76,6 +76,29 @@ def test_pictures_and_gradients_equal_reference(device, dtype, rule, tile_size):
         close("gradient", t.grad, reference_leaf.grad)
 
 
+@pytest.mark.parametrize("given", ["rgb", "rgb alpha", "rgb depth", "alpha", "depth"])
+@pytest.mark.parametrize(("tile_size", "absgrad"), [(16, False), (16, True), (8, False)])
+def test_gradients_of_some_images(device, dtype, tile_size, absgrad, given):
+    """Colour alone runs a kernel without depth and alpha: the bits are those of gradients of zero for what is not given."""
+    gaussians, cam = hand_placed(dtype, device), camera(33, 21, cameras=2, dtype=dtype, device=device)
+    background = backgrounds(2, dtype, device)
+    *_, record, tiles = drawn(gaussians, cam, background, SMOOTH, tile_size, degree=3)
+    record, size = record.detach().requires_grad_(), {"width": 33, "height": 21, "rule": SMOOTH, "absgrad": absgrad}
+    images = dict(zip(("rgb", "alpha", "depth"), blend(record, tiles, background, **size)))
+    generator = torch.Generator().manual_seed(7)
+    upstream = {n: torch.randn(i.shape, generator=generator, dtype=torch.float64).to(i) for n, i in images.items()}
+    own = given.split()
+    (found,) = torch.autograd.grad([images[n] for n in own], record, [upstream[n] for n in own], retain_graph=True)
+    (whole,) = torch.autograd.grad(list(images.values()), record, [upstream[n] * (n in own) for n in images])
+    assert bool(found[..., :6].any())
+    assert bool(found[..., 6:9].any()) == ("rgb" in own) and bool(found[..., 9].any()) == ("depth" in own)
+    if device.type == "cpu":
+        assert torch.equal(found, whole)
+    close("gradient", found, whole)
+    if absgrad:
+        assert bool((found[..., 10:] * (1 + 1e-5) >= found[..., :2].abs()).all()) and bool(found[..., 10:].any())
+
+
 @pytest.mark.parametrize("cameras", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_gradcheck(device, cameras):
     """Finite differences agree with the backward kernel for every value of a projected Gaussian and for the background."""
