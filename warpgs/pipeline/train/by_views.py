@@ -28,6 +28,9 @@ cannot tell a colour that changes with direction from an error of the shape."""
 OPACITIES_DECAY, SPARSE_VIEWS = 0.001, 9
 """Fraction of every opacity that a step takes up to so many opaque views, with one layer; with more, or where views know their
 opacity, it takes none, and there are two layers: neither was measured there (docs/decisions/023-opacity-decay.md)."""
+SMOOTH_WEIGHT, SMOOTH_VIEWS = 1.0, 4
+"""Weight of the roughness of rendered depth up to so many opaque views; with more, or where views know their opacity, there is
+no such term (docs/decisions/024-smooth-depth.md)."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
@@ -66,7 +69,10 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if optimizer.opacities_lr is None:
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
-    few = views <= SPARSE_VIEWS and all(v.alpha is None for v in train)
+    opaque = all(v.alpha is None for v in train)
+    few, loss = views <= SPARSE_VIEWS and opaque, config.loss
+    if loss.smooth_weight is None:
+        loss = dataclasses.replace(loss, smooth_weight=SMOOTH_WEIGHT if views <= SMOOTH_VIEWS and opaque else 0.0)
     if optimizer.opacities_decay is None:
         optimizer = dataclasses.replace(optimizer, opacities_decay=OPACITIES_DECAY if few else 0.0)
     method = config.method
@@ -87,6 +93,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
         f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
+        f"smooth_weight {loss.smooth_weight:g}": config.loss.smooth_weight,
         "two layers" if method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
@@ -103,5 +110,12 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
                 f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
                 f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
             )
-    chosen_parts = {"steps": steps, "sh_degree": degree, "half_resolution": half, "optimizer": optimizer, "method": method}
+    chosen_parts = {
+        "steps": steps,
+        "sh_degree": degree,
+        "half_resolution": half,
+        "optimizer": optimizer,
+        "method": method,
+        "loss": loss,
+    }
     return dataclasses.replace(config, **chosen_parts), notes
