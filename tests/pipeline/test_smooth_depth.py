@@ -2,11 +2,27 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import pytest
 import torch
 
-from tests.scenes import photos
+from tests.pipeline.test_memory_plan import STEADY, instances, measured
+from tests.pipeline.test_normals_example import same_bits
+from tests.scenes import photos, seeds
+from warpgs.errors import UsageError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.by_views import SMOOTH_VIEWS, settings_by_views
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
 from warpgs.pipeline.train.loss_terms.smooth_depth import BOUND, CONFIRMED, EDGE, SmoothDepth, depth_roughness
+from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
+from warpgs.render.rasterize import rasterize
 
 CPU = torch.device("cpu")
 
@@ -57,3 +73,66 @@ def test_confirmed_pixels_count_less():
     consistent[1] = 2.0
     found = SmoothDepth().needs(TrainingView(view.camera, view.image, consistent=consistent), None)["smooth_depth"]
     assert torch.equal(found, torch.where(consistent > 0, CONFIRMED, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("views", "alpha", "weight"), [(3, None, 1.0), (SMOOTH_VIEWS, None, 1.0), (SMOOTH_VIEWS + 1, None, 0.0), (3, 1.0, 0.0)]
+)
+def test_few_opaque_views_have_the_term(views, alpha, weight):
+    """What is given holds; other presets have none."""
+    train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6), alpha=alpha)] * views
+    for preset in ("default", "quick"):
+        config, _ = settings_by_views(PRESETS[preset], train, "cuda")
+        assert config.loss.smooth_weight == weight
+        assert [t.name for t in built_in_terms(config.loss)] == ["photometric", "smooth_depth"][: 1 + (weight > 0)]
+    given = dataclasses.replace(PRESETS["default"], loss=LossConfig(smooth_weight=0.2))
+    assert settings_by_views(given, train, "cuda")[0].loss.smooth_weight == 0.2
+    assert PRESETS["3dgs"].loss.smooth_weight == 0
+
+
+def test_wrong_weights_are_refused():
+    """In the settings and in the term."""
+    for wrong in (-1, math.nan, 1001):
+        for kind, name in ((LossConfig, "smooth_weight"), (SmoothDepth, "weight")):
+            with pytest.raises(UsageError, match="must lie between"):
+                kind(**{name: wrong})
+
+
+def test_a_fit_with_the_term_is_smoother_and_continues(tmp_path):
+    """Rendered depth is less rough than without; a continued fit has the same bits as an uninterrupted one."""
+
+    def fit(weight: float, until: int = 40) -> Trainer:
+        config = FitConfig(
+            steps=40, init=InitConfig(source="points", opacity=0.9), sh_degree=0, half_resolution=0.5,
+            loss=LossConfig(smooth_weight=weight),
+        )  # fmt: skip
+        trainer = Trainer(photos(3, 40, 32), seeds(), config, CPU)
+        while trainer.step < until:
+            trainer.advance(until - trainer.step)
+        return trainer
+
+    def rough(trainer: Trainer) -> float:
+        found = []
+        for v in photos(3, 40, 32):
+            r = rasterize(trainer.gaussians, v.camera)
+            image = torch.as_tensor(v.image, dtype=torch.float32)
+            found.append(float(depth_roughness(r.depth, r.alpha, image, torch.ones_like(r.depth), None)))
+        return sum(found)
+
+    whole, half = fit(30.0), fit(30.0, 20)
+    assert rough(whole) < 0.9 * rough(fit(0.0))
+    save_checkpoint(tmp_path, *half.state())
+    again = fit(30.0, 0)
+    again.load(*load_checkpoint(tmp_path))
+    while again.step < 40:
+        again.advance(40 - again.step)
+    assert same_bits(whole, again)
+
+
+def test_plan_covers_the_term():
+    """The weights that stay, and what the term and its gradient take."""
+    config = dataclasses.replace(STEADY, loss=LossConfig(smooth_weight=1.0))
+    fit = Trainer(photos(2, 400, 300), seeds(60), config, CPU)
+    fit.advance()
+    found, planned = measured(fit, 2), fit.layout.step(60, instances(fit))
+    assert found <= planned <= 1.25 * found + 20_000, (found, planned)

@@ -27,7 +27,7 @@ BOUND = 0.1
 """Largest value of a pixel: beyond it nothing pulls."""
 CONFIRMED = 0.2
 """Weight of pixels with consistent depth."""
-MAPS = 24
+MAPS = 12
 """Maps of one float a pixel that the term holds at the loss, with its gradient."""
 
 
