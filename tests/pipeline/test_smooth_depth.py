@@ -15,7 +15,7 @@ from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.by_views import SMOOTH_VIEWS, settings_by_views
+from warpgs.pipeline.train.by_views import SMOOTH_STEPS, SMOOTH_VIEWS, settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
 from warpgs.pipeline.train.loss_terms.smooth_depth import BOUND, CONFIRMED, EDGE, SmoothDepth, depth_roughness
@@ -79,15 +79,20 @@ def test_confirmed_pixels_count_less():
     ("views", "alpha", "weight"), [(3, None, 1.0), (SMOOTH_VIEWS, None, 1.0), (SMOOTH_VIEWS + 1, None, 0.0), (3, 1.0, 0.0)]
 )
 def test_few_opaque_views_have_the_term(views, alpha, weight):
-    """What is given holds; other presets have none."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6), alpha=alpha)] * views
-    for preset in ("default", "quick"):
-        config, _ = settings_by_views(PRESETS[preset], train, "cuda")
-        assert config.loss.smooth_weight == weight
-        assert [t.name for t in built_in_terms(config.loss)] == ["photometric", "smooth_depth"][: 1 + (weight > 0)]
-    given = dataclasses.replace(PRESETS["default"], loss=LossConfig(smooth_weight=0.2))
-    assert settings_by_views(given, train, "cuda")[0].loss.smooth_weight == 0.2
-    assert PRESETS["3dgs"].loss.smooth_weight == 0
+    """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""
+    train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=alpha)] * views
+    default = PRESETS["default"]
+    config, _ = settings_by_views(default, train, "cuda")
+    assert config.loss.smooth_weight == weight and config.steps == (3000 if alpha else 4500)
+    assert [t.name for t in built_in_terms(config.loss)] == ["photometric", "smooth_depth"][: 1 + (weight > 0)]
+    short = dataclasses.replace(default, steps=SMOOTH_STEPS - 1), PRESETS["quick"], PRESETS["3dgs"]
+    assert all(settings_by_views(c, train, "cuda")[0].loss.smooth_weight == 0 for c in short)
+    limited, _ = settings_by_views(default, train, "cpu")
+    assert limited.steps < SMOOTH_STEPS and limited.loss.smooth_weight == 0
+    unlimited = dataclasses.replace(default, cpu_limit=False)
+    assert settings_by_views(unlimited, train, "cpu")[0].loss.smooth_weight == weight
+    given = dataclasses.replace(default, loss=LossConfig(smooth_weight=0.2))
+    assert settings_by_views(given, train, "cpu")[0].loss.smooth_weight == 0.2
 
 
 def test_wrong_weights_are_refused():
