@@ -12,10 +12,10 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
-MIN_STEPS = 3000
-"""Steps of a fit of up to `FEW` views at most."""
+MIN_STEPS, OPAQUE_STEPS = 3000, 4500
+"""Steps of a fit of few views at most: where views know their opacity, and where all are opaque."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
-"""Views up to which steps are `MIN_STEPS`; the power of their number with which they grow beyond; and their bound."""
+"""Views from which steps grow beyond `MIN_STEPS`; the power of their number with which they do; and their bound."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
 """Learning rate of the log scales up to so many views, and the power of their number with which it falls beyond."""
 OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
@@ -28,15 +28,20 @@ cannot tell a colour that changes with direction from an error of the shape."""
 OPACITIES_DECAY, SPARSE_VIEWS = 0.001, 9
 """Fraction of every opacity that a step takes up to so many opaque views, with one layer; with more, or where views know their
 opacity, it takes none, and there are two layers: neither was measured there (docs/decisions/023-opacity-decay.md)."""
+SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
+"""Weight of the roughness of rendered depth up to so many opaque views, in fits of at least so many steps; else there is no
+such term: it was not measured with alpha, costs decibels with 9 views, and does not pay in 480 steps
+(docs/decisions/024-smooth-depth.md)."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
 
 
-def steps_by_views(views: int) -> int:
-    """Return the most steps of a fit of so many views: 3000 up to 4, 5511 for 9, 21,129 for 54, 30,000 from 87 on."""
-    return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
+def steps_by_views(views: int, opaque: bool = True) -> int:
+    """Return the most steps of a fit of so many views: 4500 up to 6 opaque ones, 5511 for 9, 30,000 from 87 on."""
+    grown = round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER)
+    return min(MAX_STEPS, max(grown, OPAQUE_STEPS if opaque else MIN_STEPS))
 
 
 def cpu_seconds(views: int) -> float:
@@ -66,7 +71,8 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if optimizer.opacities_lr is None:
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
-    few = views <= SPARSE_VIEWS and all(v.alpha is None for v in train)
+    opaque = all(v.alpha is None for v in train)
+    few = views <= SPARSE_VIEWS and opaque
     if optimizer.opacities_decay is None:
         optimizer = dataclasses.replace(optimizer, opacities_decay=OPACITIES_DECAY if few else 0.0)
     method = config.method
@@ -78,30 +84,40 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     half = config.half_resolution
     if half is None:
         half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
-    steps = config.steps
-    if steps is None:
-        steps = min(steps_by_views(views), config.max_steps)
+    wanted, limit = config.steps, ""
+    if wanted is None:
+        wanted = min(steps_by_views(views, opaque), config.max_steps)
+    steps = wanted
+    if config.steps is None:
+        pixels = max(v.camera.width * v.camera.height for v in train)
+        seconds = pixels_of_steps(config.batch * wanted, half, pixels) / CPU_PIXELS
+        if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):
+            most = cpu_seconds(views)
+            steps = max(1, int(wanted * most / seconds))
+            limit = (
+                f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
+                f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
+            )
+    loss = config.loss
+    if loss.smooth_weight is None:
+        smooth = opaque and views <= SMOOTH_VIEWS and steps >= SMOOTH_STEPS
+        loss = dataclasses.replace(loss, smooth_weight=SMOOTH_WEIGHT if smooth else 0.0)
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
-        f"at most {steps:,} steps{each}": config.steps, f"SH degree {degree}": config.sh_degree,
+        f"at most {wanted:,} steps{each}": config.steps, f"SH degree {degree}": config.sh_degree,
         f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
         f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
+        f"smooth_weight {loss.smooth_weight:g}": config.loss.smooth_weight,
         "two layers" if method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
     open_ = [words for words, given in chosen.items() if given is None]
     if open_:
         notes.append(Detail(f"settings for {views} views: {', '.join(open_)}"))
-    if config.steps is None:
-        pixels = max(v.camera.width * v.camera.height for v in train)
-        seconds = pixels_of_steps(config.batch * steps, half, pixels) / CPU_PIXELS
-        if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):
-            most, wanted = cpu_seconds(views), steps
-            steps = max(1, int(steps * most / seconds))
-            notes.append(
-                f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
-                f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
-            )
-    chosen_parts = {"steps": steps, "sh_degree": degree, "half_resolution": half, "optimizer": optimizer, "method": method}
+    if limit:
+        notes.append(limit)
+    chosen_parts = {
+        "steps": steps, "sh_degree": degree, "half_resolution": half, "optimizer": optimizer, "method": method, "loss": loss,
+    }  # fmt: skip
     return dataclasses.replace(config, **chosen_parts), notes

@@ -77,7 +77,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     probe = probe_seconds(largest.width, largest.height, device)
     setup, step = probe * SETUP * len(views), probe * STEP * config.batch
-    most = steps_by_views(len(views))
+    most = steps_by_views(len(views), all(v.alpha is None for v in views))
     steps = min(int((seconds - setup) / step), most)
     if steps < MIN_STEPS:
         raise UsageError(

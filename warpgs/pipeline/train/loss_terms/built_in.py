@@ -9,6 +9,7 @@ from warpgs.pipeline.train.loss import LossTerm
 from warpgs.pipeline.train.loss_terms.given import GivenDepthDifference, GivenNormalsDifference
 from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
 from warpgs.pipeline.train.loss_terms.photometric import Photometric
+from warpgs.pipeline.train.loss_terms.smooth_depth import SmoothDepth
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,9 @@ class LossConfig:
     alpha_weight: float = 1.0
     """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
 
+    smooth_weight: float | None = 0.0
+    """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 for no such term. None:
+    by the number of views."""
     depth_weight: float = 0.3
     """Weight of the difference of rendered and given inverse depth, in views with given depth, in [0, 1000]; 0 for no such
     term."""
@@ -34,8 +38,8 @@ class LossConfig:
     """Weight of the sum of squares of each view's exposure less the identity, where exposures are learned, in [0, 1000]."""
 
     def __post_init__(self) -> None:
-        for name in ("alpha_weight", "depth_weight", "normal_weight", "exposure_weight"):
-            if not 0 <= getattr(self, name) <= 1000:
+        for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
+            if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
                 raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1000")
         if not 0 <= self.ssim_weight <= 1:
             raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
@@ -55,6 +59,8 @@ def built_in_terms(
     terms: list[LossTerm] = [Photometric(config.ssim_weight)]
     if cutout and config.alpha_weight > 0:
         terms.append(AlphaDifference(config.alpha_weight))
+    if config.smooth_weight:
+        terms.append(SmoothDepth(config.smooth_weight))
     if depth and config.depth_weight > 0:
         terms.append(GivenDepthDifference(config.depth_weight))
     if normals and config.normal_weight > 0:
