@@ -19,7 +19,7 @@ from typing import Any
 import warpgs
 from warpgs import schema
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.table import Column, DensityUpdate, Table
+from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.train.context import StrategyContext
 from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
 from warpgs.pipeline.train.presets import PRESETS
@@ -35,7 +35,11 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 SSIM_WEIGHT = 0.2
+"""Weight of SSIM in every photometric loss, as in 3DGS."""
 CHUNK = 2**24
+"""Distances that are held at a time."""
+OF_TWIN = {"twin": schema.fields(GradientGrowth.STATE), "order": schema.items(schema.whole(0))}
+"""Schema of what a checkpoint holds of the second model beside its tensors."""
 
 
 @dataclass(frozen=True)
@@ -196,10 +200,6 @@ class CorGS(CloneSplit):
         self.twin.table.load({n.removeprefix("twin."): t for n, t in tensors.items() if n.startswith("twin.")})
         self.twin_growth.load(plain["twin"])
         self.order = list(plain["order"])
-
-    def columns(self) -> Mapping[str, Column]:
-        """Return the columns in which gradients are gathered."""
-        return super().columns()
 
 
 def _kept(table: Table, rows: torch.Tensor) -> DensityUpdate:

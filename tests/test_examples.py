@@ -24,6 +24,7 @@ SMALL = {
     "05_own_strategy": (["--steps", "200", "--width", "48", "--start", "100"], "sprout.png", lambda gain: gain > 0.2),
     "07_rasterizer_in_another_trainer": (["--steps", "40", "--width", "48"], "render.png", lambda gain: gain > 1),
     "08_feature_field": (["--steps", "40", "--count", "150", "--size", "40"], "features.png", lambda gain: gain > 0.7),
+    "11_cor_gs": (["--steps", "12", "--width", "48"], "cor_gs.png", lambda gain: abs(gain) < 3),
     "10_depth_and_normals": (["--size", "64"], "normals.png", lambda degrees: degrees < 6),
 }
 """Flags for a test, an image that is written, and what the returned figure must fulfil."""

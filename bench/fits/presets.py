@@ -1,11 +1,11 @@
 """Presets side by side, and beside gsplat's default strategy, on named rows with several seeds.
 
 A preset may carry settings: ``default:optimizer.scales_lr=0.1``, ``gsplat:steps=1000,sh_degree=0,background=mean``;
-``pruned/PRESET`` is a fit that is pruned. The views of the split are scored, or with --leave-out K training views that the fit did not see, by which settings may be chosen: of up to four
-each in turn, of more K at once. Seeds come one after the other, the longest fits of each first. Rows that --out holds are
-kept when the command is given again, those that failed are tried again. Times that were taken beside other fits stand in
-brackets. --fixed PRESET adds a table of bytes against quality, paired with that preset; --shrink N makes images smaller by a
-further factor, to try the command.
+``pruned/PRESET`` is a fit that is pruned. The views of the split are scored, or with --leave-out K training views that the fit
+did not see, by which settings may be chosen: of up to four each in turn, of more K at once. Seeds come one after the other, the
+longest fits of each first. Rows that --out holds are kept when the command is given again, those that failed are tried again.
+Times that were taken beside other fits stand in brackets. --fixed PRESET adds a table of bytes against quality, paired with that
+preset; --shrink N makes images smaller by a further factor, to try the command.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ def line(row: dict) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print the tables, or print those of files; return the exit code."""
     a = parse(
-        __doc__, arguments, {"data?": Path}, rows=list(ROWS), presets=["default"], gsplat=False, leave_out=0, seeds=5, first_seed=0, jobs=1, seconds=math.inf, shrink=1, device="auto", out=Path, table=[Path],
-        base="default", fixed=str,
+        __doc__, arguments, {"data?": Path}, rows=list(ROWS), presets=["default"], gsplat=False, leave_out=0, seeds=5,
+        first_seed=0, jobs=1, seconds=math.inf, shrink=1, device="auto", out=Path, table=[Path], base="default", fixed=str,
     )  # fmt: skip
     if a.table:
         print(tables([row for path in a.table for row in result_file.read(path)["rows"]], a.base, a.fixed))
