@@ -99,7 +99,9 @@ def test_gaussians_without_a_neighbour_are_pruned_in_both_models(module):
         table.apply(change)
     assert strategy.prunes(6) and not strategy.prunes(4)
     assert (len(table), len(strategy.twin.table)) == (counts[0] - 1, counts[1] - 1)
-    assert all(float(t.params["means"].detach().abs().max()) < 50 * trainer.context.extent for t in (table, strategy.twin.table))
+    assert all(
+        float(t.params["means"].detach().abs().max()) < 50 * trainer.context.extent for t in (table, strategy.twin.table)
+    )
 
 
 def test_the_term_is_zero_where_models_agree(module):
