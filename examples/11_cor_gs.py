@@ -32,7 +32,6 @@ from warpgs.pipeline.train.views import TrainingView
 import numpy as np
 import torch
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 SSIM_WEIGHT = 0.2
 """Weight of SSIM in every photometric loss, as in 3DGS."""
@@ -79,8 +78,8 @@ class Pseudo:
     def draw(self, generator: torch.Generator) -> warpgs.Camera:
         """Return a random camera, with the size and the intrinsics of a training camera."""
         i = int(torch.randint(len(self.cameras), (1,), generator=generator))
-        pair = Rotation.from_matrix(self.rotations[[i, int(self.neighbor[i])]].numpy())
-        R = torch.as_tensor(pair.mean().as_matrix())
+        u, _, vt = torch.linalg.svd(self.rotations[[i, int(self.neighbor[i])]].mean(0))
+        R = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))], dtype=torch.float64)) @ vt  # the nearest rotation
         center = self.centers[i] + self.spread[i] * torch.randn(3, generator=generator, dtype=torch.float64)
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3], viewmat[:3, 3] = R, -R @ center

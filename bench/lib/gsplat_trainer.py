@@ -69,8 +69,8 @@ class Settings:
 def default_settings(steps: int) -> Settings:
     """Return the settings for gsplat's default strategy, whose refinement ends at half of the steps, as at 15,000 of 30,000.
 
-    gsplat 1.6.0 resets opacities every 3000 steps up to there. 1.5.3 never does: it writes ``step % reset_every == 0 & step > 0``,
-    which Python reads as false.
+    gsplat 1.6.0 resets opacities every 3000 steps up to there. 1.5.3 never does: it writes
+    ``step % reset_every == 0 & step > 0``, which Python reads as false.
     """
     return Settings(
         steps, cap=0, strategy="default", init_opacity=0.1, init_scale=1.0, opacity_reg=0.0, scale_reg=0.0, refine_stop=15_000

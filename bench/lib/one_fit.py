@@ -26,6 +26,7 @@ from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.runs.prune import prune
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.background import mean_color
+from warpgs.pipeline.train.by_views import DEGREES
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
@@ -54,8 +55,8 @@ class Fit:
     row: str
     """Name of the row."""
     preset: str
-    """``default``, a preset, ``PRESET:GROUP.KEY=VALUE,...``, or any of ours after ``pruned/``; or one of `PEERS`, whose settings
-    are those of `gsplat_trainer.Settings`."""
+    """``default``, a preset, ``PRESET:GROUP.KEY=VALUE,...``, or any of ours after ``pruned/``; or one of `PEERS`, whose
+    settings are those of `gsplat_trainer.Settings`."""
     seed: int
     folder: str
     split: str
@@ -88,7 +89,7 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
 
 
 def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:
-    """Return the settings of gsplat's trainer: ``gsplat:steps=1000,sh_degree=0,background=mean``.
+    """Return the settings of gsplat's trainer: ``gsplat:steps=1000,sh_degree=auto,background=mean``; auto is as in `default`.
 
     Raises:
         UsageError: A setting is unknown.
@@ -97,6 +98,8 @@ def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:
     given: dict = {f.name: None for f in dataclasses.fields(gsplat_trainer.Settings)}
     _change(given, preset, changes)
     given = {n: v for n, v in given.items() if v is not None}
+    if given.get("sh_degree") == "auto":
+        given["sh_degree"] = sum(len(train) >= n for n in DEGREES)
     if given.get("background") == "mean":
         given["background"] = mean_color(train)
     settings = gsplat_trainer.default_settings(given.get("steps", PEER_STEPS))

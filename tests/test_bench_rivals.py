@@ -1,0 +1,59 @@
+"""Rivals under one rule: their steps are chosen on training views left out, and all share start, background and degree."""
+
+import pytest
+
+from bench.lib.arms import ARMS, LADDER, RIVALS, Arm, chosen_steps
+from bench.lib.one_fit import config_of, is_peer, peer_settings
+from tests.scenes import photos
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.background import mean_color
+from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+
+
+@pytest.fixture(autouse=True)
+def registry_as_it_was(monkeypatch):
+    """What a test registers is gone after it."""
+    STRATEGIES.names()
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+
+
+@pytest.mark.parametrize("views", [3, 6])
+def test_all_arms_share_start_background_and_degree(views):
+    """Those of `default`, for any number of views; only the ladder's first arm starts at random."""
+    train = photos(views)
+    default = settings_by_views(config_of("default"), train, "cpu")[0]
+    for arm in (*RIVALS, *LADDER):
+        if is_peer(arm.preset):
+            peer = peer_settings(arm.preset, train)
+            assert (peer.sh_degree, peer.background) == (default.sh_degree, mean_color(train)), arm.words
+            continue
+        own = settings_by_views(config_of(arm.preset), train, "cpu")[0]
+        assert (own.sh_degree, own.background) == (default.sh_degree, "auto"), arm.words
+        start = (own.init.merge_px, own.init.fill_px, own.init.opacity, own.init.scale_factor)
+        same = start == (8, 32, default.init.opacity, default.init.scale_factor) and own.init.source in ("auto", "sweep")
+        assert same != (arm is LADDER[0]), arm.words
+
+
+def test_every_arm_names_its_steps_once():
+    """Numbers of steps are read from the preset itself."""
+    for arm in (a for arms in ARMS.values() for a in arms if a.steps):
+        assert len(arm.steps) > 1 and arm.steps == tuple(sorted(arm.steps))
+        for steps in arm.steps:
+            preset = arm.with_steps(steps)
+            found = peer_settings(preset, photos(3)) if is_peer(preset) else config_of(preset)
+            assert found.steps == steps
+
+
+def test_steps_are_chosen_on_views_left_out():
+    """The best mean; a number that lacks a view, a test score and a failure count for nothing."""
+    arm = Arm("a", "3dgs:sh_degree=0", (10, 20, 30))
+
+    def row(steps: int, out: str, psnr: float) -> dict:
+        return {"row": "r", "preset": f"3dgs:sh_degree=0,steps={steps}", "seed": 0, "left_out": out, "psnr": psnr}
+
+    rows = [row(10, "x", 20.0), row(10, "y", 22.0), row(20, "x", 21.5), row(20, "y", 21.0), row(30, "x", 99.0)]
+    rows += [row(10, "", 99.0), row(10, "z", 99.0) | {"error": "died"}, row(10, "x", 99.0) | {"row": "other"}]
+    assert chosen_steps(rows, "r", arm) == 20
+    with pytest.raises(UsageError, match="a: no number of steps was tried.*--tune"):
+        chosen_steps(rows, "r", Arm("a", "mcmc", (10, 20)))
