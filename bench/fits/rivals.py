@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import functools
 import math
-import re
 import sys
 import tempfile
 from pathlib import Path
@@ -20,14 +19,13 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from bench.lib.arms import ARMS, Arm, chosen_steps
-from bench.lib.one_fit import Fit, compile_all, measure, plan
+from bench.lib.arms import ARMS, GSPLAT, Arm, chosen_steps, steps_in
+from bench.lib.one_fit import Fit, compile_all, is_peer, measure, plan
 from bench.lib.pool import measure_all
 from bench.lib.preset_table import means_table
 from bench.lib.scenes import Row, made, row_of, shrunk
 from warpgs.errors import UsageError, WarpgsError
 from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.by_views import MIN_STEPS
 
 LEFT_OUT = 2
 """Training views left out at once where there are more than four; of fewer, each in turn."""
@@ -55,11 +53,6 @@ def fits(a: argparse.Namespace, rows: dict[str, Row], folders: dict[str, str], d
     return [fit for fit in found if steps_in(fit.preset) <= a.most_steps]
 
 
-def steps_in(preset: str) -> int:
-    """Return the steps that a preset names; those of `default` for few views where it names none."""
-    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else MIN_STEPS
-
-
 def work(preset: str) -> float:
     """Return roughly what a fit takes, in steps: a step of two models takes as long as four."""
     return steps_in(preset) * (4 if "CorGS" in preset else 1)
@@ -80,7 +73,8 @@ def main(arguments: list[str] | None = None) -> int:
         with tempfile.TemporaryDirectory() as work:
             folders = {name: made(a.data, row, Path(work)) for name, row in rows.items()}
             tasks = fits(a, rows, folders, device)
-            first = functools.partial(compile_all, tuple(dict.fromkeys(t.preset for t in tasks)), str(device))
+            used = ("default", *((GSPLAT,) if any(is_peer(t.preset) for t in tasks) else ()))  # others use little else
+            first = functools.partial(compile_all, used, str(device))
             found = measure_all(measure, tasks, first, a, WHAT, device, lambda r: f"{r['psnr']:.2f} dB  {r['training']:.1f} s")
     except WarpgsError as e:
         print(f"bench.fits.rivals: {e}", file=sys.stderr)

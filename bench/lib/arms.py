@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import statistics
 from collections import defaultdict
 from dataclasses import dataclass
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.train.by_views import MIN_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`; the degree follows from the number of views."""
@@ -54,7 +56,25 @@ LADDER = (
     Arm("+ importance: all three scores", f"default:{SCORES}"),
 )
 """Steps of the method, each beside the one above it; the last is off in `default`."""
-ARMS = {"rivals": RIVALS, "ladder": LADDER}
+ABLATION = (
+    Arm("`default`", "default"),
+    Arm("pixels without consistent depth too", "default:method.ra=false"),
+    Arm("two layers", "default:method.hier=true"),
+    Arm("residual in the importance", "default:method.s_render=true"),
+    Arm("residual and semantics", "default:method.s_render=true,method.s_semantic=true"),
+    Arm("residual, semantics and geometry", f"default:{SCORES}"),
+    Arm("all three, pixels of highest importance", f"default:{SCORES},method.agp=false"),
+    Arm("no sampling events", "default:method.events=false"),
+    Arm("no opacity decay", "default:optimizer.opacities_decay=0"),
+    Arm("no dropout", "default:dropout=0"),
+)
+"""One part of `default` changed."""
+ARMS = {"rivals": RIVALS, "ladder": LADDER, "ablation": ABLATION}
+
+
+def steps_in(preset: str) -> int:
+    """Return the steps that a preset names; those of `default` for few views, the most it takes, where it names none."""
+    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else MIN_STEPS
 
 
 def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:
