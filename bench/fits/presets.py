@@ -1,11 +1,11 @@
 """Presets side by side, and beside gsplat's default strategy, on named rows with several seeds.
 
-A preset may carry settings: ``default:optimizer.scales_lr=0.1``; ``pruned/PRESET`` is a fit that is pruned. The views of the
-split are scored, or with --leave-out K training views that the fit did not see, by which settings may be chosen: of up to four
-each in turn, of more K at once. Seeds come one after the other, the longest fits of each first. Rows that --out holds are
-kept when the command is given again, those that failed are tried again. Times that were taken beside other fits stand in
-brackets. --fixed PRESET adds a table of bytes against quality, paired with that preset; --shrink N makes images smaller by a
-further factor, to try the command.
+A preset may carry settings: ``default:optimizer.scales_lr=0.1``, ``gsplat:steps=1000,sh_degree=0,background=mean``;
+``pruned/PRESET`` is a fit that is pruned. The views of the split are scored, or with --leave-out K training views that the
+fit did not see, by which settings may be chosen: of up to four each in turn, of more K at once. Seeds come one after the other,
+the longest fits of each first. Rows that --out holds are kept when the command is given again, failures are tried again.
+Times that were taken beside other fits stand in brackets. --fixed PRESET adds a table of bytes against quality, paired with
+that preset; --shrink N makes images smaller by a further factor, to try the command.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from bench.lib.one_fit import PEER, PEER_POINTS, PEER_STEPS, PEERS, Fit, compile_all, config_of, measure, plan
+from bench.lib.one_fit import PEER, PEER_POINTS, Fit, compile_all, config_of, is_peer, measure, peer_settings, plan
 from bench.lib.pool import measure_all
 from bench.lib.preset_table import tables
 from bench.lib.scenes import ROWS, Row, made, row_of, scene_at, shrunk
@@ -36,7 +36,7 @@ def fits(a: argparse.Namespace, rows: dict[str, Row], folders: dict[str, str], d
     """Return all fits that were asked for: seeds in order, the longest of each seed first."""
 
     def work(fit: Fit) -> float:
-        steps = a.peer_steps if fit.preset in PEERS else config_of(fit.preset).steps
+        steps = peer_settings(fit.preset, []).steps if is_peer(fit.preset) else config_of(fit.preset).steps
         views = rows[fit.row].views
         return (steps or steps_by_views(views)) * (views + 20)  # roughly: more views mean more Gaussians and a longer start
 
@@ -47,7 +47,7 @@ def fits(a: argparse.Namespace, rows: dict[str, Row], folders: dict[str, str], d
             known = scene_at(folders[name], row.downscale).points is not None
             for preset in [*a.presets, *((PEER, PEER_POINTS)[: 1 + known] if a.gsplat else ())]:
                 place = (row.split, row.downscale)
-                own += plan(name, preset, seed, folders[name], place, a.leave_out, str(device), a.peer_steps)
+                own += plan(name, preset, seed, folders[name], place, a.leave_out, str(device))
         found += sorted(own, key=work, reverse=True)
     return found
 
@@ -60,9 +60,8 @@ def line(row: dict) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print the tables, or print those of files; return the exit code."""
     a = parse(
-        __doc__, arguments, {"data?": Path}, rows=list(ROWS), presets=["default"], gsplat=False, peer_steps=PEER_STEPS,
-        leave_out=0, seeds=5, first_seed=0, jobs=1, seconds=math.inf, shrink=1, device="auto", out=Path, table=[Path],
-        base="default", fixed=str,
+        __doc__, arguments, {"data?": Path}, rows=list(ROWS), presets=["default"], gsplat=False, leave_out=0, seeds=5,
+        first_seed=0, jobs=1, seconds=math.inf, shrink=1, device="auto", out=Path, table=[Path], base="default", fixed=str,
     )  # fmt: skip
     if a.table:
         print(tables([row for path in a.table for row in result_file.read(path)["rows"]], a.base, a.fixed))

@@ -2,8 +2,8 @@
 
 gsplat is called, never copied. The settings are those of ``examples/simple_trainer.py`` of nerfstudio-project/gsplat, of
 ``mcmc`` at 90d7b4b3 (2026-08-20) and of ``default``, whose thresholds are `DefaultStrategy`'s own: `Settings` holds them, and
-`train` takes its steps in its order. Its fused SSIM is optional there and absent here: SSIM is by convolutions with zero
-padding, which is what it falls back to.
+`train` takes its steps in its order. Its SSIM is fused-ssim's with padding "valid": the map without the 5 pixels at each edge.
+Ours, which is fused, too, has the same values.
 """
 
 from __future__ import annotations
@@ -16,11 +16,15 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from bench.lib.peers import torch_ssim
 from warpgs.colors import C0
 from warpgs.errors import UsageError
 from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.ssim import ssim
 from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
+
+BLACK = (0.0, 0.0, 0.0)
+EDGE = 5
+"""Pixels at each edge of an image that "valid" SSIM leaves out: half of its window."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,8 @@ class Settings:
     full_steps: int = 30_000
     """Length of the schedule that `refine_stop` belongs to."""
     refine_stop: int = 25_000
+    background: tuple[float, float, float] = BLACK
+    """Colour behind the scene, which its trainer leaves black."""
 
     @property
     def last_refinement(self) -> int:
@@ -64,7 +70,8 @@ class Settings:
 def default_settings(steps: int) -> Settings:
     """Return the settings for gsplat's default strategy, whose refinement ends at half of the steps, as at 15,000 of 30,000.
 
-    gsplat 1.5.3 never resets opacities: it writes ``step % reset_every == 0 & step > 0``, which Python reads as false.
+    gsplat 1.6.0 resets opacities every 3000 steps up to there. 1.5.3 never does: it writes
+    ``step % reset_every == 0 & step > 0``, which Python reads as false.
     """
     return Settings(
         steps, cap=0, strategy="default", init_opacity=0.1, init_scale=1.0, opacity_reg=0.0, scale_reg=0.0, refine_stop=15_000
@@ -117,14 +124,15 @@ def optimizers_of(params: torch.nn.ParameterDict, s: Settings, size: float) -> d
     return {n: torch.optim.Adam([{"params": params[n], "lr": lr, "name": n}], eps=1e-15, fused=fused) for n, lr in lrs.items()}
 
 
-def render(params, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int, degree: int):
-    """Return gsplat's image [H, W, 3] over black, and what its rasterizer tells the strategy."""
+def render(params, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int, degree: int, background=BLACK):
+    """Return gsplat's image [H, W, 3] over a background [3], and what its rasterizer tells the strategy."""
     from gsplat import rasterization
 
+    behind = {"backgrounds": torch.tensor([background], device=viewmat.device)} if any(background) else {}
     rgb, _, info = rasterization(
         means=params["means"], quats=params["quats"], scales=params["scales"].exp(),
         opacities=params["opacities"].sigmoid(), colors=torch.cat([params["sh0"], params["shN"]], 1),
-        viewmats=viewmat[None], Ks=K[None], width=width, height=height, sh_degree=degree, packed=False,
+        viewmats=viewmat[None], Ks=K[None], width=width, height=height, sh_degree=degree, packed=False, **behind,
     )  # fmt: skip
     return rgb[0], info
 
@@ -136,7 +144,7 @@ def loss_of(image: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
     else:
         l1 = (image - target)[mask].abs().mean()
         image, target = image * mask[..., None], target * mask[..., None]
-    similarity = torch_ssim(image, target).mean()
+    similarity = ssim(image, target)[EDGE:-EDGE, EDGE:-EDGE].mean()
     regular = s.opacity_reg * params["opacities"].sigmoid().mean() + s.scale_reg * params["scales"].exp().mean()
     return (1 - s.ssim_lambda) * l1 + s.ssim_lambda * (1 - similarity) + regular
 
@@ -197,7 +205,7 @@ def train(
         order = order or torch.randperm(len(there)).tolist()
         view = there[order.pop()]
         height, width = view.image.shape[:2]
-        image, info = draw(params, view.viewmat, view.K, width, height, min(step // s.sh_every, s.sh_degree))
+        image, info = draw(params, view.viewmat, view.K, width, height, min(step // s.sh_every, s.sh_degree), s.background)
         strategy.step_pre_backward(params=params, optimizers=optimizers, state=state, step=step, info=info)
         loss_of(image, view.image, view.mask, params, s).backward()
         for optimizer in optimizers.values():
@@ -216,7 +224,7 @@ def fit(
     """Train on views of a scene; return the parameters, and seconds, count, unit and size of the scene as figures of a row.
 
     Args:
-        scene: Scene of the views, over black.
+        scene: Scene of the views; settings have the background.
         views: Training views.
         first: Gaussians whose means and colours are the start.
         s: Settings.
@@ -225,10 +233,10 @@ def fit(
         draw: Rasterizer, with arguments and results of `render`.
 
     Raises:
-        UsageError: The scene is not over black, which is all that gsplat's trainer knows.
+        UsageError: The scene has another background, over which its transparent pixels lie.
     """
-    if any(scene.background):
-        raise UsageError(f"{scene.path}: its background is {scene.background}; gsplat's trainer knows black alone")
+    if any(scene.background) and scene.background != s.background:
+        raise UsageError(f"{scene.path}: its background is {scene.background}, and the settings say {s.background}")
     cameras, began = [view.camera for view in scene.views], time.perf_counter()
     unit = own_scale(cameras, scene.normalization) if own_units else 1.0
     size = scene_scale(cameras, unit)
@@ -240,12 +248,12 @@ def fit(
 
 
 @torch.no_grad()
-def image_of(params, view: View, scale: float, draw: Callable = render) -> np.ndarray:
-    """Return the image of a view in [0, 1], shape [H, W, 3], all coefficients in use."""
+def image_of(params, view: View, scale: float, draw: Callable = render, background=BLACK) -> np.ndarray:
+    """Return the image of a view over a background [3], in [0, 1], shape [H, W, 3], all coefficients in use."""
     there = loaded(view, params["means"].device, scale)
     degree = math.isqrt(params["shN"].shape[1] + 1) - 1
-    size = (view.camera.width, view.camera.height)
-    return draw(params, there.viewmat, there.K, *size, degree)[0].clamp(0, 1).cpu().numpy()
+    size = view.camera.width, view.camera.height
+    return draw(params, there.viewmat, there.K, *size, degree, background)[0].clamp(0, 1).cpu().numpy()
 
 
 def compile_kernels(device: torch.device) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import json
+import re
 import statistics
 import tempfile
 import time
@@ -23,8 +25,11 @@ from warpgs.io.splits import split_views
 from warpgs.pipeline.metrics.evaluate import render_view, score
 from warpgs.pipeline.runs.prune import prune
 from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.train.background import mean_color
+from warpgs.pipeline.train.by_views import DEGREES
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.scene import Scene, View
 
 PEER, PEER_POINTS = "gsplat", "gsplat-points"
@@ -35,6 +40,12 @@ PRUNED = "pruned/"
 KEEP_PSNR = 0.1
 """Loss of training PSNR that pruning may cost [dB]."""
 PEER_STEPS = 7000
+"""Steps of gsplat where its settings name none."""
+
+
+def is_peer(preset: str) -> bool:
+    """Return whether a preset is gsplat's trainer."""
+    return preset.partition(":")[0] in PEERS
 
 
 @dataclass(frozen=True)
@@ -44,7 +55,8 @@ class Fit:
     row: str
     """Name of the row."""
     preset: str
-    """``default``, a preset, ``PRESET:GROUP.KEY=VALUE,...``, one of `PEERS`, or any of ours after ``pruned/``."""
+    """``default``, a preset, ``PRESET:GROUP.KEY=VALUE,...``, or any of ours after ``pruned/``; or one of `PEERS`, whose
+    settings are those of `gsplat_trainer.Settings`."""
     seed: int
     folder: str
     split: str
@@ -52,8 +64,6 @@ class Fit:
     """Training views that are scored instead of the held-out ones, with commas; empty for none."""
     downscale: int
     device: str
-    peer_steps: int = PEER_STEPS
-    """Steps of gsplat."""
 
     @property
     def key(self) -> dict:
@@ -64,7 +74,8 @@ class Fit:
 def config_of(preset: str, seed: int = 0) -> FitConfig:
     """Return the settings of one of our presets with a seed; ``default`` is that of a user who names none.
 
-    ``PRESET:a.b=value,c=value`` changes what it names; values are JSON, a bare word is a word.
+    ``PRESET:a.b=value,c=value`` changes what it names; values are JSON, a bare word is a word. A strategy may be
+    ``FILE.py:CLASS``; settings of its own come after it.
 
     Raises:
         UsageError: The preset or a setting is unknown, or a value is out of range.
@@ -73,6 +84,30 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
     if name not in PRESETS:
         raise UsageError(f"preset {name!r} is not one of {', '.join(PRESETS)}")
     values = PRESETS[name].to_json() | {"seed": seed}
+    _change(values, preset, changes)
+    return FitConfig.from_json(values)
+
+
+def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:
+    """Return the settings of gsplat's trainer: ``gsplat:steps=1000,sh_degree=auto,background=mean``; auto is as in `default`.
+
+    Raises:
+        UsageError: A setting is unknown.
+    """
+    changes = preset.partition(":")[2]
+    given: dict = {f.name: None for f in dataclasses.fields(gsplat_trainer.Settings)}
+    _change(given, preset, changes)
+    given = {n: v for n, v in given.items() if v is not None}
+    if given.get("sh_degree") == "auto":
+        given["sh_degree"] = sum(len(train) >= n for n in DEGREES)
+    if given.get("background") == "mean":
+        given["background"] = mean_color(train)
+    settings = gsplat_trainer.default_settings(given.get("steps", PEER_STEPS))
+    return dataclasses.replace(settings, **given)
+
+
+def _change(values: dict, preset: str, changes: str) -> None:
+    """Change nested values as a preset says after its colon."""
     for change in filter(None, changes.split(",")):
         key, sep, value = change.partition("=")
         *groups, last = key.split(".")
@@ -85,21 +120,21 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
             place[last] = json.loads(value)
         except json.JSONDecodeError:
             place[last] = value
-    return FitConfig.from_json(values)
+        if key == "strategy":
+            kind = STRATEGIES.load(value).Config
+            values["strategy_config"] = None if kind is None else dataclasses.asdict(kind())
 
 
 def compile_all(presets: tuple[str, ...], device: str) -> None:
-    """Compile what fits of these presets use, gsplat's own kernels too."""
-    for preset in presets:
-        if preset in PEERS:
+    """Compile what fits of these presets use, gsplat's own kernels too; those that differ in their steps alone use the same."""
+    for preset in dict.fromkeys(re.sub(r"(?<=[:,])steps=\d+,?", "", p) for p in presets):
+        if is_peer(preset):
             gsplat_trainer.compile_kernels(torch.device(device))
         else:
             compile_kernels(config_of(preset), torch.device(device))
 
 
-def plan(
-    row: str, preset: str, seed: int, folder: str, place: tuple[str, int], count: int, device: str, peer_steps: int = PEER_STEPS
-) -> list[Fit]:  # fmt: skip
+def plan(row: str, preset: str, seed: int, folder: str, place: tuple[str, int], count: int, device: str) -> list[Fit]:
     """Return the fits of a row, a preset and a seed: one, or one for each set of training views that is left out.
 
     Args:
@@ -110,18 +145,17 @@ def plan(
         place: Split and downscale.
         count: Training views to leave out, 0 for none.
         device: cpu or cuda.
-        peer_steps: Steps of gsplat.
     """
     split, downscale = place
     cut = folds(scene_at(folder, downscale), split, count)
-    return [Fit(row, preset, seed, folder, part, names, downscale, device, peer_steps) for part, names in cut]
+    return [Fit(row, preset, seed, folder, part, names, downscale, device) for part, names in cut]
 
 
 def measure(fit: Fit) -> dict:
     """Fit, score, and return what is kept: scores, sizes, times, steps, and why the fit ended."""
     scene = scene_at(fit.folder, fit.downscale)
     try:
-        if fit.preset in PEERS:
+        if is_peer(fit.preset):
             return peer_figures(fit, scene)
         config = config_of(fit.preset, fit.seed)
         if fit.preset.startswith(PRUNED):
@@ -158,16 +192,16 @@ def peer_figures(fit: Fit, scene: Scene) -> dict:
     train, test = ([scene.view(name) for name in names] for names in (split.train, split.test))
     first = start_of(fit, scene, train)
     setup = time.perf_counter() - began
-    settings = gsplat_trainer.default_settings(fit.peer_steps)
+    settings = peer_settings(fit.preset, train)
     params, row = gsplat_trainer.fit(scene, train, first, settings, seed=fit.seed)
     row |= {"setup": setup, "training": row.pop("seconds"), "bytes": full_bytes(row["gaussians"])}
-    scored = scores((gsplat_trainer.image_of(params, view, row["unit"]) for view in test), test)
-    return {k: v for k, v in scored.items() if k != "views"} | row | {"steps": fit.peer_steps, "ended": "steps"}
+    scored = scores((gsplat_trainer.image_of(params, view, row["unit"], background=settings.background) for view in test), test)
+    return {k: v for k, v in scored.items() if k != "views"} | row | {"steps": settings.steps, "ended": "steps"}
 
 
 def start_of(fit: Fit, scene: Scene, train: list[View]) -> warpgs.Gaussians:
     """Return the first Gaussians of our default with this seed, or those on the reconstruction's points."""
-    config = config_of("3dgs:init.source=points" if fit.preset == PEER_POINTS else "default", fit.seed)
+    config = config_of("3dgs:init.source=points" if fit.preset.startswith(PEER_POINTS) else "default", fit.seed)
     return make_trainer(train, scene.points, config, torch.device(fit.device), scene.background).gaussians
 
 

@@ -55,8 +55,8 @@ def drawn_by(rasterizer: str) -> Callable:
         return gsplat_trainer.render
     adapter = runpy.run_path(str(ADAPTER))["render"]
 
-    def draw(params, viewmat, K, width, height, degree):
-        options = RasterizeOptions(rule=rasterizer, sh_degree=degree)
+    def draw(params, viewmat, K, width, height, degree, background):
+        options = RasterizeOptions(rule=rasterizer, sh_degree=degree, background=viewmat.new_tensor(background))
         render, info = adapter(params, Camera(viewmat, K, width, height), options)
         return render.rgb, info
 

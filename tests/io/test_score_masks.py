@@ -9,6 +9,7 @@ from tests.io import scenes
 from warpgs.errors import DataError
 from warpgs.io.image_ids import image_ids
 from warpgs.io.load import load_scene
+from warpgs.pipeline.metrics.evaluate import score
 
 RECT = tuple(f"rect_{i + 1:03d}_3_r5000.png" for i in range(scenes.VIEWS))
 
@@ -131,3 +132,20 @@ def test_where_pixels_come_from(tmp_path):
     assert load_scene(tmp_path, downscale=2).pixels == "images area-resampled by 2"
     scenes.save_images(tmp_path / "images_2", width=8, height=6)
     assert load_scene(tmp_path, downscale=2).pixels == "images_2 as stored"
+
+
+def test_undistorted_images_are_scored_inside_their_mask_only(tmp_path):
+    """Pixels that the lens did not see change no score, with a score mask and without one."""
+    for folder, masks in ((tmp_path / "plain", False), (tmp_path / "masked", True)):
+        scenes.write_transforms(folder, scenes.transforms_json(k1=0.8, k2=0.0, p1=0.0, p2=0.0))
+        if masks:
+            for i in range(scenes.VIEWS):
+                scenes.save(folder / "idrmasks" / f"{i:03d}.png", np.full((scenes.HEIGHT, scenes.WIDTH), 255, np.uint8))
+        view = load_scene(folder).views[0]
+        assert view.mask is not None and not view.mask[0, 0] and (view.score_mask is not None) == masks
+        image = view.image.copy()
+        image[~view.mask] = 1 - image[~view.mask]
+        m = score(view, image)
+        assert m.psnr == np.inf and m.ssim == 1
+        image[view.mask] = 0
+        assert score(view, image).psnr < 30

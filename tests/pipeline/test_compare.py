@@ -273,13 +273,17 @@ FULL = dataclasses.replace(A, preset="whole", method=MethodConfig(events=True, h
 
 
 def test_ablation_rows_switch_off_one_part_each():
-    """Full, uniform draws, the residual alone, the paper's seven parts and no sampling at all; marks by heading."""
+    """Full, uniform sampling, one score more at a time, each other part off, no sampling, and the paper's settings; marks."""
     variants, marks = ablation_variants(FULL)
-    assert list(variants) == ["full", "uniform", "residual only", *(f"no {name}" for name in SWITCHES)]
+    scores = ["uniform", "residual only", "residual + semantics"]  # which is full without geometry
+    parts = [name for name in SWITCHES if name != "s_geometry"]
+    assert list(variants) == ["full", *scores, *(f"no {name}" for name in parts), "paper-literal"]
     assert variants["full"] == FULL
-    weights = [variants[row].method.weights() for row in ("uniform", "residual only", "no s_geometry")]
+    paper = variants.pop("paper-literal")
+    assert paper == dataclasses.replace(PRESETS["paper-literal"], steps=FULL.steps) and FULL.steps != 30_000
+    weights = [variants[row].method.weights() for row in scores]
     assert weights == [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), pytest.approx((2 / 3, 1 / 3, 0.0))]
-    for (row, variant), name in zip(list(variants.items())[3:], SWITCHES, strict=True):
+    for (row, variant), name in zip(list(variants.items())[4:], parts, strict=True):
         switches = dataclasses.asdict(variant.method)
         assert [s for s, value in switches.items() if value is False] == [name] and row == f"no {name}"
         assert dataclasses.replace(variant, method=FULL.method) == FULL
@@ -290,14 +294,16 @@ def test_ablation_rows_switch_off_one_part_each():
 
 
 def test_ablation_switches_on_what_a_preset_leaves_out():
-    """A preset without scores gets a row with each, and no row twice: uniform is the preset itself."""
+    """A preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself."""
     scores = {"s_render": False, "s_semantic": False, "s_geometry": False}
     base = dataclasses.replace(FULL, method=dataclasses.replace(FULL.method, **scores))
     variants, _ = ablation_variants(base)
-    assert {"full", "residual only", "no hier", "with s_semantic", "with s_geometry"} <= set(variants)
+    rows = "full", "residual only", "residual + semantics + geometry", "with s_semantic", "with s_geometry"
+    assert {*rows, "no hier"} <= set(variants)
     assert not {"uniform", "no s_render", "with s_render", "with hier"} & set(variants)
-    weights = [variants[row].method.weights() for row in ("full", "with s_semantic", "with s_geometry")]
-    assert weights == [(0, 0, 0), (0, 1, 0), (0, 0, 1)]
+    weights = [variants[row].method.weights() for row in rows]
+    assert weights == [(0, 0, 0), (1, 0, 0), pytest.approx((0.4, 0.2, 0.4)), (0, 1, 0), (0, 0, 1)]
+    assert "paper-literal" not in ablation_variants(PRESETS["paper-literal"])[0]
 
 
 def test_command_ablates(scene, tmp_path, capsys, monkeypatch):

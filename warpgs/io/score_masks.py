@@ -38,6 +38,8 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
         )
     if mask.shape != (height, width):
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
+    if view.mask is not None:  # what the lens did not see, or a mask file hides, shows no truth
+        mask = mask & view.mask
     if not mask.any():
         raise DataError(f"{path}: the mask leaves no pixel of {view.name} to score; white keeps a pixel")
     return mask
@@ -55,7 +57,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
         scene: What opens them.
 
     Returns:
-        The views with ``score_mask`` set, and a note for the user.
+        The views with ``score_mask`` set, inside the view's own mask where it has one, and a note for the user.
 
     Raises:
         DataError: There is no mask, one is missing (the message names the ids) or does not fit, or it cannot be known whether

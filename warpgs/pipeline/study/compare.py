@@ -20,21 +20,27 @@ from warpgs.pipeline.study.study import FILES, SWITCHES, Place, Runs, StudyReque
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loop import train_views
-from warpgs.pipeline.train.presets import preset_settings, preset_word
+from warpgs.pipeline.train.presets import PRESETS, preset_settings, preset_word
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 
 SCORES = ("s_render", "s_semantic", "s_geometry")
 """Switches of the scores that the importance map is the sum of."""
-ABLATION_ROWS: dict[str, dict[str, bool]] = {
+PAPER = "paper-literal"
+"""Preset with the paper's hyper-parameters, a row of each ablation."""
+ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
     "full": {},
     "uniform": dict.fromkeys(SCORES, False),
-    "residual only": {"s_render": True} | dict.fromkeys(SCORES[1:], False),
+    "residual only": {"s_render": True, "s_semantic": False, "s_geometry": False},
+    "residual + semantics": {"s_render": True, "s_semantic": True, "s_geometry": False},
+    "residual + semantics + geometry": dict.fromkeys(SCORES, True),
     **{f"no {name}": {name: False} for name in SWITCHES},
     **{f"with {name}": {name: True} for name in SWITCHES},
+    PAPER: None,
 }
-"""Switches of each row of the ablation: those of the preset; pixels sampled uniformly, or by the residual alone; each part that
-is on switched off alone, and each that is off switched on. A row that equals an earlier one is left out."""
+"""Switches of each row of the ablation: those of the preset; pixels sampled uniformly, by the residual, and by one score more
+at a time; each part that is on switched off alone, and each that is off switched on. None for preset `PAPER`. A row that equals
+an earlier one is left out."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
@@ -59,6 +65,8 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:
     """Return the rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
 
+    All have its number of steps.
+
     Raises:
         UsageError: The configuration has no sampling events, so there is nothing to ablate.
     """
@@ -67,10 +75,14 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
     variants: dict[str, FitConfig] = {}
     marks: dict[str, tuple[bool, ...]] = {}
     for row, switches in ABLATION_ROWS.items():
-        changed = dataclasses.replace(base.method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
-        if all(changed != earlier.method for earlier in variants.values()):
-            variants[row] = dataclasses.replace(base, method=changed)
-            marks[row] = tuple(bool(getattr(changed, name)) for name in SWITCHES)
+        if switches is None:  # the steps are the preset's, so that rows differ in the method alone
+            changed = dataclasses.replace(PRESETS[PAPER], steps=base.steps, max_steps=base.max_steps, cpu_limit=base.cpu_limit)
+        else:
+            method = dataclasses.replace(base.method, **switches)  # type: ignore[arg-type]  # names of bool fields alone
+            changed = dataclasses.replace(base, method=method)
+        if base.preset != row and changed not in variants.values():
+            variants[row] = changed
+            marks[row] = tuple(bool(getattr(changed.method, name)) for name in SWITCHES)
     return variants, marks
 
 

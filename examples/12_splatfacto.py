@@ -1,6 +1,6 @@
 """A trainer in the manner of nerfstudio's splatfacto around the rasterizer: dataparser, densification, cameras, in plain torch.
 
-    python examples/11_splatfacto.py path/to/scene --out splatfacto.png --pose-noise 0.5
+    python examples/12_splatfacto.py path/to/scene --out splatfacto.png --pose-noise 0.5
 
 `warpgs.load_scene` is the dataparser. Gaussians are split, duplicated and culled by absgrad (`Render.means2d.absgrad`), random
 backgrounds and `scale_loss` keep them from becoming fog and needles, and each training camera has a correction of its own.

@@ -1,0 +1,96 @@
+"""Arms of the comparisons: rivals under one rule, and the steps of the ladder from plain 3DGS to the method."""
+
+from __future__ import annotations
+
+import re
+import statistics
+from collections import defaultdict
+from dataclasses import dataclass
+
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.by_views import MIN_STEPS
+
+ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
+"""Start, background and degree of `default`; the degree follows from the number of views."""
+STEPS = (500, 1000, 2000, 4000)
+"""Numbers of steps that training views left out choose from."""
+SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
+NO_GROWTH = "density.gradient=1e9"
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One row of a table."""
+
+    words: str
+    """Its name on the page."""
+    preset: str
+    """Preset with its settings, as `bench.lib.one_fit.Fit` takes it, without steps that are chosen."""
+    steps: tuple[int, ...] = ()
+    """Numbers of steps to choose from; empty for those of the preset."""
+
+    def with_steps(self, steps: int) -> str:
+        """Return the preset with a number of steps."""
+        return f"{self.preset}{',' if ':' in self.preset else ':'}steps={steps}"
+
+
+COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,cuda_graph=false,density.gradient=0.0005,{ONE_RULE}"
+GSPLAT = "gsplat:sh_degree=auto,background=mean"
+RIVALS = (
+    Arm("`default`", "default"),
+    Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
+    Arm("CoR-GS", COR_GS, (1000, 3000)),
+    Arm("gsplat", GSPLAT, (500, 1000, 2000, 3000)),
+    Arm("gsplat, 3,000 steps", f"{GSPLAT},steps=3000"),
+    Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
+    Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
+)
+"""Methods under one rule: start, background, degree and scores are those of `default`, all else is the method's own."""
+LADDER = (
+    Arm("`3dgs`, random points", "3dgs:background=auto,sh_degree=null", STEPS),
+    Arm("`3dgs`, start from the depth sweep", f"3dgs:{ONE_RULE}", STEPS),
+    Arm("learning rates, opacity decay and schedule of `default`", f"default:dropout=0,method.events=false,{NO_GROWTH}"),
+    Arm("+ dropout", f"default:method.events=false,{NO_GROWTH}"),
+    Arm("+ placement at consistent depth", f"default:{NO_GROWTH}"),
+    Arm("+ refinement by gradients: `default`", "default"),
+    Arm("+ importance: all three scores", f"default:{SCORES}"),
+)
+"""Steps of the method, each beside the one above it; the last is off in `default`."""
+ABLATION = (
+    Arm("`default`", "default"),
+    Arm("pixels without consistent depth too", "default:method.ra=false"),
+    Arm("two layers", "default:method.hier=true"),
+    Arm("residual in the importance", "default:method.s_render=true"),
+    Arm("residual and semantics", "default:method.s_render=true,method.s_semantic=true"),
+    Arm("residual, semantics and geometry", f"default:{SCORES}"),
+    Arm("all three, pixels of highest importance", f"default:{SCORES},method.agp=false"),
+    Arm("no sampling events", "default:method.events=false"),
+    Arm("no opacity decay", "default:optimizer.opacities_decay=0"),
+    Arm("no dropout", "default:dropout=0"),
+)
+"""One part of `default` changed."""
+ARMS = {"rivals": RIVALS, "ladder": LADDER, "ablation": ABLATION}
+
+
+def steps_in(preset: str) -> int:
+    """Return the steps that a preset names; those of `default` for few views, the most it takes, where it names none."""
+    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else MIN_STEPS
+
+
+def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:
+    """Return the steps of best PSNR on the training views left out of a row, the mean over views and seeds.
+
+    Numbers of steps that lack some of the views, since the tuning was cut short, are left out.
+
+    Raises:
+        UsageError: None was measured.
+    """
+    found = defaultdict(list)
+    for r in rows:
+        if r["row"] == row and r["left_out"] and "error" not in r:
+            found[r["preset"]].append(r["psnr"])
+    scores = {n: found[arm.with_steps(n)] for n in arm.steps}
+    most = max(map(len, scores.values()))
+    if not most:
+        raise UsageError(f"{row}, {arm.words}: no number of steps was tried on views left out; give the command with --tune")
+    return max((n for n in arm.steps if len(scores[n]) == most), key=lambda n: statistics.mean(scores[n]))

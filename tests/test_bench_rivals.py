@@ -1,0 +1,77 @@
+"""Rivals under one rule: their steps are chosen on training views left out, and all share start, background and degree."""
+
+import pytest
+
+from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
+from bench.lib.one_fit import config_of, is_peer, peer_settings
+from bench.lib.rivals_page import arms_table
+from tests.scenes import photos
+from tests.test_bench_presets import results
+from warpgs.errors import UsageError
+from warpgs.pipeline.train.background import mean_color
+from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+
+
+@pytest.fixture(autouse=True)
+def registry_as_it_was(monkeypatch):
+    """What a test registers is gone after it."""
+    STRATEGIES.names()
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+
+
+@pytest.mark.parametrize("views", [3, 6])
+def test_all_arms_share_start_background_and_degree(views):
+    """Those of `default`, for any number of views; only the ladder's first arm starts at random."""
+    train = photos(views)
+    default = settings_by_views(config_of("default"), train, "cpu")[0]
+    for arm in (*RIVALS, *LADDER, *ABLATION):
+        if is_peer(arm.preset):
+            peer = peer_settings(arm.preset, train)
+            assert (peer.sh_degree, peer.background) == (default.sh_degree, mean_color(train)), arm.words
+            continue
+        own = settings_by_views(config_of(arm.preset), train, "cpu")[0]
+        assert (own.sh_degree, own.background) == (default.sh_degree, "auto"), arm.words
+        start = (own.init.merge_px, own.init.fill_px, own.init.opacity, own.init.scale_factor)
+        same = start == (8, 32, default.init.opacity, default.init.scale_factor) and own.init.source in ("auto", "sweep")
+        assert same != (arm is LADDER[0]), arm.words
+
+
+def test_the_page_pairs_each_method_with_its_base():
+    """Differences are paired by seed, to the first arm or to the one above; a single seed is named; cells may lack."""
+    arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
+    rows = results("fern:3", "default", [20.0, 20.2]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4])
+    rows += results("fern:3", "mcmc:steps=7", [19.0])
+    tuned = [{"row": "fern:3", "preset": f"3dgs:steps={n}", "left_out": "x", "psnr": float(n)} for n in (10, 20)]
+    table = arms_table(arms, rows, tuned, ["fern:3"], above=False).splitlines()
+    assert table[0].startswith("| method | fern: steps | fern: PSNR / SSIM | difference to it")
+    assert "| a | 3,000 | 20.10 ± 0.14 / 0.500 |  |" in table
+    low, high = (1.1 + sign * 0.1 * 25.4517 for sign in (-1, 1))  # Student's t for 97.5 % of one degree of freedom, two rows
+    assert f"| b | 20 | 21.20 ± 0.28 / 0.500 | +1.10 [{low:+.2f}, {high:+.2f}] |" in table
+    assert "| c | 7 | 19.00 / 0.500 (1 seed) | -1.00 |" in table
+    again = arms_table((*arms, Arm("d", "quick")), rows, tuned, ["fern:3"], above=True).splitlines()
+    assert again[-2:] == ["| c | 7 | 19.00 / 0.500 (1 seed) | -2.00 |", "| d |  |  |  |"]
+
+
+def test_every_arm_names_its_steps_once():
+    """Numbers of steps are read from the preset itself."""
+    for arm in (a for arms in ARMS.values() for a in arms if a.steps):
+        assert len(arm.steps) > 1 and arm.steps == tuple(sorted(arm.steps))
+        for steps in arm.steps:
+            preset = arm.with_steps(steps)
+            found = peer_settings(preset, photos(3)) if is_peer(preset) else config_of(preset)
+            assert found.steps == steps
+
+
+def test_steps_are_chosen_on_views_left_out():
+    """The best mean; a number that lacks a view, a test score and a failure count for nothing."""
+    arm = Arm("a", "3dgs:sh_degree=0", (10, 20, 30))
+
+    def row(steps: int, out: str, psnr: float) -> dict:
+        return {"row": "r", "preset": f"3dgs:sh_degree=0,steps={steps}", "seed": 0, "left_out": out, "psnr": psnr}
+
+    rows = [row(10, "x", 20.0), row(10, "y", 22.0), row(20, "x", 21.5), row(20, "y", 21.0), row(30, "x", 99.0)]
+    rows += [row(10, "", 99.0), row(10, "z", 99.0) | {"error": "died"}, row(10, "x", 99.0) | {"row": "other"}]
+    assert chosen_steps(rows, "r", arm) == 20
+    with pytest.raises(UsageError, match=r"a: no number of steps was tried.*--tune"):
+        chosen_steps(rows, "r", Arm("a", "mcmc", (10, 20)))

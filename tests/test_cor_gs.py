@@ -1,0 +1,135 @@
+"""The baseline of docs/add-a-baseline.md: two models, pruned and regularised where they disagree."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.scenes import photos, seeds
+from warpgs import rasterize
+from warpgs.errors import UsageError
+from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.trainer import Trainer
+
+CPU = torch.device("cpu")
+FILE = Path(__file__).parent.parent / "examples" / "11_cor_gs.py"
+NAME = f"{FILE}:CorGS"
+
+
+@pytest.fixture(autouse=True)
+def registry_as_it_was(monkeypatch):
+    """What a test registers is gone after it."""
+    STRATEGIES.names()
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+
+
+@pytest.fixture
+def module():
+    """The example's module."""
+    return sys.modules[STRATEGIES.load(NAME).__module__]
+
+
+def fit(module, steps: int = 12, views: int = 3, gradient: float = 1e-5, **own) -> Trainer:
+    """Return a fit at step 0 that refines every 4 steps and co-prunes every 6."""
+    config = FitConfig(
+        steps=steps, init=InitConfig(source="points"), sh_degree=0, strategy=NAME,
+        density=DensityConfig(start=2, every=4, stop_fraction=1.0, gradient=gradient),
+        strategy_config=module.CorConfig(**({"every": 6} | own)),
+    )  # fmt: skip
+    return Trainer(photos(views), seeds(), config, CPU)
+
+
+def advanced(trainer: Trainer, until: int) -> Trainer:
+    while trainer.step < until:
+        trainer.advance()
+    return trainer
+
+
+def test_distances_are_to_the_nearest_other_point(module, monkeypatch):
+    """Also where they do not fit into one chunk."""
+    points, others = torch.rand(7, 3), torch.rand(5, 3)
+    wanted = torch.stack([(others - p).norm(dim=1).min() for p in points])
+    monkeypatch.setattr(module, "CHUNK", 11)
+    torch.testing.assert_close(module.nearest(points, others), wanted)
+
+
+def test_a_continued_fit_equals_an_uninterrupted_one(module):
+    """Both models, bit for bit: their Gaussians, moments and statistics, and the random cameras to come."""
+    whole, half = advanced(fit(module), 10), advanced(fit(module), 5)
+    again = fit(module)
+    again.load(*half.state())
+    (tensors, plain), (others, rest) = whole.state(), advanced(again, 10).state()
+    assert plain == rest and tensors.keys() == others.keys()
+    assert all(torch.equal(t, others[n]) for n, t in tensors.items())
+    assert any(n.startswith("twin.") for n in tensors)
+
+
+def error(trainer: Trainer, table) -> float:
+    """Return the summed mean absolute error of a model on the training views."""
+    options = trainer.context.render_options()
+    with torch.no_grad():
+        return sum(float((rasterize(table.gaussians, v.camera, options).rgb - v.image).abs().mean()) for v in trainer.views)
+
+
+def test_models_differ_and_learn(module):
+    """Both are trained on the same views, in an order of their own."""
+    trainer = fit(module, steps=40, gradient=1.0)
+    ours, twin = trainer.table, trainer.strategy.twin.table
+    before = error(trainer, ours)
+    assert error(trainer, twin) == before
+    advanced(trainer, 40)
+    assert len(twin) == len(ours) and not torch.equal(twin.params["means"], ours.params["means"])
+    assert max(error(trainer, ours), error(trainer, twin)) < 0.8 * before
+
+
+def test_gaussians_without_a_neighbour_are_pruned_in_both_models(module):
+    """One that stands alone in either model is gone after co-pruning, and no other is."""
+    trainer = fit(module)
+    strategy, table = trainer.strategy, trainer.table
+    counts = len(table), len(strategy.twin.table)
+    with torch.no_grad():
+        table.params["means"][3] += 100 * trainer.context.extent
+        strategy.twin.table.params["means"][5] -= 100 * trainer.context.extent
+    for change in strategy.update(6):
+        table.apply(change)
+    assert strategy.prunes(6) and not strategy.prunes(4)
+    assert (len(table), len(strategy.twin.table)) == (counts[0] - 1, counts[1] - 1)
+    assert all(
+        float(t.params["means"].detach().abs().max()) < 50 * trainer.context.extent for t in (table, strategy.twin.table)
+    )
+
+
+def test_the_term_is_zero_where_models_agree(module):
+    """At the first step both models are one; the weight scales what follows."""
+    trainer = fit(module)
+    assert float(trainer.strategy.regularisation((False, 1), trainer.gaussians)) == pytest.approx(0, abs=1e-6)
+    with torch.no_grad():
+        trainer.strategy.twin.table.params["sh"] += 0.5
+    assert float(trainer.strategy.regularisation((False, 1), trainer.gaussians)) > 0.01
+
+
+def test_random_cameras_stay_between_their_neighbours(module):
+    """Rotations are rotations; without noise the position is that of a training camera."""
+    views = advanced(fit(module), 0).views
+    cameras = module.Pseudo(views, 0.0)
+    generator = torch.Generator().manual_seed(1)
+    for _ in range(5):
+        camera = cameras.draw(generator)
+        R, t = camera.viewmat[:3, :3].double(), camera.viewmat[:3, 3].double()
+        torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-6, rtol=0)
+        assert float((cameras.centers - -(R.T @ t)).norm(dim=1).min()) < 1e-5
+
+
+def test_scenes_that_it_cannot_fit_are_refused(module):
+    """One view has no neighbour; transparent views have a random background, which two renders would not share."""
+    with pytest.raises(UsageError, match="at least two opaque"):
+        fit(module, views=1)
+    config = fit(module).config
+    cut_out = [dataclasses.replace(v, alpha=v.image[..., 0]) for v in photos(3)]
+    with pytest.raises(UsageError, match="at least two opaque"):
+        Trainer(cut_out, seeds(), config, CPU)
