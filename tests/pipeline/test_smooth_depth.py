@@ -86,8 +86,6 @@ def test_few_opaque_views_have_the_term(views, alpha, weight):
     assert config.loss.smooth_weight == weight
     few = 3000 if alpha else 4500
     assert config.steps == (few if views <= FEW else steps_by_views(views))
-        3000 if alpha else 4500 if views <= FEW else steps_by_views(views)
-    )
     assert [t.name for t in built_in_terms(config.loss)] == ["photometric", "smooth_depth"][: 1 + (weight > 0)]
     short = dataclasses.replace(default, steps=SMOOTH_STEPS - 1), PRESETS["quick"], PRESETS["3dgs"]
     assert all(settings_by_views(c, train, "cuda")[0].loss.smooth_weight == 0 for c in short)
