@@ -13,7 +13,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of few views at most: where views know their opacity, and where all are opaque."""
+"""Steps of a fit of up to `FEW` views at most: where views know their opacity, and where all are opaque."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Views from which steps grow beyond `MIN_STEPS`; the power of their number with which they do; and their bound."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
@@ -39,9 +39,10 @@ CPU_SECONDS = 45.0, 4.0, 1200.0
 
 
 def steps_by_views(views: int, opaque: bool = True) -> int:
-    """Return the most steps of a fit of so many views: 4500 up to 6 opaque ones, 5511 for 9, 30,000 from 87 on."""
-    grown = round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER)
-    return min(MAX_STEPS, max(grown, OPAQUE_STEPS if opaque else MIN_STEPS))
+    """Return the most steps of a fit of so many views: 4500 up to 4 opaque ones, 5511 for 9, 30,000 from 87 on."""
+    if opaque and views <= FEW:
+        return OPAQUE_STEPS
+    return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
 def cpu_seconds(views: int) -> float:
