@@ -21,9 +21,9 @@ def snippets(page: str) -> list[str]:
 
 def test_the_example_of_the_rasterizer_fits_an_image(capsys):
     """Run as printed, it ends near the target."""
-    text = next(t for t in snippets("docs/python.md") if "rasterize(" in t and "backward()" in t)
+    text = next(t for t in snippets("docs/rasterizer.md") if "rasterize(" in t and "backward()" in t)
     assert len(text.splitlines()) <= 28
-    exec(compile(text, "docs/python.md", "exec"), {})
+    exec(compile(text, "docs/rasterizer.md", "exec"), {})
     assert float(capsys.readouterr().out.split()[-1]) < 0.06
 
 

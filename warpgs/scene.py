@@ -34,7 +34,7 @@ class Camera:
     height: int
     """Image height [px]."""
     model: str = "pinhole"
-    """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/python.md), or one of your own."""
+    """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
     """Coefficients of the camera model, shape [P] or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4, k1 to k4;
     None for a model without. They have no gradient: those that require one are refused."""

@@ -51,8 +51,8 @@ class FitConfig:
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
     antialiased: bool = False
     """Antialiased model, for renders at other sizes than that of the photos (Mip-Splatting, Yu et al. 2024): opacities are
-    reduced below the size of a pixel, and no axis is smaller than the training cameras resolve (docs/python.md). Renders of the
-    run are antialiased, too; other programs need their antialiased mode."""
+    reduced below the size of a pixel, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of
+    the run are antialiased, too; other programs need their antialiased mode."""
     half_resolution: float | None = 0.0
     """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md). None: by the number
     of views."""
