@@ -233,7 +233,7 @@ def _depth_order(
     else:
         inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
         interop.launch(k.visible_keys, threads, inputs, device)
-    wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+    interop.sort_pairs(depths_view, order_view, visible)
     return order, visible, total
 
 
@@ -254,7 +254,7 @@ def _sort_by_tile(
     """
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
     keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
-    wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
+    interop.sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
     inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
     interop.launch(make_find_ranges(slotted), total, inputs, keys.device)
     return ids
