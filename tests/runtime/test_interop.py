@@ -235,6 +235,8 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
     with ThreadPoolExecutor(2) as pool:
         for count, found in zip(counts, pool.map(launches, counts), strict=True):
             assert found == [[times] * count for times in (1, 2, 3)]
+
+
 @wp.kernel(enable_backward=False)
 def tell_apart(
     begin: int, table: wp.array2d(dtype=wp.float32), numbers: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.float32)
