@@ -13,7 +13,7 @@ from warpgs.constants import RULES
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
 from warpgs.render.compose import inputs_of
-from warpgs.render.graphed import MIN_CALLS, Recorder, call_key
+from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphPool
@@ -30,11 +30,11 @@ class Counted:
 
     def __init__(self, settings, cameras, capacity, graphs):
         type(self).made += 1
-        self.limit, self.instances, self.rendered = capacity - 1024, 0, 0
+        self.limit, self.needed, self.rendered = capacity.instances - SPARE, None, 0
 
     def render(self, sources, backgrounds):
-        self.instances = type(self).seen
-        fits = self.instances <= self.limit
+        self.needed = Capacity(5, type(self).seen)
+        fits = self.needed.instances <= self.limit
         self.rendered += fits
         return "images" if fits else None
 
@@ -58,7 +58,7 @@ def recorder(monkeypatch, surroundings) -> Recorder:
     """A recorder whose rasterizers render nothing; a call has `Counted.seen` instances."""
     Counted.made, Counted.seen = 0, 100
     monkeypatch.setattr(graphed, "GraphedRasterizer", Counted)
-    monkeypatch.setattr(graphed, "count_instances", lambda *_: Counted.seen)
+    monkeypatch.setattr(graphed, "count_needed", lambda *_: Capacity(5, Counted.seen))
     return Recorder(GraphPool(CPU))
 
 
@@ -179,7 +179,8 @@ def test_other_planes_are_another_graph(surroundings):
         assert torch.equal(*images) and all(torch.equal(a, b) for a, b in zip(*gradients))
 
 
-def test_a_rasterizer_that_is_too_small_says_so(surroundings):
+@pytest.mark.parametrize("short", ["visible", "instances"])
+def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     """The call runs without graphs, and the next rasterizer has the capacity."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
@@ -188,11 +189,11 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings):
     for _ in range(MIN_CALLS):
         found = own.render(sources, None, settings)
     assert found is not None
-    own.rasterizer.capacity = own.rasterizer.instances - 1
+    own.rasterizer.capacity = own.rasterizer.needed._replace(**{short: getattr(own.rasterizer.needed, short) - 1})
     assert own.render(sources, None, settings) is None and own.rasterizer is None
     for _ in range(2 * MIN_CALLS):
         found = own.render(sources, None, settings)
-    assert found is not None and own.rasterizer.capacity > own.rasterizer.instances
+    assert found is not None and own.rasterizer.needed.within(own.rasterizer.capacity)
 
 
 def first_graphed(own: Recorder, g: Gaussians, cam: Camera):
