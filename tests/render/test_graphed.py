@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import itertools
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -28,7 +29,7 @@ class Counted:
 
     made, seen = 0, 100
 
-    def __init__(self, settings, cameras, capacity, graphs):
+    def __init__(self, settings, cameras, capacity, graphs, gradients):
         type(self).made += 1
         self.limit, self.needed, self.rendered = capacity.instances - SPARE, None, 0
 
@@ -105,15 +106,18 @@ def test_rasterizers_that_do_not_pay_are_made_less_and_less(recorder):
 
 
 def test_calls_that_cannot_be_captured_are_not(recorder, monkeypatch):
-    """No gradients, float64, rows that are not contiguous, too many Gaussians, too little memory."""
+    """Float64, rows that are not contiguous, too many Gaussians, too little memory; images without gradients in a thread."""
     own = batch()
     monkeypatch.setattr(graphed, "MAX_PROJECTED", 19)
     assert call_key(own, None, SETTINGS) is None
     monkeypatch.setattr(graphed, "MAX_PROJECTED", 20)
     assert call_key(own, None, SETTINGS) is not None
-    with torch.no_grad():
-        assert call_key(own, None, SETTINGS) is None
-    assert call_key(own.detached(), None, SETTINGS) is None
+    assert call_key(own, None, SETTINGS, gradients=False) is not None
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(call_key, own, None, SETTINGS, gradients=False).result() is None
+        assert pool.submit(call_key, own, None, SETTINGS).result() is not None
+    with torch.inference_mode():
+        assert call_key(own, None, SETTINGS, gradients=False) is None
     assert call_key(ProjectInputs(*(t.double() for t in own)), None, SETTINGS) is None
     assert call_key(own._replace(means=own.means.T.contiguous().T), None, SETTINGS) is None
     assert call_key(own, torch.zeros(1, 3), SETTINGS) is not None and call_key(own, torch.zeros(3), SETTINGS) is None
@@ -163,6 +167,20 @@ def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
     wanted = results(g, cams, backgrounds)
     for each in found[MIN_CALLS - 1 :]:
         assert all(torch.equal(a, b) for a, b in itertools.zip_longest(each, wanted))
+
+
+def test_images_without_gradients_have_the_same_bits(surroundings):
+    """And keep nothing for a backward pass."""
+    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU), gradients=False)
+    cam = camera(70, 50, 2, torch.float32)
+    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    with torch.no_grad():
+        for _ in range(MIN_CALLS + 1):
+            found = own.render(inputs_of(g, cam), None, settings)
+        wanted = rasterize(g, cam)
+    assert own.rasterizer.rendered == 2 and len(own.rasterizer._forward_blend._places) == 0
+    for a, b in zip((*found[0], *found[1:]), (wanted.rgb, wanted.alpha, wanted.depth, wanted.projected, wanted.tile_counts)):
+        assert torch.equal(a, b) and not a.requires_grad
 
 
 def test_other_planes_are_another_graph(surroundings):

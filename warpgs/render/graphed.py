@@ -12,6 +12,7 @@ import contextlib
 import functools
 import math
 import os
+import threading
 import weakref
 from typing import NamedTuple
 
@@ -71,7 +72,9 @@ class Capacity(NamedTuple):
 class GraphedRasterizer:
     """Render and gradients of one set of tensors for any camera, as four graphed functions."""
 
-    def __init__(self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool):
+    def __init__(
+        self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
+    ):  # fmt: skip
         """Prepare the functions; nothing is rendered yet.
 
         Args:
@@ -79,8 +82,10 @@ class GraphedRasterizer:
             cameras: Number of images at a time.
             capacity: Numbers to allocate memory for.
             graphs: Pool to capture graphs in.
+            gradients: True to keep what the backward pass needs.
         """
         self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
+        self.gradients = gradients
         self._project_settings = settings.projection()
         self._coefficients = CAMERA_MODELS.find(settings.camera_model).coefficients
         self.rendered = 0
@@ -127,8 +132,10 @@ class GraphedRasterizer:
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
         images, block = self._forward_blend(*projection, sums, backgrounds.detach())
-        projected = _projected(self, cameras, projection, *inputs[:7])
-        images = _blended(projected, backgrounds, self, projection[1], images, block)
+        projected = projection[0]
+        if self.gradients:
+            projected = _projected(self, cameras, projection, *inputs[:7])
+            images = _blended(projected, backgrounds, self, projection[1], images, block)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
         self.needed = Capacity(*split_sum(int(self._total[0])))
@@ -159,7 +166,9 @@ class GraphedRasterizer:
         memory = InstanceMemory(
             None, self.capacity.instances, overflow, allocator, Visible(sums, self.capacity.visible)
         )  # fmt: skip
-        tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory)
+        tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory, self.gradients)
+        if not self.gradients:
+            return ()
         return *(t for t in tiles.tensors() if t is not tiles.counts), *saved
 
     def _blend_gradients(self, allocator: Allocator, projected, counts, backgrounds, rgb, depth, block, *v_images) -> tuple[()]:
@@ -251,8 +260,8 @@ _projected, _blended = (super(torch.autograd.Function, node).apply for node in (
 class Recorder:
     """History of the calls on one stream, and the rasterizer of those that came often enough."""
 
-    def __init__(self, graphs: GraphPool):
-        self.graphs = graphs
+    def __init__(self, graphs: GraphPool, gradients: bool = True):
+        self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
         """Rasterizer of the calls at hand; None where they were too few."""
         self.min_calls = MIN_CALLS
@@ -266,7 +275,7 @@ class Recorder:
 
         ``inputs`` are without opacity factors; ``backgrounds`` [C, 3] may be None.
         """
-        key = None if self.graphs.failed else call_key(inputs, backgrounds, settings)
+        key = None if self.graphs.failed else call_key(inputs, backgrounds, settings, self.gradients)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
         try:
@@ -306,7 +315,7 @@ class Recorder:
             visible, instances = (int(CAPACITY_FACTOR * n) + SPARE for n in needed)
             cameras = len(inputs.viewmats)
             capacity = Capacity(min(visible, cameras * len(inputs.means)), instances)
-            self.rasterizer = GraphedRasterizer(settings, cameras, capacity, self.graphs)
+            self.rasterizer = GraphedRasterizer(settings, cameras, capacity, self.graphs, self.gradients)
 
     def _drop(self) -> None:
         if self.rasterizer is not None:
@@ -328,16 +337,19 @@ def count_needed(inputs: ProjectInputs, settings: RenderSettings) -> Capacity:
     return Capacity(*torch.stack([(counts > 0).sum(), counts.sum()]).tolist())
 
 
-def call_key(inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings) -> tuple | None:
+def call_key(
+    inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings, gradients: bool = True
+) -> tuple | None:  # fmt: skip
     """Return the values that calls must have in common to use one rasterizer.
 
-    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients.
-    ``backgrounds`` [C, 3] may be None.
+    None for calls that cannot be captured, and for those that need not be: very large ones. ``backgrounds`` [C, 3] may be None.
+    Calls without ``gradients`` are captured in the main thread alone: a viewer renders beside a loop that may wait for the
+    whole device.
     """
     means, viewmats = inputs.means, inputs.viewmats
     projected, tiles = len(means) * len(viewmats), math.prod(grid(*settings.window[2:], settings.tile_size))
     small = 0 < projected <= MAX_PROJECTED and projected * tiles < VISIBLE  # the sums hold every count
-    fit = means.dtype == torch.float32 and torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
         return None
     if backgrounds is not None and tuple(backgrounds.shape) != (len(viewmats), 3):
@@ -365,14 +377,14 @@ def _can_capture(device: torch.device) -> bool:
 
 
 _UNCACHED = os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") is not None
-_RECORDERS: dict[tuple[torch.device, int], Recorder] = {}
+_RECORDERS: dict[tuple[torch.device, int, bool], Recorder] = {}
 
 
-def recorder(device: torch.device) -> Recorder:
-    """Return the recorder of torch's current stream on a CUDA device."""
-    key = (device, interop.warp_stream(device).cuda_stream)
+def recorder(device: torch.device, gradients: bool = True) -> Recorder:
+    """Return the recorder of torch's current stream on a CUDA device, for calls with or without ``gradients``."""
+    key = (device, interop.warp_stream(device).cuda_stream, gradients)
     found = _RECORDERS.get(key)
-    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device)))
+    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
 
 
 def clear_graph_cache() -> None:

@@ -81,7 +81,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError("pixels do not go with window, contributions and capacity: leave those out")
     if options.error_bound and options.capacity is not None:
         raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
-    return replace(rule, near=near, far=far)
+    return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
 
 
 def _matrices(K: Any) -> list[list[list[float]]]:
@@ -272,7 +272,8 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     features = _checked_channels("features", options.features, inputs)
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
-        found = graphed.recorder(inputs.means.device).render(inputs, backgrounds, settings)
+        gradients = needs_slots((*inputs, backgrounds))
+        found = graphed.recorder(inputs.means.device, gradients).render(inputs, backgrounds, settings)
         if found is not None:
             return _as_render(camera, *found)
     layers = [_layer("background", options.background, colors, inputs)]
