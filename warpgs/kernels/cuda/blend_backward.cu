@@ -76,7 +76,7 @@ while (top_instance > floor) {
                 T[k] = T_end;
                 #pragma unroll
                 for (int c = 0; c < CHANNELS; ++c)
-                    G[k][c] = CHANNELS == 3 || c < v_rgb.shape[1] ? v_rgb.data[v_pitch * o + c] : 0.0f;
+                    G[k][c] = c < v_rgb.shape[1] ? v_rgb.data[v_pitch * o + c] : 0.0f;
                 float z_end = 0.0f;
                 if (with_depth) {
                     const float W = weights.data[o];
@@ -99,7 +99,7 @@ while (top_instance > floor) {
                     behind[k] = (rgb.data[pitch * o] - state[PIXELS]) * G[k][0];
                     #pragma unroll
                     for (int c = 1; c < CHANNELS; ++c)
-                        if (CHANNELS == 3 || c < rgb.shape[1])
+                        if (c < rgb.shape[1])
                             behind[k] += (rgb.data[pitch * o + c] - state[(1 + c) * PIXELS]) * G[k][c];
                     if (with_depth)
                         behind[k] += (z_end - state[(1 + CHANNELS) * PIXELS]) * vz[k] + (state[0] - T_end) * vw[k];

@@ -126,7 +126,8 @@ for (int k = 0; k < PER; ++k) {
         if (inside)
             #pragma unroll
             for (int c = 0; c < CHANNELS; ++c)
-                rgb.data[pitch * o + c] = color[k][c] + T[k] * background[c];
+                if (c < rgb.shape[1])
+                    rgb.data[pitch * o + c] = color[k][c] + T[k] * background[c];
     } else {
         // through shared memory, so that a store of the warp goes to few pixels, whose channels are neighbours
         float* staged = reinterpret_cast<float*>(s_rest[warp]);
