@@ -107,13 +107,17 @@ def measure_in_turn(
     """
     begin, before = time.perf_counter(), others_seconds()
     shortest = [_warm_up(work, device, limit_ms, repeats >= REPEATS) for work in works]
+    gc.collect()
+    gc.freeze()  # so that later collections are short
     samples = [[] for _ in works]
     in_turn = [i for i, least in enumerate(shortest) if least <= limit_ms]
     apart = [i for i in in_turn if shortest[i] > APART * min(shortest)]
     for group in ([i for i in in_turn if i not in apart], *([i] for i in apart)):
         for _ in range(repeats):
             for i in group:
+                gc.collect()  # memory that a program leaves in reference cycles is freed before the next one begins
                 samples[i].append(_timed(works[i], device))
+    gc.unfreeze()
     rows = []
     for own, least in zip(samples, shortest):
         if not own:

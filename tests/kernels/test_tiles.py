@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import warp as wp
 
 from tests.gaussians import SMOOTH, camera, cloud
 from tests.reference.project import project_reference
@@ -10,7 +11,8 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import InstanceMemory, bin_tiles
+from warpgs.kernels.tiles import InstanceMemory, Visible, bin_tiles, running_counts, split_sum
+from warpgs.runtime.allocator import TORCH
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
@@ -150,6 +152,26 @@ def test_lists_without_slots_are_the_same(device):
         blend(projected.requires_grad_(), bare, backgrounds, **size)
     with pytest.raises(ValueError, match="no slots"):
         contributions(projected, bare, **size)
+
+
+def test_room_for_visible_gaussians_changes_no_list(device):
+    """As many as there are, more, and all; with less, what is written stays inside."""
+    gaussians, cam = cloud(300, torch.float32, device), camera(64, 48, cameras=2, dtype=torch.float32, device=device)
+    gaussians.means[::3, 2] = -4.0  # behind the cameras
+    projected, counts, wanted = binned(gaussians, cam)
+    seen, total = int((counts > 0).sum()), int(counts.sum())
+    assert 300 < seen < 550
+    sums = running_counts(counts.view(-1), wp.float32, TORCH)
+    assert split_sum(int(sums[-1])) == (seen, total)
+    for room in (seen, seen + 1, 550, 600, seen - 1, 1):
+        overflow = torch.zeros(1, dtype=torch.int32, device=device)
+        memory = InstanceMemory(capacity=total + 9, overflow=overflow, visible=Visible(sums, room))
+        made = bin_tiles(projected, counts, width=64, height=48, rule=EXACT, memory=memory)
+        assert made.visible == room and int(made.total) <= total
+        if room >= seen:
+            assert torch.equal(made.ranges, wanted.ranges) and int(made.total) == total
+            assert torch.equal(made.gaussian_ids[:total], wanted.gaussian_ids) and torch.equal(made.slots[:total], wanted.slots)
+            assert torch.equal(made.starts[counts.view(-1) > 0], wanted.starts[counts.view(-1) > 0])
 
 
 @pytest.mark.cuda

@@ -122,7 +122,7 @@ def test_chunks_make_the_same_image(device, dtype):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("channels", [3, 5, 8, 32])
+@pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 32])
 def test_native_kernels_agree_with_generic_ones(channels):
     """Float32 on CUDA against float64: images and gradients within 1e-5, the same bits each time."""
     device = torch.device("cuda", 0)

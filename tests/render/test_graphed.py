@@ -4,6 +4,7 @@ import dataclasses
 import gc
 import itertools
 import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -13,7 +14,7 @@ from warpgs.constants import RULES
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render import graphed
 from warpgs.render.compose import inputs_of
-from warpgs.render.graphed import MIN_CALLS, Recorder, call_key
+from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphPool
@@ -28,13 +29,13 @@ class Counted:
 
     made, seen = 0, 100
 
-    def __init__(self, settings, cameras, capacity, graphs):
+    def __init__(self, settings, cameras, capacity, graphs, gradients):
         type(self).made += 1
-        self.limit, self.instances, self.rendered = capacity - 1024, 0, 0
+        self.limit, self.needed, self.rendered = capacity.instances - SPARE, None, 0
 
     def render(self, sources, backgrounds):
-        self.instances = type(self).seen
-        fits = self.instances <= self.limit
+        self.needed = Capacity(5, type(self).seen)
+        fits = self.needed.instances <= self.limit
         self.rendered += fits
         return "images" if fits else None
 
@@ -58,7 +59,7 @@ def recorder(monkeypatch, surroundings) -> Recorder:
     """A recorder whose rasterizers render nothing; a call has `Counted.seen` instances."""
     Counted.made, Counted.seen = 0, 100
     monkeypatch.setattr(graphed, "GraphedRasterizer", Counted)
-    monkeypatch.setattr(graphed, "count_instances", lambda *_: Counted.seen)
+    monkeypatch.setattr(graphed, "count_needed", lambda *_: Capacity(5, Counted.seen))
     return Recorder(GraphPool(CPU))
 
 
@@ -105,15 +106,18 @@ def test_rasterizers_that_do_not_pay_are_made_less_and_less(recorder):
 
 
 def test_calls_that_cannot_be_captured_are_not(recorder, monkeypatch):
-    """No gradients, float64, rows that are not contiguous, too many Gaussians, too little memory."""
+    """Float64, rows that are not contiguous, too many Gaussians, too little memory; images without gradients in a thread."""
     own = batch()
     monkeypatch.setattr(graphed, "MAX_PROJECTED", 19)
     assert call_key(own, None, SETTINGS) is None
     monkeypatch.setattr(graphed, "MAX_PROJECTED", 20)
     assert call_key(own, None, SETTINGS) is not None
-    with torch.no_grad():
-        assert call_key(own, None, SETTINGS) is None
-    assert call_key(own.detached(), None, SETTINGS) is None
+    assert call_key(own, None, SETTINGS, gradients=False) is not None
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(call_key, own, None, SETTINGS, gradients=False).result() is None
+        assert pool.submit(call_key, own, None, SETTINGS).result() is not None
+    with torch.inference_mode():
+        assert call_key(own, None, SETTINGS, gradients=False) is None
     assert call_key(ProjectInputs(*(t.double() for t in own)), None, SETTINGS) is None
     assert call_key(own._replace(means=own.means.T.contiguous().T), None, SETTINGS) is None
     assert call_key(own, torch.zeros(1, 3), SETTINGS) is not None and call_key(own, torch.zeros(3), SETTINGS) is None
@@ -165,6 +169,20 @@ def test_a_graphed_rasterizer_gives_the_same_bits(surroundings):
         assert all(torch.equal(a, b) for a, b in itertools.zip_longest(each, wanted))
 
 
+def test_images_without_gradients_have_the_same_bits(surroundings):
+    """And keep nothing for a backward pass."""
+    g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU), gradients=False)
+    cam = camera(70, 50, 2, torch.float32)
+    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    with torch.no_grad():
+        for _ in range(MIN_CALLS + 1):
+            found = own.render(inputs_of(g, cam), None, settings)
+        wanted = rasterize(g, cam)
+    assert own.rasterizer.rendered == 2 and len(own.rasterizer._forward_blend._places) == 0
+    for a, b in zip((*found[0], *found[1:]), (wanted.rgb, wanted.alpha, wanted.depth, wanted.projected, wanted.tile_counts)):
+        assert torch.equal(a, b) and not a.requires_grad
+
+
 def test_other_planes_are_another_graph(surroundings):
     """Near and far plane of the rule count, in the image and in gradients."""
     g, cam, own = leaves(cloud(200)), camera(64, 48, dtype=torch.float32), Recorder(NoGraphPool(CPU))
@@ -179,7 +197,8 @@ def test_other_planes_are_another_graph(surroundings):
         assert torch.equal(*images) and all(torch.equal(a, b) for a, b in zip(*gradients))
 
 
-def test_a_rasterizer_that_is_too_small_says_so(surroundings):
+@pytest.mark.parametrize("short", ["visible", "instances"])
+def test_a_rasterizer_that_is_too_small_says_so(surroundings, short):
     """The call runs without graphs, and the next rasterizer has the capacity."""
     g, own = leaves(cloud(300)), Recorder(NoGraphPool(CPU))
     cam = camera(70, 50, 1, torch.float32)
@@ -188,11 +207,11 @@ def test_a_rasterizer_that_is_too_small_says_so(surroundings):
     for _ in range(MIN_CALLS):
         found = own.render(sources, None, settings)
     assert found is not None
-    own.rasterizer.capacity = own.rasterizer.instances - 1
+    own.rasterizer.capacity = own.rasterizer.needed._replace(**{short: getattr(own.rasterizer.needed, short) - 1})
     assert own.render(sources, None, settings) is None and own.rasterizer is None
     for _ in range(2 * MIN_CALLS):
         found = own.render(sources, None, settings)
-    assert found is not None and own.rasterizer.capacity > own.rasterizer.instances
+    assert found is not None and own.rasterizer.needed.within(own.rasterizer.capacity)
 
 
 def first_graphed(own: Recorder, g: Gaussians, cam: Camera):

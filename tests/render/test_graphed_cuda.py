@@ -124,6 +124,22 @@ def test_a_training_loop_is_replayed(fresh):
     assert replays() - before == 4 * 40 and fresh.rasterizer._forward_blend.captures == captured
 
 
+def test_images_without_gradients_are_replayed(fresh):
+    """Beside a loop with gradients, whose graphs stay; the bits are those of single kernels."""
+    g, cams = scene(2000)
+    images = graphed.recorder(CUDA, False)
+    images.clear()
+    for step in range(40):
+        (rasterize(g, cams[step % 4]).rgb ** 2).sum().backward()
+        with torch.no_grad():
+            found, wanted = (rasterize(g, cams[step % 4], o) for o in (RasterizeOptions(), PLAIN))
+        assert all(torch.equal(getattr(found, n), getattr(wanted, n)) for n in ("rgb", "alpha", "depth", "projected"))
+        assert not found.rgb.requires_grad
+        del found, wanted
+    assert fresh.rasterizer.rendered > 30 and images.rasterizer.rendered > 30 and images.graphs.replays > 30
+    images.clear()
+
+
 def test_more_instances_than_the_capacity_run_without_graphs(fresh):
     """Gaussians that grow twice give the same bits, and are captured anew."""
     g, cams = scene(3000)
@@ -135,7 +151,7 @@ def test_more_instances_than_the_capacity_run_without_graphs(fresh):
     capacities = []
     for step in range(14):
         assert equal([image(True)], [image(False)])
-        capacities.append(0 if fresh.rasterizer is None else fresh.rasterizer.capacity)
+        capacities.append(0 if fresh.rasterizer is None else fresh.rasterizer.capacity.instances)
         if step in (5, 6):
             with torch.no_grad():
                 g.log_scales.add_(1)

@@ -237,6 +237,38 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
             assert found == [[times] * count for times in (1, 2, 3)]
 
 
+@wp.kernel(enable_backward=False)
+def tell_apart(
+    begin: int, table: wp.array2d(dtype=wp.float32), numbers: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.float32)
+):
+    i = begin + wp.tid()
+    found[i] = wp.float32(table.shape[0] * 100 + table.shape[1]) + 1000.0 * table[i, 1] + 1000000.0 * numbers[i]
+
+
+def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
+    """Flat, and in rows: also slices at the same address, of the same shape, whose rows lie at other distances."""
+    memory = torch.arange(60, dtype=torch.float32)
+    for width in (5, 10, 5):
+        image = memory.view(-1, 2, width)[:3]  # as of two rows of pixels
+        part = image[..., :3]
+        found = torch.zeros(6)
+        arguments = [interop.rows(part, wp.float32), interop.flat(image, wp.float32), interop.flat(found, wp.float32)]
+        interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
+        wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
+        assert torch.equal(found, wanted), width
+    empty = [interop.rows(part[..., :0], wp.float32), interop.rows(part[:0], wp.float32)]
+    assert [v.array().shape for v in empty] == [(0, 0), (0, 3)]
+
+
+def test_pairs_are_sorted_in_place_where_they_lie():
+    """Stably, by tensors that come and go at the same address, too."""
+    for seed in range(3):
+        keys = torch.randint(4, (40,), dtype=torch.int32, generator=torch.Generator().manual_seed(seed))
+        values, wanted = torch.arange(40, dtype=torch.int32), keys[:20].sort(stable=True)
+        interop.sort_pairs(interop.view(keys, wp.int32), interop.view(values, wp.int32), 20, end_bit=2)
+        assert torch.equal(keys[:20], wanted.values) and torch.equal(values[:20].long(), wanted.indices)
+
+
 def test_items_are_numbered_in_31_bits():
     """2^31 - 1 of them can be, one more cannot."""
     interop._check_size(2**31 - 1)

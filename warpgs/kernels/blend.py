@@ -83,7 +83,7 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
 def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
     """Return what the generic kernels take: projected Gaussians [C, N, 9 + D], and the instances of each tile."""
     return [
-        interop.view(projected.view(-1, projected.shape[-1]), real),
+        interop.rows(projected, real),
         interop.view(tiles.ranges, wp.int32),
         interop.view(tiles.gaussian_ids, wp.int32),
     ]
@@ -97,6 +97,7 @@ def composite(
     *,
     save: bool,
     allocator: Allocator = TORCH,
+    image: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, ...]:
     """Return the images, and what the backward pass needs. Nothing is checked, and no gradient is recorded.
 
@@ -108,24 +109,27 @@ def composite(
         settings: Settings.
         save: True where gradients will be taken.
         allocator: Provider of the results' memory.
+        image: Memory of the channels, shape [C, H, W, D], which may be a slice of those of an image, or, on CUDA in float32,
+            of the first ones alone; None for new memory.
 
     Returns:
-        ``rgb`` [C, H, W, D]; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last instance that
-        was blended [C, H, W]; states of the chunks (CUDA only, else empty).
+        ``rgb`` [C, H, W, D], or ``image``; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last
+        instance that was blended [C, H, W]; states of the chunks (CUDA only, else empty).
     """
     if is_native(projected):
-        return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator)
+        return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = interop.real_of(projected), projected.device
     cameras, channels = backgrounds.shape
     shape = (cameras, settings.height, settings.width)
-    rgb, alpha, depth = (allocator.output(s, projected.dtype, device) for s in ((*shape, channels), shape, shape))
+    rgb = allocator.output((*shape, channels), projected.dtype, device) if image is None else image
+    alpha, depth = (allocator.output(shape, projected.dtype, device) for _ in range(2))
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(backgrounds, real),
-        interop.view(rgb.view(-1, channels), real),
-        *(interop.view(t.view(-1), real) for t in (alpha, depth, transmittances, weights)),
-        interop.view(ends.view(-1), wp.int32),
+        interop.rows(rgb, real),
+        *(interop.flat(t, real) for t in (alpha, depth, transmittances, weights)),
+        interop.flat(ends, wp.int32),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size, channels).forward, len(tiles.ranges), inputs, device)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
@@ -140,21 +144,21 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     deep = v_alpha is not None or v_depth is not None
-    upstream = [interop.view(v_rgb.contiguous().view(-1, channels), real)]
+    upstream = [interop.rows(v_rgb, real)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
-        upstream.append(interop.view(v.view(-1), real))
+        upstream.append(interop.flat(v, real))
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
         interop.view(backgrounds, real),
-        *(interop.view(t.view(-1), real) for t in (transmittances, weights, depth)), interop.view(ends.view(-1), wp.int32),
+        *(interop.flat(t, real) for t in (transmittances, weights, depth)), interop.flat(ends, wp.int32),
         *upstream, interop.view(v_slots, real),
     ]  # fmt: skip
     kernels = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep)
     _launch(kernels.backward, len(tiles.ranges), inputs, device)
     inputs = [
         interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
-        interop.view(v_projected.view(-1, v_projected.shape[-1]), real),
+        interop.rows(v_projected, real),
     ]  # fmt: skip
     interop.launch(make_segments(real, values).sum_gradients, len(tiles.counts), inputs, device, cost=5)
     return v_projected
@@ -176,12 +180,13 @@ def composite_gradients(
         tiles: Their tiles.
         backgrounds: Channels behind everything, shape [C, D].
         settings: Settings as given to `composite`.
-        saved: Results of `composite` but for ``alpha``.
-        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None.
+        saved: Results of `composite` but for ``alpha``. Of ``rgb`` only the channels that ``v_images`` has are read.
+        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The first
+            may be a slice of the channels of an image, and on CUDA in float32 have fewer than D: the others are 0.
         allocator: Provider of the gradient's memory.
     """
     v_rgb, v_alpha, v_depth = v_images
-    v_rgb = torch.zeros_like(saved[0]) if v_rgb is None else v_rgb
+    v_rgb = saved[0].new_zeros(*saved[0].shape[:-1], backgrounds.shape[1]) if v_rgb is None else v_rgb
     backward = blend_cuda.backward if is_native(projected) else _backward
     return backward(projected, tiles, backgrounds, settings, saved, (v_rgb, v_alpha, v_depth), allocator)
 
@@ -214,6 +219,7 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, *v_images):
         projected, backgrounds, *tensors = ctx.saved_tensors
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
+        v_images = [None if v is None else v.contiguous() for v in v_images]
         v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, saved, v_images)
         v_backgrounds = background_gradient(saved[2], v_images[0]) if ctx.needs_input_grad[1] else None
         return v_projected, v_backgrounds, None, None
@@ -325,13 +331,13 @@ def contributions(
         weights = projected.new_zeros(len(tiles.slots), 2)
         inputs = [
             settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
-            interop.view(ends.view(-1), wp.int32), interop.view(weights, real),
+            interop.flat(ends, wp.int32), interop.view(weights, real),
         ]  # fmt: skip
         _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
     sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])
     inputs = [
         interop.view(weights, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
-        interop.view(sums.view(-1), real), interop.view(maxima.view(-1), real),
+        interop.flat(sums, real), interop.flat(maxima, real),
     ]  # fmt: skip
     interop.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
     return sums, maxima

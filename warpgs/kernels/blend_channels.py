@@ -4,12 +4,13 @@ The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). Mo
 instances, and no memory but that of the image and the gradient (docs/blend.md, section 3).
 """
 
-from __future__ import annotations
-
+import functools
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import torch
+import warp as wp
 
 from warpgs.constants import Rule
 from warpgs.kernels.blend import (
@@ -24,6 +25,7 @@ from warpgs.kernels.blend import (
 from warpgs.kernels.blend_records import COLORS, WIDTHS
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles
+from warpgs.runtime import interop
 from warpgs.runtime.derivatives import first_order
 
 GEOMETRY = 6
@@ -36,6 +38,54 @@ def width_of(channels: int) -> int:
     return next(width for width in WIDTHS if width * passes >= channels)
 
 
+@functools.cache
+def make_kernels(real, width: int):
+    """Make the kernels that give Gaussians the channels of a pass, ``width`` of them, and take the gradient apart again."""
+    module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
+    geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
+    own, rest = wp.constant(width), wp.constant(GEOMETRY + width)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def color(
+        begin: int, projected: wp.array2d(dtype=real), counts: wp.array(dtype=int), colors: wp.array2d(dtype=real), first: int,
+        # outputs
+        colored: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        if counts[i] > 0:  # rows of others are not read
+            row = i % colors.shape[0]
+            for c in range(own):
+                value = real(0.0)
+                if first + c < colors.shape[1]:
+                    value = colors[row, first + c]
+                colored[i, geometry + c] = value
+            if first == 0:
+                for k in range(geometry):
+                    colored[i, k] = projected[i, k]
+                for k in range(3):
+                    colored[i, rest + k] = projected[i, box + k]
+
+    @wp.kernel(enable_backward=False, module=module)
+    def add(
+        begin: int, v: wp.array2d(dtype=real), counts: wp.array(dtype=int), first: int,
+        # outputs, to which is added
+        v_projected: wp.array2d(dtype=real), v_colors: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        row = begin + wp.tid()
+        rows = v_colors.shape[0]
+        for camera in range(counts.shape[0] // rows):
+            i = camera * rows + row
+            if counts[i] > 0:  # the gradient of others is 0
+                for k in range(geometry):
+                    v_projected[i, k] = v_projected[i, k] + v[i, k]
+                for k in range(3):
+                    v_projected[i, box + k] = v_projected[i, box + k] + v[i, rest + k]
+                for c in range(wp.min(own, v_colors.shape[1] - first)):
+                    v_colors[row, first + c] = v_colors[row, first + c] + v[i, geometry + c]
+
+    return SimpleNamespace(color=color, add=add)
+
+
 class _Group(NamedTuple):
     """The channels of one pass."""
 
@@ -44,24 +94,29 @@ class _Group(NamedTuple):
     projected: torch.Tensor
     """Projected Gaussians that have them in place of a colour, shape [C, N, 9 + G]. All groups share the memory."""
     backgrounds: torch.Tensor
-    """Background of the channels, shape [C, G]."""
+    """Background of the channels, shape [C, G]: zeros fill up the last group."""
 
 
-def _padded(values: torch.Tensor, channels: slice) -> torch.Tensor:
-    """Return a group of channels of values [..., D], contiguous, shape [..., G]: zeros fill up the last group."""
-    part, width = values[..., channels], width_of(values.shape[-1])
-    return torch.nn.functional.pad(part, (0, width - part.shape[-1])).contiguous()
+def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
+    """Return values [..., F] as [..., width]: zeros fill them up."""
+    return torch.nn.functional.pad(values, (0, width - values.shape[-1]))
 
 
-def _groups(projected: torch.Tensor, colors: torch.Tensor, backgrounds: torch.Tensor) -> Iterator[_Group]:
+def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
+    """Return the gradient of a pass [..., F] as its kernels take it: the generic ones read ``width`` channels."""
+    return v_image if native or v_image.shape[-1] == width else _padded(v_image, width)
+
+
+def _groups(projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor) -> Iterator[_Group]:
     """Yield the groups of all channels, in order; each must be done with before the next."""
-    count, width = colors.shape[-1], width_of(colors.shape[-1])
-    rest = projected[..., GEOMETRY + COLORS :]
-    colored = torch.cat([projected[..., :GEOMETRY], projected.new_empty(*projected.shape[:2], width), rest], -1)
+    count, width, real = colors.shape[-1], width_of(colors.shape[-1]), interop.real_of(colors)
+    colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
+    inputs = [interop.rows(projected, real), interop.view(tiles.counts, wp.int32), interop.rows(colors, real)]
     for first in range(0, count, width):
         channels = slice(first, min(first + width, count))
-        colored[..., GEOMETRY : GEOMETRY + width] = _padded(colors, channels)
-        yield _Group(channels, colored, _padded(backgrounds, channels))
+        arguments = [*inputs, first, interop.rows(colored, real)]
+        interop.launch(make_kernels(real, width).color, len(tiles.counts), arguments, projected.device, cost=5)
+        yield _Group(channels, colored, _padded(backgrounds[:, channels], width).contiguous())
 
 
 class _BlendChannels(torch.autograd.Function):
@@ -70,12 +125,19 @@ class _BlendChannels(torch.autograd.Function):
         save = any(ctx.needs_input_grad)
         if save:
             check_slots(tiles)
+        projected, colors = projected.contiguous(), colors.contiguous()
         image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
         found = None
-        for group in _groups(projected, colors, backgrounds):
+        for group in _groups(projected, tiles, colors, backgrounds):
             # the first pass gives all that does not depend on the channels
-            rgb, *rest = composite(group.projected, tiles, group.backgrounds, settings, save=save and found is None)
-            image[..., group.channels] = rgb[..., : group.channels.stop - group.channels.start]
+            part = image[..., group.channels]
+            whole = part.shape[-1] == group.backgrounds.shape[-1]
+            rgb, *rest = composite(
+                group.projected, tiles, group.backgrounds, settings, save=save and found is None,
+                image=part if whole or is_native(projected) else None,
+            )  # fmt: skip
+            if rgb is not part:
+                part.copy_(rgb[..., : part.shape[-1]])
             found = found or rest
         alpha, depth, *saved = found
         if save:
@@ -90,23 +152,26 @@ class _BlendChannels(torch.autograd.Function):
         projected, colors, backgrounds, image, *tensors = ctx.saved_tensors
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
         v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
-        for group in _groups(projected, colors, backgrounds):
-            first = group.channels.start == 0
-            if v_image is None and not first:
+        v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))
+        real, width = interop.real_of(projected), width_of(colors.shape[-1])
+        outputs = [interop.rows(t, real) for t in (v_projected, v_colors)]
+        for group in _groups(projected, tiles, colors, backgrounds):
+            first = group.channels.start
+            if v_image is None and first > 0:
                 break
-            saved = [_padded(image, group.channels), *shared]
-            if is_native(projected) and not first:
+            saved = [image[..., group.channels], *shared]
+            if is_native(projected) and first > 0:
                 # states hold the channels; to keep those of all groups would take memory for each channel
-                rgb, _, *rest = composite(group.projected, tiles, group.backgrounds, ctx.settings, save=True)
-                saved = [rgb, *rest]
-            v_rgb = None if v_image is None else _padded(v_image, group.channels)
-            v_images = (v_rgb, v_alpha, v_depth) if first else (v_rgb, None, None)
+                again = composite(
+                    group.projected, tiles, group.backgrounds, ctx.settings, save=True, image=image[..., :0]
+                )  # fmt: skip
+                saved[1:] = again[2:]
+            v_rgb = None if v_image is None else _given(v_image[..., group.channels], width, is_native(projected))
+            v_images = (v_rgb, v_alpha, v_depth) if first == 0 else (v_rgb, None, None)
             v = composite_gradients(group.projected, tiles, group.backgrounds, ctx.settings, saved, v_images)
-            v_geometry, v_own, v_rest = v.split([GEOMETRY, width_of(colors.shape[-1]), 3], -1)
-            part = v_colors[..., group.channels]
-            part += v_own[..., : part.shape[-1]].sum_to_size(part.shape)
-            v_projected[..., :GEOMETRY] += v_geometry
-            v_projected[..., GEOMETRY + COLORS :] += v_rest
+            arguments = [interop.rows(v, real), interop.view(tiles.counts, wp.int32), first, *outputs]
+            count = v_colors.shape[0] * v_colors.shape[1]
+            interop.launch(make_kernels(real, width).add, count, arguments, v.device, cost=5)
         v_backgrounds = background_gradient(shared[1], v_image, colors.shape[-1]) if ctx.needs_input_grad[2] else None
         return v_projected, v_colors, v_backgrounds, None, None
 

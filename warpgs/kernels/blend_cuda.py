@@ -73,7 +73,7 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
     def forward_body(
         item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
         ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
-        rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
+        rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
     ): ...  # fmt: skip
@@ -85,7 +85,7 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
         begin: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
         ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
         # outputs
-        rgb: wp.array(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
+        rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
     ):  # fmt: skip
@@ -164,9 +164,9 @@ def make_backward(
         item: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
         keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
         totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
-        rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
+        rgb: wp.array2d(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
-        v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
+        v_rgb: wp.array2d(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
         v_slots: wp.array2d(dtype=float),
     ): ...  # fmt: skip
 
@@ -188,9 +188,9 @@ def make_backward(
         begin: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
         keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
         totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
-        rgb: wp.array(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
+        rgb: wp.array2d(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
-        v_rgb: wp.array(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
+        v_rgb: wp.array2d(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
         # outputs
         v_slots: wp.array2d(dtype=float),
     ):  # fmt: skip
@@ -212,11 +212,11 @@ def make_backward(
 
 
 def _floats(*tensors: torch.Tensor) -> list[interop.View]:
-    return [interop.view(t.view(-1), wp.float32) for t in tensors]
+    return [interop.flat(t, wp.float32) for t in tensors]
 
 
 def _ints(*tensors: torch.Tensor) -> list[interop.View]:
-    return [interop.view(t.view(-1), wp.int32) for t in tensors]
+    return [interop.flat(t, wp.int32) for t in tensors]
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
@@ -239,6 +239,7 @@ def forward(
     *,
     save: bool,
     allocator: Allocator = TORCH,
+    image: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, ...]:
     """Return what `blend.composite` returns for projected Gaussians [C, N, 9 + D] and backgrounds [C, D], on CUDA.
 
@@ -248,7 +249,8 @@ def forward(
     """
     device, channels = projected.device, backgrounds.shape[1]
     shape = (backgrounds.shape[0], settings.height, settings.width)
-    rgb, alpha, depth = (allocator.output(s, torch.float32, device) for s in ((*shape, channels), shape, shape))
+    rgb = allocator.output((*shape, channels), torch.float32, device) if image is None else image
+    alpha, depth = (allocator.output(shape, torch.float32, device) for _ in range(2))
     transmittances, weights = allocator.saved((2, *(shape if save else (0,))), torch.float32, device).unbind()
     ends = allocator.saved(shape, torch.int32, device)
     pixels = tiles.size * tiles.size
@@ -261,7 +263,8 @@ def forward(
     inputs = [
         settings.struct(tiles.size, wp.float32), chunk, *_floats(projected),
         *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
-        *_floats(rgb, alpha, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
+        interop.rows(rgb, wp.float32), *_floats(alpha, depth, transmittances, weights), *_ints(ends),
+        interop.view(states, wp.float32),
     ]  # fmt: skip
     per = 2 if tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
     interop.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
@@ -307,8 +310,8 @@ def backward(
         settings.struct(tiles.size, wp.float32), count, tiles.ranges.shape[0], *_floats(projected),
         *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots), interop.view(tiles.total, wp.int64),
         *_floats(backgrounds),
-        *_floats(rgb, depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
-        *_floats(v_rgb.contiguous(), v_alpha, v_depth), interop.view(v_slots, wp.float32),
+        interop.rows(rgb, wp.float32), *_floats(depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
+        interop.rows(v_rgb, wp.float32), *_floats(v_alpha, v_depth), interop.view(v_slots, wp.float32),
     ]  # fmt: skip
     interop.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
     inputs = [*_floats(projected), *_ints(tiles.starts, tiles.counts), interop.view(v_slots, wp.float32), *_floats(v_projected)]

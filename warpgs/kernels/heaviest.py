@@ -162,11 +162,11 @@ def heaviest(
     weights = projected.new_zeros(*shape, k)
     ids = torch.full((*shape, k), -1, dtype=torch.int32, device=device)
     counts = torch.zeros(shape, dtype=torch.int32, device=device)
-    outputs = [interop.view(weights.view(-1), real), *(interop.view(t.view(-1), wp.int32) for t in (ids, counts))]
+    outputs = [interop.flat(weights, real), *(interop.flat(t, wp.int32) for t in (ids, counts))]
     own, rest = settings.struct(tiles.size, real), [per_camera, k, *outputs]
     if is_native(projected):
-        lists = [interop.view(t.view(-1), wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
-        inputs, pixels = [own, interop.view(projected.view(-1), real), *lists, *rest], tiles.size * tiles.size
+        lists = [interop.flat(t, wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
+        inputs, pixels = [own, interop.flat(projected, real), *lists, *rest], tiles.size * tiles.size
         interop.launch(make_native(tiles.size), len(tiles.ranges) * pixels, inputs, device, block_dim=pixels)
     else:
         inputs = [own, *tile_inputs(projected, tiles, real), *rest]

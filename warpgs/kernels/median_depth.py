@@ -147,11 +147,11 @@ def median_depth(
     real, device = interop.real_of(projected), projected.device
     settings, count = BlendSettings(origin, width, height, rule), len(tiles.ranges)
     depths = projected.new_empty(len(projected), height, width)
-    own, output = settings.struct(tiles.size, real), interop.view(depths.view(-1), real)
+    own, output = settings.struct(tiles.size, real), interop.flat(depths, real)
     native = projected.is_cuda and projected.dtype == torch.float32
     if native:
-        lists = [interop.view(t.view(-1), wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
-        inputs, pixels = [own, interop.view(projected.view(-1), real), *lists, output], tiles.size * tiles.size
+        lists = [interop.flat(t, wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
+        inputs, pixels = [own, interop.flat(projected, real), *lists, output], tiles.size * tiles.size
         interop.launch(make_native(tiles.size), count * pixels, inputs, device, block_dim=pixels)
         return depths
     inputs = [own, *tile_inputs(projected, tiles, real), output]

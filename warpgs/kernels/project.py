@@ -65,7 +65,7 @@ def project_tensors(
     arguments = [
         *_views(inputs), interop.view(inputs.opacity_factors, real), *settings.size, *settings.window,
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
+        interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
     ]  # fmt: skip
     if _native(means):
         kernel, tasks, cost = project_cuda.make_forward(*settings.variant()), cameras * count, 5
@@ -129,8 +129,8 @@ def project_gradients(
     outputs = [interop.view(g, dtype) for g, dtype in zip(found, (t.vec3, t.vec4, t.vec3, real, t.vec3))]
     arguments = [
         *_views(inputs[:8]), width, height, settings.sh_count, rule.near, rule.low_pass,
-        interop.view(projected.view(-1, PROJECTED_SIZE), real), interop.view(tile_counts.view(-1), wp.int32),
-        interop.view(v_projected.view(-1, PROJECTED_SIZE), real),
+        interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
+        interop.rows(v_projected, real),
     ]  # fmt: skip
     if _native(projected):
         kernel, tasks, cost = project_cuda.make_backward(*settings.variant()), -(-count // BLOCK) * BLOCK, 10

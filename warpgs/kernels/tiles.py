@@ -3,6 +3,7 @@
 import functools
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -56,11 +57,21 @@ class Tiles:
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
     visible: int = 0
-    """Number of Gaussians that have instances; with a capacity, of all."""
+    """Number of Gaussians that have instances; with a capacity, of those that there is room for."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         """Return all tensors, with the shapes [...] named there, in the order of the constructor."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
+
+
+class Visible(NamedTuple):
+    """Room for visible Gaussians where nothing is read from the device."""
+
+    sums: torch.Tensor
+    """Running sums of `running_counts`, int64, shape [S]."""
+    capacity: int
+    """Number of visible Gaussians to allocate for, at most the number of all. Where there are more, which the last of the sums
+    tells, the lists must not be used."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,8 @@ class InstanceMemory:
     shape [1]; needed with a capacity."""
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
+    visible: Visible | None = None
+    """Room for visible Gaussians, with a capacity; None to sort all Gaussians."""
 
 
 AS_NEEDED = InstanceMemory()
@@ -155,19 +168,28 @@ def make_kernels(real, native: bool):
     @wp.kernel(enable_backward=False, module=module)
     def visible_keys(
         begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
+        limit: int,
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
         i = begin + wp.tid()
-        seen = wp.where(i < tile_counts.shape[0] and tile_counts[i] > 0, 1, 0)
+        count = tile_counts.shape[0]
+        seen = wp.where(i < count and tile_counts[i] > 0, 1, 0)
         after = int(0)  # the visible ones that the sum has behind this one
         if wp.static(native):
             rank = lanes.running_sum(seen)
             after = lanes.broadcast(rank, 31) - rank
-        if seen == 1:
-            j = int(packed[i // per] / wp.int64(VISIBLE)) - 1 - after
-            keys[j] = projected[i, 9]
-            ids[j] = i
+        if i < count:
+            passed = int(packed[i // per] / wp.int64(VISIBLE)) - after  # visible ones up to this one
+            j = passed - 1
+            key = real(wp.inf)
+            if seen == 1:
+                key = projected[i, 9]
+            else:  # behind all visible ones, as far as there is room
+                j = int(packed[packed.shape[0] - 1] / wp.int64(VISIBLE)) + i - passed
+            if j < limit:
+                keys[j] = key
+                ids[j] = i
 
     @wp.kernel(enable_backward=False, module=module)
     def ordered_counts(
@@ -202,38 +224,61 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     )
 
 
+def running_counts(counts: torch.Tensor, real, allocator: Allocator, *, output: bool = False) -> torch.Tensor:
+    """Return running sums of tile counts and visible Gaussians in one, int64, shape [S]: `split_sum` takes the last apart.
+
+    Args:
+        counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
+        real: Scalar type of the Gaussians, of Warp.
+        allocator: Provider of the sums' memory.
+        output: True for sums that outlive the call of a graphed function.
+    """
+    device, count, native = counts.device, len(counts), counts.is_cuda
+    sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
+    packed = (allocator.output if output else allocator.workspace)((sums,), torch.int64, device)
+    kernel = make_kernels(real, native).pack_counts
+    interop.launch(kernel, threads, [interop.view(counts, wp.int32), interop.view(packed, wp.int64)], device)
+    return torch.cumsum(packed, 0, out=packed)
+
+
+def split_sum(total: int) -> tuple[int, int]:
+    """Return the number of visible Gaussians and of instances in the last of the `running_counts`."""
+    return divmod(total, VISIBLE)
+
+
 def _depth_order(
     projected: torch.Tensor, counts: torch.Tensor, tiles: int, memory: InstanceMemory
 ) -> tuple[torch.Tensor, int, int]:
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
 
-    With a capacity nothing is read from the device: all Gaussians count as visible, those that are not come last, and the
-    number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the tiles of an image.
+    With a capacity nothing is read from the device: all Gaussians count as visible, or as many as there is room for. Those
+    that are not come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N],
+    ``tiles`` the tiles of an image.
     """
     device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
     projected_view, counts_view = interop.view(projected, real), interop.view(counts, wp.int32)
+    packed = None
     if memory.capacity is not None:
         visible, total = count, memory.capacity
+        if memory.visible is not None:
+            packed, visible = memory.visible
     else:
         if count * tiles >= VISIBLE or count > MAX_VISIBLE:
             many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
             _check_total(*reversed(many.tolist()), device, tiles, memory.budget)
         # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
-        sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-        packed = memory.allocator.workspace((sums,), torch.int64, device)
-        interop.launch(k.pack_counts, threads, [counts_view, interop.view(packed, wp.int64)], device)
-        torch.cumsum(packed, 0, out=packed)
-        visible, total = divmod(int(packed[-1]), VISIBLE)
+        packed = running_counts(counts, real, memory.allocator)
+        visible, total = split_sum(int(packed[-1]))
         _check_total(total, visible, device, tiles, memory.budget)
     depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
     depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
-    if memory.capacity is not None:
+    if packed is None:
         interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
     else:
-        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), depths_view, order_view]
-        interop.launch(k.visible_keys, threads, inputs, device)
-    wp.utils.radix_sort_pairs(depths_view.array(), order_view.array(), visible)
+        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), visible, depths_view, order_view]
+        interop.launch(k.visible_keys, -(-count // 256) * 256 if native else count, inputs, device)
+    interop.sort_pairs(depths_view, order_view, visible)
     return order, visible, total
 
 
@@ -254,7 +299,7 @@ def _sort_by_tile(
     """
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
     keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
-    wp.utils.radix_sort_pairs(keys_view.array(), slots_view.array(), total, end_bit=no_tile.bit_length())
+    interop.sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
     inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
     interop.launch(make_find_ranges(slotted), total, inputs, keys.device)
     return ids

@@ -18,7 +18,7 @@ from warpgs.kernels.blend_channels import blend_channels
 from warpgs.kernels.heaviest import heaviest
 from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.project_inputs import ProjectInputs, checked_factors, packed_covariances
+from warpgs.kernels.project_inputs import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
@@ -65,7 +65,7 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
     means = gaussians.means
     viewmats, Ks = as_batch(camera.viewmat, means), as_batch(camera.K, means)
     if camera.distortion is None:
-        distortion = means.new_empty(len(viewmats), 0)
+        distortion = nothing((len(viewmats), 0), means.dtype, means.device)
     else:
         distortion = as_batch(camera.distortion, means, 1)
     factors = checked_factors(means, opacity_factors)
@@ -194,7 +194,7 @@ def count_instances(inputs: ProjectInputs, settings: RenderSettings) -> torch.Te
 
 def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
-    memory: InstanceMemory,
+    memory: InstanceMemory, save: bool = True,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
     """Bin and blend without autograd, in memory of the allocator; returns what the backward pass needs, too.
 
@@ -204,10 +204,11 @@ def composite_into(
         backgrounds: Colour behind everything, contiguous, shape [C, 3].
         settings: Settings of the render.
         memory: Memory of the instances; its allocator provides all other tensors.
+        save: True where gradients will be taken.
 
     Returns:
         The instances, and the tensors [...] that `blending.composite` returns.
     """
-    tiles = bin_projected(projected, tile_counts, settings, memory)
-    found = blending.composite(projected, tiles, backgrounds, settings.blending(), save=True, allocator=memory.allocator)
+    tiles = bin_projected(projected, tile_counts, settings, memory, save)
+    found = blending.composite(projected, tiles, backgrounds, settings.blending(), save=save, allocator=memory.allocator)
     return tiles, found

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
+import threading
 import weakref
+from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -19,8 +22,17 @@ import warp as wp
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles
-from warpgs.render.compose import composite_into, count_instances
+from warpgs.kernels.tiles import (
+    BYTES_PER_INSTANCE,
+    VISIBLE,
+    InstanceMemory,
+    Tiles,
+    Visible,
+    grid,
+    running_counts,
+    split_sum,
+)
+from warpgs.render.compose import composite_into
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
@@ -31,32 +43,55 @@ from warpgs.runtime.device_memory import available_bytes
 MIN_CALLS = 3
 """Equal calls in a row from which on kernels are captured. Where a capture did not pay, the number doubles for the next."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for instances, as a multiple of the most that such calls were seen to have."""
-MAX_PROJECTED = 2**19
-"""Most projected Gaussians of a captured call. Beyond, the GPU takes longer than the host, and a graph would gain nothing."""
+"""Capacity for visible Gaussians and instances, as a multiple of the most that such calls were seen to have."""
+SPARE = 1024
+"""What is added to both."""
+MAX_PROJECTED = 2**23
+"""Most projected Gaussians of a captured call. Beyond, the GPU takes so long that a graph would gain nothing."""
 MAX_MEMORY_FRACTION = 0.05
 """Largest fraction of the free memory that lists and saved states may take; calls that need more are not captured."""
+
+
+class Capacity(NamedTuple):
+    """Numbers of a render that memory is allocated for."""
+
+    visible: int
+    """Gaussians that touch a tile."""
+    instances: int
+    """(Gaussian, tile) instances."""
+
+    def within(self, other: Capacity) -> bool:
+        """Return whether neither number is larger than the other's."""
+        return self.visible <= other.visible and self.instances <= other.instances
+
+    def or_more(self, other: Capacity) -> Capacity:
+        """Return the larger of both numbers."""
+        return Capacity(max(self.visible, other.visible), max(self.instances, other.instances))
 
 
 class GraphedRasterizer:
     """Render and gradients of one set of tensors for any camera, as four graphed functions."""
 
-    def __init__(self, settings: RenderSettings, cameras: int, capacity: int, graphs: GraphPool):
+    def __init__(
+        self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
+    ):  # fmt: skip
         """Prepare the functions; nothing is rendered yet.
 
         Args:
             settings: Settings of the render.
             cameras: Number of images at a time.
-            capacity: Number of instances to allocate memory for.
+            capacity: Numbers to allocate memory for.
             graphs: Pool to capture graphs in.
+            gradients: True to keep what the backward pass needs.
         """
         self.settings, self.cameras, self.capacity, self.device = settings, cameras, capacity, graphs.device
+        self.gradients = gradients
         self._project_settings = settings.projection()
         self._coefficients = CAMERA_MODELS.find(settings.camera_model).coefficients
         self.rendered = 0
         """Number of renders that fitted."""
-        self.instances = 0
-        """Number of instances of the last call."""
+        self.needed = Capacity(0, 0)
+        """Numbers of the last call."""
         on_gpu = self.device.type == "cuda"
         self._host_total = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=on_gpu)
         self._total, self._stream = self._host_total.numpy(), graphs.stream
@@ -88,7 +123,7 @@ class GraphedRasterizer:
         """
         of_cameras = [t.contiguous() for t in inputs[5:8]]
         self._addresses[:] = [t.data_ptr() for t in of_cameras]  # nobody reads them any more: the last call was waited for
-        (cameras, *projection), _ = self._forward_project(*inputs[:5])
+        (cameras, *projection, sums), _ = self._forward_project(*inputs[:5])
         if self._total_ready is not None:
             self._total_ready.record(self._stream)
         if backgrounds is None:
@@ -96,13 +131,15 @@ class GraphedRasterizer:
                 self._black = torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
-        images, block = self._forward_blend(*projection, backgrounds.detach())
-        projected = _projected(self, cameras, projection, *inputs[:7])
-        images = _blended(projected, backgrounds, self, projection[1], images, block)
+        images, block = self._forward_blend(*projection, sums, backgrounds.detach())
+        projected = projection[0]
+        if self.gradients:
+            projected = _projected(self, cameras, projection, *inputs[:7])
+            images = _blended(projected, backgrounds, self, projection[1], images, block)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
-        self.instances = int(self._total[0])
-        if self.instances > self.capacity:
+        self.needed = Capacity(*split_sum(int(self._total[0])))
+        if not self.needed.within(self.capacity):
             return None
         self.rendered += 1
         return images, projected, projection[1]
@@ -119,16 +156,19 @@ class GraphedRasterizer:
         cameras = allocator.output(((25 + self._coefficients) * self.cameras,), torch.float32, self.device)
         fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
-        total = allocator.workspace((1,), torch.int64, self.device)
-        torch.sum(counts.view(-1), 0, keepdim=True, dtype=torch.int64, out=total)
+        sums = running_counts(counts.view(-1), wp.float32, allocator, output=True)
         with interop.stream_of(self.device):
-            wp.copy(self._host_total, interop.view(total, wp.int64).array())
+            wp.copy(self._host_total, interop.view(sums[-1:], wp.int64).array())
         return ()
 
-    def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
-        overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the count tells before
-        memory = InstanceMemory(None, self.capacity, overflow, allocator)
-        tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory)
+    def _bin_and_blend(self, allocator: Allocator, projected, counts, sums, backgrounds) -> tuple[torch.Tensor, ...]:
+        overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the sums tell before
+        memory = InstanceMemory(
+            None, self.capacity.instances, overflow, allocator, Visible(sums, self.capacity.visible)
+        )  # fmt: skip
+        tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory, self.gradients)
+        if not self.gradients:
+            return ()
         return *(t for t in tiles.tensors() if t is not tiles.counts), *saved
 
     def _blend_gradients(self, allocator: Allocator, projected, counts, backgrounds, rgb, depth, block, *v_images) -> tuple[()]:
@@ -220,22 +260,22 @@ _projected, _blended = (super(torch.autograd.Function, node).apply for node in (
 class Recorder:
     """History of the calls on one stream, and the rasterizer of those that came often enough."""
 
-    def __init__(self, graphs: GraphPool):
-        self.graphs = graphs
+    def __init__(self, graphs: GraphPool, gradients: bool = True):
+        self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
         """Rasterizer of the calls at hand; None where they were too few."""
         self.min_calls = MIN_CALLS
         """Equal calls in a row from which on kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
-        self._exceeded: tuple[tuple | None, int] = (None, 0)
-        """Key of the last call that exceeded its capacity, and its number of instances."""
+        self._exceeded: tuple[tuple | None, Capacity] = (None, Capacity(0, 0))
+        """Key of the last call that exceeded its capacity, and what it needed."""
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
         """Return what `GraphedRasterizer.render` returns; None where the call must run without graphs.
 
         ``inputs`` are without opacity factors; ``backgrounds`` [C, 3] may be None.
         """
-        key = None if self.graphs.failed else call_key(inputs, backgrounds, settings)
+        key = None if self.graphs.failed else call_key(inputs, backgrounds, settings, self.gradients)
         if key is None or not self.graphs.lock.acquire(blocking=False):
             return None
         try:
@@ -258,7 +298,7 @@ class Recorder:
                 self._drop()
                 raise
             if found is None:
-                self._exceeded = (key, self.rasterizer.instances)
+                self._exceeded = (key, self.rasterizer.needed)
                 self._drop()
             return found
         finally:
@@ -266,14 +306,16 @@ class Recorder:
 
     def _make(self, inputs: ProjectInputs, settings: RenderSettings) -> None:
         """Make the rasterizer, unless its lists would take too much memory."""
-        instances = int(count_instances(inputs, settings))
+        needed = count_needed(inputs, settings)
         if self._exceeded[0] == self._key:
-            instances = max(instances, self._exceeded[1])
+            needed = needed.or_more(self._exceeded[1])
         budget = MAX_MEMORY_FRACTION * available_bytes(self.graphs.device)
-        self._too_large = CAPACITY_FACTOR * instances * BYTES_PER_INSTANCE > budget
+        self._too_large = CAPACITY_FACTOR * needed.instances * BYTES_PER_INSTANCE > budget
         if not self._too_large:
-            capacity = int(CAPACITY_FACTOR * instances) + 1024
-            self.rasterizer = GraphedRasterizer(settings, len(inputs.viewmats), capacity, self.graphs)
+            visible, instances = (int(CAPACITY_FACTOR * n) + SPARE for n in needed)
+            cameras = len(inputs.viewmats)
+            capacity = Capacity(min(visible, cameras * len(inputs.means)), instances)
+            self.rasterizer = GraphedRasterizer(settings, cameras, capacity, self.graphs, self.gradients)
 
     def _drop(self) -> None:
         if self.rasterizer is not None:
@@ -285,18 +327,29 @@ class Recorder:
         with self.graphs.lock:
             self._drop()
             self.graphs.release()
-            self.min_calls, self._exceeded = MIN_CALLS, (None, 0)
+            self.min_calls, self._exceeded = MIN_CALLS, (None, Capacity(0, 0))
 
 
-def call_key(inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings) -> tuple | None:
+@torch.no_grad()
+def count_needed(inputs: ProjectInputs, settings: RenderSettings) -> Capacity:
+    """Return the numbers of a render."""
+    counts = project.project_inputs(inputs, settings.projection())[1]
+    return Capacity(*torch.stack([(counts > 0).sum(), counts.sum()]).tolist())
+
+
+def call_key(
+    inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings, gradients: bool = True
+) -> tuple | None:  # fmt: skip
     """Return the values that calls must have in common to use one rasterizer.
 
-    None for calls that cannot be captured, and for those that need not be: large ones, and those without gradients.
-    ``backgrounds`` [C, 3] may be None.
+    None for calls that cannot be captured, and for those that need not be: very large ones. ``backgrounds`` [C, 3] may be None.
+    Calls without ``gradients`` are captured in the main thread alone: a viewer renders beside a loop that may wait for the
+    whole device.
     """
     means, viewmats = inputs.means, inputs.viewmats
-    small = 0 < len(means) * len(viewmats) <= MAX_PROJECTED
-    fit = means.dtype == torch.float32 and torch.is_grad_enabled() and any(t.requires_grad for t in inputs)
+    projected, tiles = len(means) * len(viewmats), math.prod(grid(*settings.window[2:], settings.tile_size))
+    small = 0 < projected <= MAX_PROJECTED and projected * tiles < VISIBLE  # the sums hold every count
+    fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
         return None
     if backgrounds is not None and tuple(backgrounds.shape) != (len(viewmats), 3):
@@ -324,14 +377,14 @@ def _can_capture(device: torch.device) -> bool:
 
 
 _UNCACHED = os.environ.get("PYTORCH_NO_CUDA_MEMORY_CACHING") is not None
-_RECORDERS: dict[tuple[torch.device, int], Recorder] = {}
+_RECORDERS: dict[tuple[torch.device, int, bool], Recorder] = {}
 
 
-def recorder(device: torch.device) -> Recorder:
-    """Return the recorder of torch's current stream on a CUDA device."""
-    key = (device, interop.warp_stream(device).cuda_stream)
+def recorder(device: torch.device, gradients: bool = True) -> Recorder:
+    """Return the recorder of torch's current stream on a CUDA device, for calls with or without ``gradients``."""
+    key = (device, interop.warp_stream(device).cuda_stream, gradients)
     found = _RECORDERS.get(key)
-    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device)))
+    return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
 
 
 def clear_graph_cache() -> None:

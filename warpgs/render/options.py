@@ -78,10 +78,10 @@ class RasterizeOptions:
     """Most (Gaussian, tile) instances at a time: an image of more is rendered in chunks, and each chunk again for its
     gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
     record: bool = True
-    """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to small calls
-    with gradients in a fixed order, without colors, features, opacity factors, contributions, median depth, heaviest, error
-    bound and limits (docs/decisions/010-recorded-calls.md). Choose False where other threads wait for the whole device, as
-    torch.cuda.synchronize does."""
+    """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to calls with
+    gradients in a fixed order and, in the main thread, to calls without gradients. It does not apply with colors, features,
+    opacity factors, contributions, median depth, heaviest, error bound and limits (docs/decisions/010-recorded-calls.md).
+    Choose False where other threads wait for the whole device, as torch.cuda.synchronize does."""
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""

@@ -144,4 +144,4 @@ def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
         second: Count of numbers at the first two; the rest is at the third.
         out: Result, float32, contiguous, any shape.
     """
-    interop.launch(_make_fetch(), out.numel(), [table, first, second, interop.view(out.view(-1), wp.float32)], out.device)
+    interop.launch(_make_fetch(), out.numel(), [table, first, second, interop.flat(out, wp.float32)], out.device)

@@ -84,17 +84,39 @@ class View(NamedTuple):
 
     tensor: torch.Tensor
     dtype: object
+    axes: int | None = None
+    """1 for a flat array, 2 for rows of the last axis, None for the axes of the tensor."""
+
+    def shape(self) -> tuple[int, ...]:
+        """Return the sizes of the axes that a kernel sees, those of a vector type included."""
+        if self.axes is None:
+            return tuple(self.tensor.shape)
+        count, width = self.tensor.numel(), self.tensor.shape[-1]
+        return (count,) if self.axes == 1 else (count // max(width, 1), width)
 
     def array(self) -> wp.array:
-        """Return the same memory as a Warp array of the tensor's shape [...], without a copy and without gradient."""
-        for size in self.tensor.shape:
+        """Return the same memory as a Warp array of the shape [...], without a copy and without gradient."""
+        tensor = self.tensor.detach()
+        if self.axes is not None:
+            tensor = tensor.view(self.shape())
+        for size in tensor.shape:
             _check_size(size)
-        return wp.from_torch(self.tensor.detach(), dtype=self.dtype, requires_grad=False)
+        return wp.from_torch(tensor, dtype=self.dtype, requires_grad=False)
 
 
 def view(tensor: torch.Tensor, dtype) -> View:
     """Return a contiguous tensor of any shape as a kernel argument of that element type."""
     return View(tensor, dtype)
+
+
+def flat(tensor: torch.Tensor, dtype) -> View:
+    """Return a contiguous tensor of any shape [...] as an argument of one axis, without the cost of ``tensor.view(-1)``."""
+    return View(tensor, dtype, 1)
+
+
+def rows(tensor: torch.Tensor, dtype) -> View:
+    """Return a tensor [..., K] as an argument of two axes. Rows are contiguous, and one stride leads from each to the next."""
+    return View(tensor, dtype, 2)
 
 
 def warp_device(device: torch.device) -> wp.Device:
@@ -140,6 +162,21 @@ _LOADING = threading.Lock()
 in which kernels are not safe either, while one runs."""
 _SORTING = threading.RLock()
 """Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
+
+
+@functools.lru_cache(maxsize=64)
+def _array_at(address: int, size: int, dtype: object, device: torch.device) -> wp.array:
+    """Return memory at an address as a Warp array, which does not own it: whoever reads it holds the tensor."""
+    return wp.array(ptr=address, shape=size, dtype=dtype, device=warp_device(device))
+
+
+def sort_pairs(keys: View, values: View, count: int, **bits: int) -> None:
+    """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace.
+
+    On a GPU it runs on the stream of `stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
+    """
+    arrays = (_array_at(t.data_ptr(), t.numel(), dtype, t.device) for t, dtype, _ in (keys, values))
+    wp.utils.radix_sort_pairs(*arrays, count, **bits)
 
 
 @contextlib.contextmanager
@@ -206,19 +243,21 @@ class _Recorded:
             # In a loop most arguments are those of the call before, memory addresses included.
             if type(value) is View:
                 tensor = value.tensor
-                now = (tensor.data_ptr(), tensor.shape)
-                if known[i] == now:
+                address, shape, before = tensor.data_ptr(), tensor.shape, known[i]
+                strided = value.axes == 2 and tensor.stride(-2)  # others are contiguous
+                if before is not None and before[0] == address and before[1] == shape and before[2] == strided:
                     continue
                 packed = command.params[i + 2]  # after the bounds and ``begin``
-                for size in now[1][: packed.ndim]:
+                seen = value.shape()
+                for size in seen[: packed.ndim]:
                     _check_size(size)  # it would wrap around
                 known[i] = None  # an interrupt here must leave nothing that is taken for known
-                packed.data = now[0]
+                packed.data = address
                 for axis in range(packed.ndim):
-                    packed.shape[axis] = now[1][axis]
+                    packed.shape[axis] = seen[axis]
                 if packed.ndim == 2:
-                    packed.strides[0] = tensor.stride(0) * tensor.element_size()
-                known[i] = now
+                    packed.strides[0] = (strided or tensor.stride(0)) * tensor.element_size()
+                known[i] = (address, shape, strided)
             elif known[i] != value:
                 if _is_struct(value):
                     ctypes.pointer(command.params[i + 2])[0] = value.__ctype__()  # copies its numbers
@@ -302,6 +341,11 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         done.result()
 
 
+@functools.cache
+def _symbols(pattern: str) -> tuple[str | int, ...]:
+    return tuple(int(symbol) if symbol.isdigit() else symbol for symbol in pattern.split())
+
+
 def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
 
@@ -319,20 +363,19 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     for name, (tensor, pattern) in tensors.items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
-        real_of(tensor)
         if first is None:
             first_name, first = name, tensor
+            real_of(tensor)
         if tensor.dtype != first.dtype:
             raise TypeError(f"{name} is {tensor.dtype} but {first_name} is {first.dtype}; give both the same type")
         if tensor.device != first.device:
             raise ValueError(f"{name} is on {tensor.device} but {first_name} is on {first.device}; move one of them")
-        wanted = pattern.split()
-        found = tuple(tensor.shape)
+        wanted, found = _symbols(pattern), tensor.shape
         fits = len(wanted) == len(found)
         for symbol, size in zip(wanted, found):
-            expected = int(symbol) if symbol.isdigit() else sizes.setdefault(symbol, size)
+            expected = symbol if type(symbol) is int else sizes.setdefault(symbol, size)
             fits = fits and expected == size
         if not fits:
             known = ", ".join(f"{k}={v}" for k, v in sizes.items())
-            raise ValueError(f"{name} must have shape [{', '.join(wanted)}] ({known}), not {list(found)}")
+            raise ValueError(f"{name} must have shape [{', '.join(map(str, wanted))}] ({known}), not {list(found)}")
     return sizes

@@ -8,6 +8,8 @@ constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC, absgrad = ABSGRAD;
 const int total = (int)min(totals.data[0], (long long)capacity);  // of a cut list, what there is
 const int floor = item * CHUNK;
 constexpr int values = 6 + CHANNELS + (absgrad ? 3 : with_depth);  // magnitudes stand behind the place of the depth
+// an image may have more channels than this pass, or, in the last of several passes, fewer
+const long long pitch = rgb.strides[0] / (int)sizeof(float), v_pitch = v_rgb.strides[0] / (int)sizeof(float);
 // number of the sum that this lane holds after the reduction below
 int held = 0;
 {
@@ -74,7 +76,7 @@ while (top_instance > floor) {
                 T[k] = T_end;
                 #pragma unroll
                 for (int c = 0; c < CHANNELS; ++c)
-                    G[k][c] = v_rgb.data[CHANNELS * o + c];
+                    G[k][c] = c < v_rgb.shape[1] ? v_rgb.data[v_pitch * o + c] : 0.0f;
                 float z_end = 0.0f;
                 if (with_depth) {
                     const float W = weights.data[o];
@@ -94,10 +96,11 @@ while (top_instance > floor) {
                     // something was blended behind this chunk: the whole image less what lies up to here
                     const float* state = states.data + (long long)(stop_at / CHUNK) * (STATE * PIXELS) + k * 32 + lane;
                     T[k] = state[0];
-                    behind[k] = (rgb.data[CHANNELS * o] - state[PIXELS]) * G[k][0];
+                    behind[k] = (rgb.data[pitch * o] - state[PIXELS]) * G[k][0];
                     #pragma unroll
                     for (int c = 1; c < CHANNELS; ++c)
-                        behind[k] += (rgb.data[CHANNELS * o + c] - state[(1 + c) * PIXELS]) * G[k][c];
+                        if (c < rgb.shape[1])
+                            behind[k] += (rgb.data[pitch * o + c] - state[(1 + c) * PIXELS]) * G[k][c];
                     if (with_depth)
                         behind[k] += (z_end - state[(1 + CHANNELS) * PIXELS]) * vz[k] + (state[0] - T_end) * vw[k];
                 }

@@ -117,13 +117,34 @@ for (int batch = begin & ~31; batch < end; batch += 32) {
         finished = finished && done[k];
 }
 const float* background = backgrounds.data + CHANNELS * camera;
+const long long pitch = rgb.strides[0] / (int)sizeof(float);
 #pragma unroll
 for (int k = 0; k < PER; ++k) {
-    if (x < width && y + 4 * k < height) {
-        const long long o = ((long long)camera * height + y + 4 * k) * width + x;
+    const bool inside = x < width && y + 4 * k < height;
+    const long long o = ((long long)camera * height + y + 4 * k) * width + x;
+    if (CHANNELS == 3) {
+        if (inside)
+            #pragma unroll
+            for (int c = 0; c < CHANNELS; ++c)
+                if (c < rgb.shape[1])
+                    rgb.data[pitch * o + c] = color[k][c] + T[k] * background[c];
+    } else {
+        // through shared memory, so that a store of the warp goes to few pixels, whose channels are neighbours
+        float* staged = reinterpret_cast<float*>(s_rest[warp]);
+        __syncwarp();
         #pragma unroll
         for (int c = 0; c < CHANNELS; ++c)
-            rgb.data[CHANNELS * o + c] = color[k][c] + T[k] * background[c];
+            staged[lane * CHANNELS + c] = color[k][c] + T[k] * background[c];
+        __syncwarp();
+        #pragma unroll
+        for (int n = 0; n < CHANNELS; ++n) {
+            const int p = (32 * n + lane) / CHANNELS, c = (32 * n + lane) % CHANNELS;
+            const int to_x = left + p % 8, to_y = top + p / 8 + 4 * k;
+            if (to_x < width && to_y < height && c < rgb.shape[1])
+                rgb.data[pitch * (((long long)camera * height + to_y) * width + to_x) + c] = staged[32 * n + lane];
+        }
+    }
+    if (inside) {
         alpha_out.data[o] = 1.0f - T[k];
         depth.data[o] = total[k] >= SMALLEST_WEIGHT ? z[k] / total[k] : 0.0f;
         if (SAVE) {
