@@ -175,6 +175,22 @@ def same_image() -> str:
     return table(head, body) + source
 
 
+def antialiasing() -> str:
+    """Return the table of scores at three sizes by the filters of a fit, as differences to a fit without."""
+    result, source = _result("antialiased_fern_h200")
+    found: dict[tuple[str, str], dict[int, dict]] = defaultdict(dict)
+    for r in result["rows"]:
+        found[r["split"], r["filters"]][r["seed"]] = r
+    body = []
+    for (split, filters), own in found.items():
+        cells = [f"{split}, {filters}", f"{len(own)}"]
+        for size in ("half", "full", "double"):
+            key, base = f"psnr_{size}", found[split, "none"]
+            cells.append(mean_sd([r[key] for r in own.values()]) if own is base else _change(own, base, key, 2))
+        body.append(cells)
+    return table(["views, filters", "fits", "half size", "size of the photos", "double size"], body) + source
+
+
 def meshes() -> str:
     """Return the table of the accuracy of meshes."""
     result, source = _result("mesh_cpu2")
@@ -203,7 +219,9 @@ def repeats() -> str:
     return table(["Gaussians, image", "sums", "wall [ms]", "bits of repeats", "largest [ulp]"], body) + source
 
 
-PARTS: tuple[Callable[[], str], ...] = (ladder, ablation, views, mcmc, objects, poses, same_image, meshes, repeats)
+PARTS: tuple[Callable[[], str], ...] = (
+    ladder, ablation, views, mcmc, objects, poses, same_image, antialiasing, meshes, repeats,
+)  # fmt: skip
 
 
 def parts() -> dict[str, str]:
