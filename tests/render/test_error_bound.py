@@ -79,4 +79,4 @@ def test_it_goes_with_the_other_options(device):
     with pytest.raises(UsageError, match="leave out one of them"):
         rasterize(g, cam, dataclasses.replace(options, capacity=1000))
     none = Gaussians(**{n: t[:0] for n, t in g.tensors().items()})
-    assert float(rasterize(none, cam, options).error_bound.max()) < 1e-30
+    assert float(rasterize(none, cam, options).error_bound.detach().max()) < 1e-30
