@@ -57,7 +57,7 @@ class Tiles:
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
     visible: int = 0
-    """Number of Gaussians that have instances; with a capacity, of those that there is room for."""
+    """Number of Gaussians that have instances; with a capacity, at most so many."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
         """Return all tensors, with the shapes [...] named there, in the order of the constructor."""
@@ -65,7 +65,7 @@ class Tiles:
 
 
 class Visible(NamedTuple):
-    """Room for visible Gaussians where nothing is read from the device."""
+    """Capacity for visible Gaussians where nothing is read from the device."""
 
     sums: torch.Tensor
     """Running sums of `running_counts`, int64, shape [S]."""
@@ -89,7 +89,7 @@ class InstanceMemory:
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
     visible: Visible | None = None
-    """Room for visible Gaussians, with a capacity; None to sort all Gaussians."""
+    """Capacity for visible Gaussians, with one for instances; None to sort all Gaussians."""
 
 
 AS_NEEDED = InstanceMemory()
@@ -251,7 +251,7 @@ def _depth_order(
 ) -> tuple[torch.Tensor, int, int]:
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
 
-    With a capacity nothing is read from the device: all Gaussians count as visible, or as many as there is room for. Those
+    With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds. Those
     that are not come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N],
     ``tiles`` the tiles of an image.
     """

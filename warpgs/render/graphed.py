@@ -45,7 +45,7 @@ MIN_CALLS = 3
 CAPACITY_FACTOR = 1.05
 """Capacity for visible Gaussians and instances, as a multiple of the most that such calls were seen to have."""
 SPARE = 1024
-"""What is added to both."""
+"""Number that is added to both."""
 MAX_PROJECTED = 2**23
 """Most projected Gaussians of a captured call. Beyond, the GPU takes so long that a graph would gain nothing."""
 MAX_MEMORY_FRACTION = 0.05

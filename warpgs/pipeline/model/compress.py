@@ -164,7 +164,7 @@ def merge_neighbours(
 
 
 def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
-    """Return the rows that stay, ascending, when as many of the others go as ``accepted`` allows, int64 [K]."""
+    """Return the rows to keep, ascending, int64 [K]; as many rows are removed as ``accepted`` allows."""
     order = prune_order(view_set.coverage(gaussians).maxima, view_set.fisher(gaussians))
     return keep_last(order, largest_fraction(lambda s: accepted(rows_of(gaussians, keep_last(order, s)))))
 
