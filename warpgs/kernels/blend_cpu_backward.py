@@ -26,20 +26,28 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
     stride = wp.constant(tile_size * (tile_size + 1))
     side = wp.constant(tile_size)
     strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+    strips = wp.constant(tile_size * (tile_size // STRIP))
+    pixels_of_tile = wp.constant(tile_size * tile_size)
+    bits = wp.constant(tile_size * tile_size - 1)
     smallest = wp.constant(real(SMALLEST_WEIGHT))
+    at = b.at
     at_int = b.at_int
 
     @wp.func(inline=True)
-    def load_channels(
-        o: wp.int32, p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), v_rgb: wp.array2d(dtype=real),
-        pixels: wp.ref[r.Pixels],
-    ) -> real:  # fmt: skip
-        """Load the upstream gradient of a pixel's channels; return its product with the background."""
-        pixels.g[p] = v_rgb[o, 0]
-        product = backgrounds[camera, 0] * v_rgb[o, 0]
-        for c in range(1, wp.static(channels)):
+    def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]):
+        """Load the upstream gradient of a pixel's channels."""
+        for c in range(wp.static(channels)):
             pixels.g[c * stride + p] = v_rgb[o, c]
-            product = product + backgrounds[camera, c] * v_rgb[o, c]
+
+    @wp.func(inline=True)
+    def behind_of(
+        p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]
+    ) -> real:  # fmt: skip
+        """Return the product of a pixel's upstream gradient with the background."""
+        product = backgrounds[camera, 0] * at(pixels.g[p])
+        for c in range(1, wp.static(channels)):
+            product = product + backgrounds[camera, c] * at(pixels.g[c * stride + p])
         return product
 
     @wp.func(inline=True)
@@ -67,20 +75,40 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
         camera = place[0]
         left = place[1]
         top = place[2]
+        rows = wp.min(side, settings.height - top)
+        across = wp.min(side, settings.width - left)
+        row = int(0)
+        while row < rows:
+            first = (camera * settings.height + top + row) * settings.width + left
+            for part in range(parts):
+                base = ((part * side + row) * strip) & bits
+                o = wp.max(first + part * strip, 0)
+                if across == side:
+                    for lane in range(strip):
+                        pixels.t[base + lane] = transmittances[o + lane]
+                        pixels.end[base + lane] = ends[o + lane]
+                lane = int(0)
+                while lane < wp.min(across - part * strip, strip):
+                    q = first + part * strip + lane
+                    if q < 0:
+                        break  # never; but vectorised, these loads would be slow gathers
+                    p = wp.max(base + lane, 0)
+                    lane += 1
+                    if across < side:
+                        pixels.t[p] = transmittances[q]
+                        pixels.end[p] = ends[q]
+                    load_channels(q, p, v_rgb, pixels)
+                    load_depth(q, p, weights, depth, v_alpha, v_depth, pixels)
+            row += 1
+        for p in range(pixels_of_tile):
+            pixels.behind[p] = at(pixels.t[p]) * behind_of(p, camera, backgrounds, pixels)
         last = int(0)
-        for row in range(wp.min(side, settings.height - top)):
-            for column in range(wp.min(side, settings.width - left)):
-                part = column // strip
-                p = (part * side + row) * strip + column - part * strip
-                o = (camera * settings.height + top + row) * settings.width + left + column
-                t = transmittances[o]
-                end = ends[o]
-                pixels.t[p] = t
-                pixels.end[p] = end
-                load_depth(o, p, weights, depth, v_alpha, v_depth, pixels)
-                pixels.behind[p] = t * load_channels(o, p, camera, backgrounds, v_rgb, pixels)
-                until[part * side + row] = wp.max(at_int(until[part * side + row]), end)
-                last = wp.max(last, end)
+        for s in range(strips):
+            end = int(0)
+            for lane in range(strip):
+                end = wp.max(end, at_int(pixels.end[s * strip + lane]))
+            until[s] = end
+            last = wp.max(last, end)
         return last
 
     return load_pixels
