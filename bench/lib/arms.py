@@ -12,7 +12,7 @@ from warpgs.pipeline.train.by_views import MIN_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`; the degree follows from the number of views."""
-STEPS = (500, 1000, 2000, 4000)
+STEPS = (500, 1000, 3000)
 """Numbers of steps that training views left out choose from."""
 SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
 NO_GROWTH = "density.gradient=1e9"
@@ -40,7 +40,7 @@ RIVALS = (
     Arm("`default`", "default"),
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
     Arm("CoR-GS", COR_GS, (1000, 3000)),
-    Arm("gsplat", GSPLAT, (500, 1000, 2000, 3000)),
+    Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, 3,000 steps", f"{GSPLAT},steps=3000"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
     Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
