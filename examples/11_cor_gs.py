@@ -3,8 +3,8 @@
     python examples/11_cor_gs.py path/to/scene --split llff:3 --out cor_gs.png
     warpgs fit path/to/scene --out run --preset 3dgs --strategy examples/11_cor_gs.py:CorGS
 
-Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning), and both
-renders of a random camera near the training cameras are drawn towards each other (co-regularisation). The class below is the
+Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning), and the
+difference of both renders of a random camera near the training cameras is a loss (co-regularisation). The class below is the
 whole baseline, and docs/add-a-baseline.md explains it. Prints the held-out PSNR of 3DGS and of CoR-GS; writes both renders.
 """
 
@@ -92,14 +92,18 @@ def random_cameras(views: list[TrainingView], noise: float, count: int, generato
 class CorGS(CloneSplit):
     """Two models of one scene, pruned and regularised where they disagree; the first of them is the result.
 
-    A step is captured as a CUDA graph: all that is random is drawn at the start, and found by the number of the step.
+    A step is captured as a CUDA graph: all random numbers are sampled at the start, and looked up by the number of the step.
     """
 
     Config = CorConfig
     STATE = staticmethod(schema.fields(GradientGrowth.STATE | OF_TWIN))
 
     def setup(self) -> None:
-        """Begin the second model with the Gaussians of the first, and draw the random cameras and the order of views."""
+        """Begin the second model with the Gaussians of the first, and sample the random cameras and the order of views.
+
+        Raises:
+            UsageError: The training views are fewer than two, of several sizes, transparent or distorted.
+        """
         context, views = self.context, self.context.views
         shapes = {v.image.shape for v in views}
         if len(views) < 2 or len(shapes) > 1 or any(v.alpha is not None or v.camera.distortion is not None for v in views):
@@ -168,7 +172,7 @@ class CorGS(CloneSplit):
         return term + torch.where(self.overflow[0] != 0, torch.nan, 0 * loss.detach())  # which ends the fit
 
     def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
-        """Update the second model."""
+        """Update the second model where the step is taken, ``going`` [1]; ``settings`` [7] are not read."""
         twin = self.twin.table
         gradients = dict(zip(twin.params, self.gradients_of_twin))
         twin.adam_step(gradients, self.lrs.index_select(0, self.taken)[0], (~going).to(torch.int32))
