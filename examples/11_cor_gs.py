@@ -1,10 +1,10 @@
 """A published baseline as a plug-in: CoR-GS (Zhang et al., ECCV 2024, arXiv 2405.12110), written from its formulas.
 
     python examples/11_cor_gs.py path/to/scene --split llff:3 --out cor_gs.png
-    warpgs fit path/to/scene --out run --preset 3dgs --strategy examples/11_cor_gs.py:CorGS --no-cuda-graph
+    warpgs fit path/to/scene --out run --preset 3dgs --strategy examples/11_cor_gs.py:CorGS
 
-Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning), and both
-renders of a random camera near the training cameras are drawn towards each other (co-regularisation). The class below is the
+Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning), and the
+difference of both renders of a random camera near the training cameras is a loss (co-regularisation). The class below is the
 whole baseline, and docs/add-a-baseline.md explains it. Prints the held-out PSNR of 3DGS and of CoR-GS; writes both renders.
 """
 
@@ -22,8 +22,10 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import DensityUpdate, Table
 from warpgs.pipeline.train.context import StrategyContext
 from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
+from warpgs.pipeline.train.memory_plan import most_instances
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.step import captured_renderer, eager_renderer
 from warpgs.pipeline.train.strategies.base import register
 from warpgs.pipeline.train.strategies.clone_split import CloneSplit
 from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
@@ -37,7 +39,9 @@ SSIM_WEIGHT = 0.2
 """Weight of SSIM in every photometric loss, as in 3DGS."""
 CHUNK = 2**24
 """Distances that are held at a time."""
-OF_TWIN = {"twin": schema.fields(GradientGrowth.STATE), "order": schema.items(schema.whole(0))}
+SPARE, MIN_INSTANCES = 2, 100_000
+"""Capacity for (Gaussian, tile) instances of a captured render: times the most of a training view, plus a few."""
+OF_TWIN = {"twin": schema.fields(GradientGrowth.STATE)}
 """Schema of what a checkpoint holds of the second model beside its tensors."""
 
 
@@ -63,100 +67,119 @@ def nearest(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
     )
 
 
-class Pseudo:
-    """Random cameras: the position of a training camera with noise, the orientation between it and its nearest neighbour."""
+def random_cameras(views: list[TrainingView], noise: float, count: int, generator: torch.Generator) -> torch.Tensor:
+    """Return camera_from_world of random cameras, float64, shape [count, 4, 4].
 
-    def __init__(self, views: list[TrainingView], noise: float):
-        """Keep centers and rotations of the training cameras."""
-        self.cameras = [v.camera for v in views]
-        poses = torch.stack([c.viewmat for c in self.cameras]).double().cpu()
-        self.rotations = poses[:, :3, :3]
-        self.centers = -(self.rotations.mT @ poses[:, :3, 3:]).squeeze(-1)
-        apart = torch.cdist(self.centers, self.centers) + torch.diag(torch.full((len(views),), torch.inf, dtype=torch.float64))
-        self.spread, self.neighbor = noise * apart.amin(1), apart.argmin(1)
-
-    def draw(self, generator: torch.Generator) -> warpgs.Camera:
-        """Return a random camera, with the size and the intrinsics of a training camera."""
-        i = int(torch.randint(len(self.cameras), (1,), generator=generator))
-        u, _, vt = torch.linalg.svd(self.rotations[[i, int(self.neighbor[i])]].mean(0))
-        R = u @ torch.diag(torch.tensor([1.0, 1.0, float(torch.det(u @ vt))], dtype=torch.float64)) @ vt  # the nearest rotation
-        center = self.centers[i] + self.spread[i] * torch.randn(3, generator=generator, dtype=torch.float64)
-        viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ center
-        given = self.cameras[i]
-        return dataclasses.replace(given, viewmat=viewmat.to(given.K.dtype).to(given.K.device))
+    Each has the position of a training camera, with noise, and the mean orientation of that camera and its nearest neighbour.
+    """
+    poses = torch.stack([v.camera.viewmat for v in views]).double().cpu()
+    rotations = poses[:, :3, :3]
+    centers = -(rotations.mT @ poses[:, :3, 3:]).squeeze(-1)
+    apart = torch.cdist(centers, centers).fill_diagonal_(torch.inf)
+    u, _, vt = torch.linalg.svd((rotations + rotations[apart.argmin(1)]) / 2)
+    sign = torch.ones(len(views), 3, dtype=torch.float64)
+    sign[:, 2] = torch.det(u @ vt)
+    middle = (u * sign[:, None]) @ vt  # the rotations nearest to the means of the matrices
+    chosen = torch.randint(len(views), (count,), generator=generator)
+    moved = noise * apart.amin(1)[chosen, None] * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    viewmats[:, :3, :3] = middle[chosen]
+    viewmats[:, :3, 3] = -(middle[chosen] @ (centers[chosen] + moved)[..., None]).squeeze(-1)
+    return viewmats
 
 
 @register("cor_gs")
 class CorGS(CloneSplit):
-    """Two models of one scene, pruned and regularised where they disagree; the first of them is the result."""
+    """Two models of one scene, pruned and regularised where they disagree; the first of them is the result.
+
+    A step is captured as a CUDA graph: all random numbers are sampled at the start, and looked up by the number of the step.
+    """
 
     Config = CorConfig
-    STATE = staticmethod(
-        schema.fields(
-            GradientGrowth.STATE | {"twin": schema.fields(GradientGrowth.STATE), "order": schema.items(schema.whole(0))}
-        )
-    )
+    STATE = staticmethod(schema.fields(GradientGrowth.STATE | OF_TWIN))
 
     def setup(self) -> None:
-        """Begin the second model with the Gaussians of the first."""
-        context = self.context
-        if len(context.views) < 2 or any(v.alpha is not None for v in context.views):
-            raise UsageError("cor_gs needs at least two opaque training views; name more in --split, or another --strategy")
+        """Begin the second model with the Gaussians of the first, and sample the random cameras and the order of views.
+
+        Raises:
+            UsageError: The training views are fewer than two, of several sizes, transparent or distorted.
+        """
+        context, views = self.context, self.context.views
+        shapes = {v.image.shape for v in views}
+        if len(views) < 2 or len(shapes) > 1 or any(v.alpha is not None or v.camera.distortion is not None for v in views):
+            raise UsageError(
+                "cor_gs needs at least two opaque training views of one size, without lens distortion; use another --strategy"
+            )
         table = Table.of_gaussians(context.gaussians, GradientGrowth.columns())
         self.twin: StrategyContext = dataclasses.replace(context, table=table)
         self.twin_growth = GradientGrowth(self.twin)
-        self.pseudo, self.order = Pseudo(context.views, self.config.noise), list[int]()
-        self.gradients_of_twin: list[torch.Tensor] = []
+        device, steps = context.device, context.steps
+        cameras = random_cameras(views, self.config.noise, steps, context.generator)
+        orders = [torch.randperm(len(views), generator=context.generator) for _ in range(-(-steps // len(views)))]
+        optimizer = context.settings[OptimizerConfig]
+        rows = [
+            table.lr_row(optimizer.lrs(context.phases.progress(step), context.extent), step, optimizer.head_lrs)
+            for step in range(1, steps + 1)
+        ]
+        self.cameras, self.lrs = cameras.float().to(device), torch.tensor(rows, device=device)
+        self.order, self.taken = torch.cat(orders)[:steps].to(device), torch.zeros(1, dtype=torch.int64, device=device)
+        self.viewmats, self.Ks = (torch.stack([getattr(v.camera, n) for v in views]) for n in ("viewmat", "K"))
+        self.images = torch.stack([v.image for v in views])
+        masked = any(v.mask is not None for v in views)
+        self.masks = (
+            torch.stack([torch.ones_like(v.image[..., 0]) if v.mask is None else v.mask for v in views]) if masked else None
+        )
+        self.overflow = torch.zeros(1, dtype=torch.int32, device=device)
+        self._measure()
 
-    def phase(self, step: int) -> Hashable:
-        """Return whether gradients are gathered in a step, and its number."""
-        return self.gradients.gathers(step), step
+    @torch.no_grad()
+    def _measure(self) -> None:
+        """Choose the renderer: on CUDA one with a fixed capacity for instances, which a graph can hold."""
+        context, options = self.context, self.context.render_options()
+        self.render = eager_renderer(options, None)
+        if context.device.type == "cuda":
+            cameras = [v.camera for v in context.views]
+            most = max(most_instances(t.gaussians, cameras, options) for t in (context.table, self.twin.table))
+            self.render = captured_renderer(options, SPARE * most + MIN_INSTANCES, self.overflow)
 
-    def statistics(self, phase: Any, v_projected, visible, size):
-        """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
-        return super().statistics(phase[0], v_projected, visible, size)
+    def _image(self, table: Table, viewmat: torch.Tensor, K: torch.Tensor) -> warpgs.Render:
+        """Return the render of one camera, [1, 4, 4] and [1, 3, 3], with colours [H, W, 3]."""
+        camera = dataclasses.replace(self.context.views[0].camera, viewmat=viewmat, K=K)
+        return self.render(table.gaussians, camera, table.gaussians.sh_degree, None, None)
 
-    def _render(self, table: Table, camera: warpgs.Camera) -> tuple[warpgs.Render, torch.Tensor]:
-        """Return the render of one camera, and its colours [H, W, 3]."""
-        options = dataclasses.replace(self.context.render_options(), record=False)
-        batch = dataclasses.replace(camera, viewmat=camera.viewmat[None], K=camera.K[None])
-        found = warpgs.rasterize(table.gaussians, batch, options)
-        return found, found.rgb.squeeze(0)
-
-    def regularisation(self, phase: Any, gaussians: warpgs.Gaussians) -> torch.Tensor:
+    def regularisation(self, phase: Hashable, gaussians: warpgs.Gaussians) -> torch.Tensor:
         """Return the first model's term, shape [], and find the gradients of the second model."""
-        if self.context.device.type == "cuda" and torch.cuda.is_current_stream_capturing():
-            raise UsageError("cor_gs changes two models in a step, which no CUDA graph holds; give --no-cuda-graph")
-        twin, weight = self.twin.table, self.config.weight
-        camera = self.pseudo.draw(self.context.generator)
-        (_, first), (_, second) = (self._render(t, camera) for t in (self.context.table, twin))
+        twin, weight, step = self.twin.table, self.config.weight, self.taken
+        self.overflow.zero_()
+        view = self.order.index_select(0, step)
+        viewmat, K, own_viewmat = (
+            self.cameras.index_select(0, step),
+            *(t.index_select(0, view) for t in (self.Ks, self.viewmats)),
+        )
+        first, second = (self._image(t, viewmat, K).rgb for t in (self.context.table, twin))
         term = weight * photometric_loss(first, second.detach(), None, SSIM_WEIGHT)
 
-        self.order = self.order or torch.randperm(len(self.context.views), generator=self.context.generator).tolist()
-        view = self.context.views[self.order.pop()]
-        found, rgb = self._render(twin, view.camera)
-        loss = photometric_loss(rgb, view.image, view.mask, SSIM_WEIGHT)
+        found = self._image(twin, own_viewmat, K)
+        image, mask = (None if t is None else t.index_select(0, view)[0] for t in (self.images, self.masks))
+        loss = photometric_loss(found.rgb, image, mask, SSIM_WEIGHT)
         loss = loss + weight * photometric_loss(second, first.detach(), None, SSIM_WEIGHT)
         *self.gradients_of_twin, v_projected = torch.autograd.grad(
             loss, [*twin.params.values(), found.projected], materialize_grads=True
         )
-        if phase[0]:
-            size = (view.camera.width, view.camera.height)
+        if phase:
+            size = (image.shape[1], image.shape[0])
             self.statistics_of_twin = self.twin_growth.statistics(v_projected, found.visible, size)
-        return term
+        return term + torch.where(self.overflow[0] != 0, torch.nan, 0 * loss.detach())  # which ends the fit
 
-    def after_step(self, phase: Any, settings: torch.Tensor, going: torch.Tensor) -> None:
-        """Update the second model."""
-        step, twin = phase[1], self.twin.table
-        optimizer = self.context.settings[OptimizerConfig]
-        lrs = optimizer.lrs(self.context.phases.progress(step), self.context.extent, 0.0)
-        rows = torch.tensor(twin.lr_row(lrs, step, optimizer.head_lrs), device=going.device)
-        stop = (~going).to(torch.int32)
-        twin.adam_step(dict(zip(twin.params, self.gradients_of_twin)), rows, stop)
-        if phase[0]:
+    def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
+        """Update the second model where the step is taken, ``going`` [1]; ``settings`` [7] are not read."""
+        twin = self.twin.table
+        gradients = dict(zip(twin.params, self.gradients_of_twin))
+        twin.adam_step(gradients, self.lrs.index_select(0, self.taken)[0], (~going).to(torch.int32))
+        if phase:
             for name, value in self.statistics_of_twin.items():
                 twin.columns[name] += torch.where(going, value, 0)
+        self.taken += going.to(torch.int64)
 
     def prunes(self, step: int) -> bool:
         """Return whether the models are pruned by each other after a step."""
@@ -179,6 +202,7 @@ class CorGS(CloneSplit):
             ours, theirs = self._matched()
             self.twin.table.apply(_kept(self.twin.table, theirs))
             yield _kept(self.context.table, ours)
+        self._measure()
 
     def _matched(self) -> list[torch.Tensor]:
         """Return which Gaussians of each model have a neighbour in the other one, bool, shape [N]; all, where none has."""
@@ -188,17 +212,18 @@ class CorGS(CloneSplit):
         return [m if bool(m.any()) else ~m for m in near]
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return the second model, [N, ...] each, and what both growths and the order of views need."""
+        """Return the second model, [N, ...] each, the number of its steps [1], and what both growths need."""
         tensors, plain = super().state()
         twin = {f"twin.{n}": t for n, t in self.twin.table.state().items()}
-        return tensors | twin, plain | {"twin": self.twin_growth.state(), "order": self.order}
+        return tensors | twin | {"taken": self.taken}, plain | {"twin": self.twin_growth.state()}
 
     def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load what `state` returned."""
         super().load(tensors, plain)
         self.twin.table.load({n.removeprefix("twin."): t for n, t in tensors.items() if n.startswith("twin.")})
         self.twin_growth.load(plain["twin"])
-        self.order = list(plain["order"])
+        self.taken.copy_(tensors["taken"])
+        self._measure()
 
 
 def _kept(table: Table, rows: torch.Tensor) -> DensityUpdate:
@@ -217,7 +242,7 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
     a = parser.parse_args(arguments)
 
-    base = dataclasses.replace(PRESETS["3dgs"], steps=a.steps, sh_degree=0, cuda_graph=False)
+    base = dataclasses.replace(PRESETS["3dgs"], steps=a.steps, sh_degree=0)
     with tempfile.TemporaryDirectory() as folder:
         if a.scene is None:
             from warpgs.synthetic.demo import write_demo

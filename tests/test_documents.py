@@ -72,7 +72,6 @@ BY_HAND = {
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
     ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
     ("install.md", "| part | size"): "sizes by du",
-    ("method.md", "| fine Gaussians"): "means of two results, in decision 022",
     ("mutation.md", "| sample | run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",

@@ -1,9 +1,9 @@
-"""Rivals under one rule, or the ladder from plain 3DGS to the method, on named rows with several seeds.
+"""Methods under one rule, side by side on named rows with several seeds; the ladder from plain 3DGS to the method; an ablation.
 
-All start from the same points, stand before the same background, have the same degree and are scored alike. Steps of an arm are
-chosen by leaving training views out: first with --tune, which writes --tuned; then without, which reads it and fits to all
-training views. --most-steps leaves out arms of more steps. Rows that a file holds are kept when the command is given again.
---set ladder has the ladder.
+All arms of a set start from the same points, stand before the same background, have the same degree and are scored alike. Where
+an arm lists several numbers of steps, training views left out choose: of up to four each in turn, the middle one first, or only
+the first --folds of them; of more, two at once. Then all training views are fitted, seed by seed, so that each arm has one seed
+before any has two. Rows that --out holds are kept when the command is given again. --arms N takes the first N arms of the set.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import functools
 import math
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import torch
 
-from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.arms import ARMS, GSPLAT, Arm, chosen_steps, steps_in
 from bench.lib.one_fit import Fit, compile_all, is_peer, measure, plan
@@ -32,54 +32,89 @@ LEFT_OUT = 2
 WHAT = "scores, sizes and times of methods by row and seed, under one rule"
 
 
-def presets_of(arm: Arm, row: str, tuned: list[dict] | None) -> list[str]:
-    """Return the presets to fit: of all numbers of steps where ``tuned`` is None, else of the chosen one."""
-    if not arm.steps:
-        return [] if tuned is None else [arm.preset]
-    return [arm.with_steps(n) for n in (arm.steps if tuned is None else (chosen_steps(tuned, row, arm),))]
-
-
-def fits(a: argparse.Namespace, rows: dict[str, Row], folders: dict[str, str], device: torch.device) -> list[Fit]:
-    """Return all fits: seeds in order, the most steps of each seed first."""
-    tuned, found = None if a.tune else result_file.read(a.tuned)["rows"], []
-    for seed in range(1 if a.tune else a.seeds):
-        own: list[Fit] = []
-        for arm in ARMS[a.set]:
-            for name, row in rows.items():
-                for preset in presets_of(arm, name, tuned):
-                    place = (row.split, row.downscale)
-                    own += plan(name, preset, seed, folders[name], place, LEFT_OUT * a.tune, str(device))
-        found += sorted(own, key=lambda fit: work(fit.preset), reverse=True)
-    return [fit for fit in found if steps_in(fit.preset) <= a.most_steps]
-
-
-def work(preset: str) -> float:
+def work(fit: Fit) -> int:
     """Return roughly what a fit takes, in steps: a step of two models takes as long as four."""
-    return steps_in(preset) * (4 if "CorGS" in preset else 1)
+    return steps_in(fit.preset) * (4 if "CorGS" in fit.preset else 1)
+
+
+class Study:
+    """The fits of a set of arms."""
+
+    def __init__(self, a: argparse.Namespace, rows: dict[str, Row], folders: dict[str, str], device: torch.device):
+        """Keep the arguments, the rows by name, and the folders of their scenes."""
+        self.arms, self.seeds, self.folds = ARMS[a.set][: a.arms], a.seeds, a.folds
+        self.rows, self.folders, self.device = rows, folders, str(device)
+
+    def _plan(self, row: str, preset: str, seed: int, left_out: int) -> list[Fit]:
+        place = (self.rows[row].split, self.rows[row].downscale)
+        return plan(row, preset, seed, self.folders[row], place, left_out, self.device)
+
+    def tuning(self) -> list[Fit]:
+        """Return the fits that choose steps, the longest first."""
+        found = []
+        for name in self.rows:
+            for preset in (arm.with_steps(n) for arm in self.arms for n in arm.steps):
+                fits = self._plan(name, preset, 0, LEFT_OUT)
+                found += [*fits[len(fits) // 2 :], *fits[: len(fits) // 2]][: self.folds]
+        return sorted(found, key=work, reverse=True)
+
+    def scored(self, done: list[dict], tuned: bool) -> list[Fit]:
+        """Return the fits to all training views, seed by seed: of arms whose steps were chosen, or of the others.
+
+        Args:
+            done: Results so far.
+            tuned: Whether steps were chosen.
+        """
+        presets = {
+            (name, arm): self._preset(done, name, arm)
+            for arm in self.arms for name in self.rows if bool(arm.steps) == tuned
+        }  # fmt: skip
+        return [
+            fit
+            for seed in range(self.seeds)
+            for (name, _), preset in presets.items() if preset
+            for fit in self._plan(name, preset, seed, 0)
+        ]  # fmt: skip
+
+    def _preset(self, done: list[dict], name: str, arm: Arm) -> str | None:
+        if not arm.steps:
+            return arm.preset
+        try:
+            return arm.with_steps(chosen_steps(done, name, arm))
+        except UsageError as e:  # the tuning was cut short
+            print(f"not fitted: {e}")
+            return None
+
+
+def line(row: dict) -> str:
+    """Return a result in words."""
+    return f"{row['psnr']:.2f} dB  {row['training']:.1f} s"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Measure and print the table; return the exit code."""
     a = parse(
-        __doc__, arguments, {"data": Path}, rows=["fern:3", "horns:3"], set="rivals", tune=False, tuned=Path, most_steps=30_000,
-        seeds=5, jobs=1, seconds=math.inf, shrink=1, device="auto", out=Path,
+        __doc__, arguments, {"data": Path}, rows=["fern:3", "horns:3"], set="rivals", arms=99, folds=99, seeds=5, jobs=1,
+        seconds=math.inf, shrink=1, device="auto", out=Path,
     )  # fmt: skip
-    device = choose_device(a.device)[0]
+    device, began = choose_device(a.device)[0], time.monotonic()
     try:
-        if a.tuned is None or a.set not in ARMS or (a.out is None and not a.tune):
-            raise UsageError(f"--tuned is needed, --out without --tune, and a --set of {', '.join(ARMS)}")
-        a.out = a.tuned if a.tune else a.out
+        if a.set not in ARMS or a.out is None:
+            raise UsageError(f"--out is needed, and a --set of {', '.join(ARMS)}")
         rows = {name: shrunk(row_of(name), a.shrink) for name in a.rows}
-        with tempfile.TemporaryDirectory() as work:
-            folders = {name: made(a.data, row, Path(work)) for name, row in rows.items()}
-            tasks = fits(a, rows, folders, device)
-            used = ("default", *((GSPLAT,) if any(is_peer(t.preset) for t in tasks) else ()))  # others use little else
+        with tempfile.TemporaryDirectory() as place:
+            study = Study(a, rows, {name: made(a.data, row, Path(place)) for name, row in rows.items()}, device)
+            used = ("default", *((GSPLAT,) if any(is_peer(arm.preset) for arm in study.arms) else ()))  # others use little else
             first = functools.partial(compile_all, used, str(device))
-            found = measure_all(measure, tasks, first, a, WHAT, device, lambda r: f"{r['psnr']:.2f} dB  {r['training']:.1f} s")
+            found: list[dict] = []
+            for tuned in (False, True):
+                tasks = study.scored(found, True) if tuned else study.tuning() + study.scored(found, False)
+                left = argparse.Namespace(**vars(a) | {"seconds": a.seconds - (time.monotonic() - began)})
+                found = measure_all(measure, tasks, None if tuned else first, left, WHAT, device, line)
     except WarpgsError as e:
         print(f"bench.fits.rivals: {e}", file=sys.stderr)
         return e.exit_code
-    print(means_table(found))
+    print(means_table([row for row in found if not row["left_out"]]))
     return int(any("error" in row for row in found))
 
 

@@ -12,7 +12,7 @@ from warpgs.pipeline.train.by_views import MIN_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`; the degree follows from the number of views."""
-STEPS = (500, 1000, 2000, 4000)
+STEPS = (1000, 2000, 4000)
 """Numbers of steps that training views left out choose from."""
 SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
 NO_GROWTH = "density.gradient=1e9"
@@ -34,13 +34,13 @@ class Arm:
         return f"{self.preset}{',' if ':' in self.preset else ':'}steps={steps}"
 
 
-COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,cuda_graph=false,density.gradient=0.0005,{ONE_RULE}"
+COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,density.gradient=0.0005,{ONE_RULE}"
 GSPLAT = "gsplat:sh_degree=auto,background=mean"
 RIVALS = (
     Arm("`default`", "default"),
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
-    Arm("CoR-GS", COR_GS, (1000, 3000)),
-    Arm("gsplat", GSPLAT, (500, 1000, 2000, 3000)),
+    Arm("CoR-GS", COR_GS, (3000, 10_000)),
+    Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, 3,000 steps", f"{GSPLAT},steps=3000"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
     Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
@@ -78,9 +78,9 @@ def steps_in(preset: str) -> int:
 
 
 def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:
-    """Return the steps of best PSNR on the training views left out of a row, the mean over views and seeds.
+    """Return the steps of best PSNR on the training views left out of a row, the mean over views.
 
-    Numbers of steps that lack some of the views, since the tuning was cut short, are left out.
+    A tuning that was cut short chooses among the numbers that most views were left out for.
 
     Raises:
         UsageError: None was measured.
@@ -92,5 +92,5 @@ def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:
     scores = {n: found[arm.with_steps(n)] for n in arm.steps}
     most = max(map(len, scores.values()))
     if not most:
-        raise UsageError(f"{row}, {arm.words}: no number of steps was tried on views left out; give the command with --tune")
+        raise UsageError(f"{row}, {arm.words}: no number of steps was tried on training views left out")
     return max((n for n in arm.steps if len(scores[n]) == most), key=lambda n: statistics.mean(scores[n]))

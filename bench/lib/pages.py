@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from bench.lib import accuracy_page, performance_page, result_file, results_page, trade_page, use_pages
+from bench.lib import accuracy_page, method_page, performance_page, result_file, results_page, trade_page, use_pages
 
 DOCS = result_file.ROOT / "docs"
 PARTS: dict[str, Callable[[], dict[str, str]]] = {
@@ -14,6 +14,7 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "formats.md": lambda: {"formats": use_pages.formats()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
     "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
+    "method.md": lambda: {"placement": method_page.placement()},
     "performance.md": performance_page.parts,
     "results.md": results_page.parts,
     "trade.md": trade_page.parts,

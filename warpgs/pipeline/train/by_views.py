@@ -1,6 +1,6 @@
 """Settings that follow from the number of training views and their size: one rule from 3 photographs to 300, on any device.
 
-The constants were chosen by leaving training views out (docs/decisions/013-any-capture.md).
+The constants were chosen by leaving training views out (docs/decisions/013-any-capture.md); docs/results.md lists exceptions.
 """
 
 from __future__ import annotations
