@@ -14,6 +14,7 @@ WORDS = {
     "only": "a configuration's name, or its beginning",
     "out": "JSON file to write; finished rows are kept where the program says so",
     "presets": "presets, also with settings: default:steps=500,optimizer.scales_lr=0.1",
+    "programs": "names of the programs to run; all where not given",
     "rows": "named rows, or FOLDER@SPLIT@DOWNSCALE",
     "seconds": "after this long no further fit is begun",
     "seeds": "number of seeds, or the seeds themselves where the default is a list",

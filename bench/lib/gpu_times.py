@@ -17,15 +17,15 @@ TRACES = 3
 WARM_UP = 5
 
 
-def gpu_times(work: Callable[[], object], repeats: int) -> tuple[dict, Counter]:
+def gpu_times(work: Callable[[], object], repeats: int, traces: int = TRACES) -> tuple[dict, Counter]:
     """Return the GPU time of a work [ms], the sum of its kernels' durations, with the spread of traces; and [us] by kernel."""
     from torch.profiler import ProfilerActivity, profile
 
     for _ in range(WARM_UP):
         work()
     torch.cuda.synchronize()
-    totals, kernels, each = [], Counter(), max(1, repeats // TRACES)
-    for _ in range(TRACES):
+    totals, kernels, each = [], Counter(), max(1, repeats // traces)
+    for _ in range(traces):
         with profile(activities=[ProfilerActivity.CUDA]) as trace:
             for _ in range(each):
                 work()
@@ -34,7 +34,7 @@ def gpu_times(work: Callable[[], object], repeats: int) -> tuple[dict, Counter]:
         for event in trace.events():
             if event.device_type == torch.autograd.DeviceType.CUDA:
                 total += event.device_time
-                kernels[event.name] += event.device_time / (TRACES * each)
+                kernels[event.name] += event.device_time / (traces * each)
         totals.append(total / each / 1000)
     return {"median": round(statistics.median(totals), 4), "spread": [round(min(totals), 4), round(max(totals), 4)]}, kernels
 

@@ -200,13 +200,13 @@ def plots(results: dict[str, dict]) -> dict[str, str]:
 
 def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
-    ops, others, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "turns"))
+    ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     sources, beside = _sources("ops", ops), next(iter(others.values()))
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
         "many channels": rasterizers_page.channels_table(beside),
-        "steps": rasterizers_page.steps_table(beside),
+        "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "buffers": rasterizers_page.buffers_table(beside),
         "whole fits": fits_table(turns) + _sources("turns", turns),
         "cpu step": cpu_step_table(result_file.stored("step")["cpu2"]) + "\n" + result_file.source("step_cpu2"),

@@ -2,7 +2,7 @@
 
 Directions: `image` without gradients, `forward` as it precedes a backward pass, `both`. GPU time is the sum of the kernels'
 durations; wall time runs from an idle device to an idle device, in turn, repeat by repeat. Memory is the peak of `both` above
-the inputs.
+the inputs. --programs names those to run, a few instead of all; --traces the traces that a GPU time is the median of.
 Needs a CUDA device; peers that cannot be imported are left out, with the reason. --kernels lists our kernels by GPU time.
 """
 
@@ -16,7 +16,7 @@ import torch
 
 from bench.lib import rasterizers, result_file
 from bench.lib.arguments import parse
-from bench.lib.gpu_times import gpu_times, peak_memory
+from bench.lib.gpu_times import TRACES, gpu_times, peak_memory
 from bench.lib.inputs import first_camera, garden_inputs
 from bench.lib.peers import torch_ssim
 from bench.lib.rasterizers import ATOMIC, GSPLAT, MANY_CHANNELS, OURS, UNRECORDED, Drawing
@@ -52,22 +52,29 @@ def works_of(drawing: Drawing, upstream: torch.Tensor) -> dict[str, Callable[[],
     return {"image": image, "forward": drawing.draw, "both": lambda: drawing.gradients(native)}
 
 
-def drawings(g: Gaussians, camera: Camera, channels: int, present: dict) -> dict[str, Drawing]:
+def drawings(g: Gaussians, camera: Camera, channels: int, present: dict, variants: dict) -> dict[str, Drawing]:
     """Return the scene as each program takes it: with coefficients for 3 channels, with plain colours for more."""
     if channels == 3:
-        made = {who: rasterizers.ours(g, camera, rule=RULE, **how) for who, how in VARIANTS.items()}
+        made = {who: rasterizers.ours(g, camera, rule=RULE, **how) for who, how in variants.items()}
         return made | {who: prepare(g, camera) for who, prepare in present.items()}
     generator = torch.Generator(g.means.device).manual_seed(3)
     colors = torch.rand(len(g), channels, device=g.means.device, generator=generator)
-    made = {who: rasterizers.ours(g, camera, colors, rule=RULE, **VARIANTS[who]) for who in (OURS, ATOMIC)}
+    many = {who: how for who, how in variants.items() if who in (OURS, ATOMIC)}
+    made = {who: rasterizers.ours(g, camera, colors, rule=RULE, **how) for who, how in many.items()}
     return made | {who: prepare(g, camera, colors) for who, prepare in present.items() if who in MANY_CHANNELS}
 
 
-def compare(g: Gaussians, camera: Camera, channels: int, present: dict, repeats: int, kernels: bool) -> dict:
-    """Return times by direction and program, peak memory, and the programs' differences from gsplat's image."""
+def compare(
+    g: Gaussians, camera: Camera, channels: int, programs: tuple[dict, dict], repeats: int, traces: int, kernels: bool
+) -> dict:
+    """Return times by direction and program, peak memory, and the programs' differences from our image.
+
+    ``programs`` are our variants and the peers.
+    """
+    variants, present = programs
     generator = torch.Generator(g.means.device).manual_seed(1)
     upstream = torch.rand(camera.height, camera.width, channels, device=g.means.device, generator=generator)
-    made = drawings(g, camera, channels, present)
+    made = drawings(g, camera, channels, present, variants)
     works = {who: works_of(drawing, upstream) for who, drawing in made.items()}
     row: dict = {"channels": channels, "wall_ms": {}, "gpu_ms": {}, "peak_mib": {}, "failed": {}}
     for who in list(works):
@@ -83,7 +90,7 @@ def compare(g: Gaussians, camera: Camera, channels: int, present: dict, repeats:
         row["wall_ms"][direction] = keep
         row["gpu_ms"][direction] = {}
         for who, w in works.items():
-            row["gpu_ms"][direction][who], by_kernel = gpu_times(w[direction], TRACED)
+            row["gpu_ms"][direction][who], by_kernel = gpu_times(w[direction], TRACED, traces)
             if kernels and who == OURS:
                 row.setdefault("kernels_us", {})[direction] = {k: round(v, 1) for k, v in by_kernel.most_common(24)}
     row["peak_mib"] = {who: round(peak_memory(w["both"]), 1) for who, w in works.items()}
@@ -154,9 +161,12 @@ def report(row: dict) -> None:
 
 def main() -> None:
     """Measure, print, write after each configuration."""
-    flags = {"repeats": 30, "only": "", "kernels": False, "without_steps": False}
+    flags = {"repeats": 30, "traces": TRACES, "programs": [str], "only": "", "kernels": False, "without_steps": False}
     a = parse(__doc__, None, {"garden": Path}, out=Path, **flags)
     present, absent = rasterizers.present(CUDA)
+    variants, present = (
+        {who: how for who, how in known.items() if who in (a.programs or known)} for known in (VARIANTS, present)
+    )
     for who, reason in absent.items():
         print(f"without {who}: {reason}")
     rows = []
@@ -167,7 +177,7 @@ def main() -> None:
         camera = first_camera(cameras)
         for channels in CHANNELS:
             row = {"configuration": name, "gaussians": len(g), "width": width, "height": height} | counts_of(g, camera)
-            row |= compare(g, camera, channels, present, a.repeats, a.kernels)
+            row |= compare(g, camera, channels, (variants, present), a.repeats, a.traces, a.kernels)
             if channels == 3 and not a.without_steps:
                 with contextlib.suppress(torch.cuda.OutOfMemoryError):
                     row["step_wall_ms"] = steps(g, camera, present, a.repeats)

@@ -12,7 +12,6 @@ from warpgs.errors import ResourceError
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import InstanceMemory, Visible, bin_tiles, running_counts, split_sum
-from warpgs.runtime.allocator import TORCH
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
@@ -161,7 +160,7 @@ def test_room_for_visible_gaussians_changes_no_list(device):
     projected, counts, wanted = binned(gaussians, cam)
     seen, total = int((counts > 0).sum()), int(counts.sum())
     assert 300 < seen < 550
-    sums = running_counts(counts.view(-1), wp.float32, TORCH)
+    sums = running_counts(counts.view(-1), wp.float32)
     assert split_sum(int(sums[-1])) == (seen, total)
     for room in (seen, seen + 1, 550, 600, seen - 1, 1):
         overflow = torch.zeros(1, dtype=torch.int32, device=device)

@@ -224,18 +224,20 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     )
 
 
-def running_counts(counts: torch.Tensor, real, allocator: Allocator, *, output: bool = False) -> torch.Tensor:
+def running_counts(
+    counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
+) -> torch.Tensor:  # fmt: skip
     """Return running sums of tile counts and visible Gaussians in one, int64, shape [S]: `split_sum` takes the last apart.
 
     Args:
         counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
         real: Scalar type of the Gaussians, of Warp.
-        allocator: Provider of the sums' memory.
-        output: True for sums that outlive the call of a graphed function.
+        allocator: Provider of the sums' memory, which is workspace.
+        out: Sums of as many counts, whose memory is taken instead; None for new memory.
     """
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-    packed = (allocator.output if output else allocator.workspace)((sums,), torch.int64, device)
+    packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
     kernel = make_kernels(real, native).pack_counts
     interop.launch(kernel, threads, [interop.view(counts, wp.int32), interop.view(packed, wp.int64)], device)
     return torch.cumsum(packed, 0, out=packed)

@@ -111,6 +111,7 @@ class GraphedRasterizer:
         self._forward_project, self._forward_blend, self._backward_blend, self._backward_project = (
             GraphedFunction(f, graphs) for f in functions
         )
+        self._sums: torch.Tensor | None = None
         self._no_factors = torch.empty(0, dtype=torch.float32, device=self.device)
         self._black: torch.Tensor | None = None
 
@@ -123,7 +124,7 @@ class GraphedRasterizer:
         """
         of_cameras = [t.contiguous() for t in inputs[5:8]]
         self._addresses[:] = [t.data_ptr() for t in of_cameras]  # nobody reads them any more: the last call was waited for
-        (cameras, *projection, sums), _ = self._forward_project(*inputs[:5])
+        (cameras, *projection), _ = self._forward_project(*inputs[:5])
         if self._total_ready is not None:
             self._total_ready.record(self._stream)
         if backgrounds is None:
@@ -131,7 +132,7 @@ class GraphedRasterizer:
                 self._black = torch.zeros(self.cameras, 3, dtype=torch.float32, device=self.device)
             backgrounds = self._black
         backgrounds = backgrounds.contiguous()
-        images, block = self._forward_blend(*projection, sums, backgrounds.detach())
+        images, block = self._forward_blend(*projection, backgrounds.detach())
         projected = projection[0]
         if self.gradients:
             projected = _projected(self, cameras, projection, *inputs[:7])
@@ -156,15 +157,15 @@ class GraphedRasterizer:
         cameras = allocator.output(((25 + self._coefficients) * self.cameras,), torch.float32, self.device)
         fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
-        sums = running_counts(counts.view(-1), wp.float32, allocator, output=True)
+        self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # kept, since it is used up within the call
         with interop.stream_of(self.device):
-            wp.copy(self._host_total, interop.view(sums[-1:], wp.int64).array())
+            wp.copy(self._host_total, interop.view(self._sums[-1:], wp.int64).array())
         return ()
 
-    def _bin_and_blend(self, allocator: Allocator, projected, counts, sums, backgrounds) -> tuple[torch.Tensor, ...]:
+    def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
         overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the sums tell before
         memory = InstanceMemory(
-            None, self.capacity.instances, overflow, allocator, Visible(sums, self.capacity.visible)
+            None, self.capacity.instances, overflow, allocator, Visible(self._sums, self.capacity.visible)
         )  # fmt: skip
         tiles, (_, _, _, *saved) = composite_into(projected, counts, backgrounds, self.settings, memory, self.gradients)
         if not self.gradients:
