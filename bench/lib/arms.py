@@ -39,7 +39,7 @@ GSPLAT = "gsplat:sh_degree=auto,background=mean"
 RIVALS = (
     Arm("`default`", "default"),
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
-    Arm("CoR-GS", COR_GS, (3000, 10_000)),
+    Arm("CoR-GS", COR_GS, (1500, 3000)),
     Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, 3,000 steps", f"{GSPLAT},steps=3000"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
