@@ -1,7 +1,8 @@
 """Two checkouts in turn on one machine: wall time, start, and held-out PSNR of the whole command `warpgs fit`.
 
 OLD and NEW are folders of the two checkouts; each keeps a kernel cache of its own, filled by a short fit before the first
-round. The order changes from round to round. Everything from the start of the process to its end counts as wall time.
+round. SCENES are folders, or FOLDER@SPLIT where they are split in different ways. The order of the checkouts changes from round
+to round. Everything from the start of the process to its end counts as wall time.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from pathlib import Path
 import torch
 
 from bench.lib import result_file
-from bench.lib.arguments import SCENE, parse
+from bench.lib.arguments import parse
 from bench.lib.tables import markdown
 
 WHAT = "the whole command warpgs fit from two checkouts in turn"
@@ -27,10 +28,11 @@ SIDES = ("old", "new")
 
 
 def command(scene: str, split: str, downscale: int, device: str, flags: str, out: Path, cores: str) -> list[str]:
-    """Return the command of one fit, on some processor cores; all cores where none is named."""
+    """Return the command of one fit, on some processor cores; all cores where none is named. 0 gives no ``--downscale``."""
     words = ["taskset", "-c", cores] if cores else []
     words += [sys.executable, "-m", "warpgs", "fit", scene, "--out", str(out), "--split", split]
-    return [*words, "--downscale", str(downscale), "--device", device, *shlex.split(flags)]
+    words += ["--downscale", str(downscale)] if downscale else []
+    return [*words, "--device", device, *shlex.split(flags)]
 
 
 def environment(checkout: Path, cache: Path, cores: str) -> dict[str, str]:
@@ -56,42 +58,52 @@ def timed(words: list[str], checkout: Path, env: dict[str, str], out: Path) -> d
 
 
 def summary(rows: list[dict]) -> str:
-    """Return the medians of both sides, and the median over rounds of new over old."""
-    lines = []
-    for side in SIDES:
-        own = [r for r in rows if r["side"] == side]
-        m = {k: statistics.median(r[k] for r in own) for k in ("wall", "setup", "training", "steps", "psnr")}
-        cells = [side, len(own), *(f"{m[k]:.1f}" for k in ("wall", "setup", "training")), f"{m['steps']:.0f}"]
-        lines.append([*cells, f"{1000 * m['training'] / m['steps']:.0f}", f"{m['psnr']:.2f}"])
-    head = ["", "rounds", "wall [s]", "setup [s]", "training [s]", "steps", "ms a step", "PSNR [dB]"]
-    pairs = [[next(r for r in rows if (r["side"], r["round"]) == (s, n)) for s in SIDES] for n in {r["round"] for r in rows}]
-    ratio = statistics.median(new["wall"] / old["wall"] for old, new in pairs)
-    gain = statistics.median(new["psnr"] - old["psnr"] for old, new in pairs)
-    over = f"new over old: {ratio:.3f} of the wall time, {gain:+.2f} dB (medians of {len(pairs)} rounds)"
-    return f"{markdown(head, lines)}\n{over}"
+    """Return for each scene the medians of both sides, and the median over rounds of new over old; then their means."""
+    lines, ratios, gains = [], [], []
+    for scene in dict.fromkeys(r["scene"] for r in rows):
+        here = [r for r in rows if r["scene"] == scene]
+        both = [n for n in {r["round"] for r in here} if sum(r["round"] == n for r in here) == len(SIDES)]
+        pairs = [[next(r for r in here if (r["side"], r["round"]) == (s, n)) for s in SIDES] for n in both]
+        if not pairs:
+            continue
+        ratios.append(statistics.median(new["wall"] / old["wall"] for old, new in pairs))
+        gains.append(statistics.median(new["psnr"] - old["psnr"] for old, new in pairs))
+        for k, side in enumerate(SIDES):
+            own = [pair[k] for pair in pairs]
+            m = {n: statistics.median(r[n] for r in own) for n in ("wall", "setup", "training", "steps", "psnr", "gaussians")}
+            cells = [scene, side, len(own), *(f"{m[n]:.1f}" for n in ("wall", "setup", "training")), f"{m['steps']:.0f}"]
+            cells += [f"{1000 * m['training'] / m['steps']:.0f}", f"{m['gaussians']:,.0f}", f"{m['psnr']:.2f}"]
+            lines.append([*cells, *((f"{ratios[-1]:.3f}", f"{gains[-1]:+.2f}") if k else ("", ""))])
+    head = ["scene", "", "rounds", "wall [s]", "setup [s]", "training [s]", "steps", "ms a step", "Gaussians", "PSNR [dB]"]
+    over = f"new over old, mean of {len(gains)} scenes: {statistics.mean(ratios):.3f} of the wall time, " if gains else ""
+    over += f"{statistics.mean(gains):+.2f} dB, least {min(gains):+.2f}" if gains else "no round is whole"
+    return f"{markdown([*head, 'time', 'gain [dB]'], lines)}\n{over}"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the rounds, print and keep the times; return 0."""
     a = parse(
-        __doc__, arguments, {"old": Path, "new": Path, **SCENE}, need=("out",), split="llff:3", downscale=1, rounds=5,
+        __doc__, arguments, {"old": Path, "new": Path, "scenes": [str]}, need=("out",), split="llff:3", downscale=0, rounds=5,
         cores="0,1", device="cpu", old_flags="", new_flags="", out=Path,
     )  # fmt: skip
-    scene, rows = str(a.scene.resolve()), []
+    rows: list[dict] = []
     with tempfile.TemporaryDirectory() as work:
         for turn in range(a.rounds + 1):  # the first fills the kernel caches and is not kept
-            for side in SIDES if turn % 2 else SIDES[::-1]:
-                checkout = getattr(a, side).resolve()
-                flags, out = getattr(a, f"{side}_flags"), Path(work, f"{side}{turn}")
-                flags = flags if turn else f"{flags} --steps 20"
-                words = command(scene, a.split, a.downscale, a.device, flags, out, a.cores)
-                row = timed(words, checkout, environment(checkout, Path(work, f"cache_{side}"), a.cores), out)
+            for place in a.scenes if turn else a.scenes[:1]:
+                folder, _, split = place.partition("@")
+                for side in SIDES if turn % 2 else SIDES[::-1]:
+                    checkout, out = getattr(a, side).resolve(), Path(work, f"{side}{turn}_{len(rows)}")
+                    flags = f"{getattr(a, f'{side}_flags')}{'' if turn else ' --steps 20'}"
+                    scene = str(Path(folder).resolve())
+                    words = command(scene, split or a.split, a.downscale, a.device, flags, out, a.cores)
+                    row = timed(words, checkout, environment(checkout, Path(work, f"cache_{side}"), a.cores), out)
+                    if turn:
+                        name = f"{Path(folder).name} {split or a.split}"
+                        rows.append({"scene": name, "side": side, "round": turn} | row)
+                        print(f"round {turn} {name} {side}: {row['wall']:.1f} s, {row['psnr']:.2f} dB", flush=True)
                 if turn:
-                    rows.append({"side": side, "round": turn} | row)
-                    print(f"round {turn} {side}: {row['wall']:.1f} s, {row['psnr']:.2f} dB", flush=True)
-            if turn:
-                commits = {side: result_file.commit_of(getattr(a, side)) for side in SIDES}
-                result_file.keep(a.out, WHAT, torch.device(a.device), rows, commits=commits)
+                    commits = {side: result_file.commit_of(getattr(a, side)) for side in SIDES}
+                    result_file.keep(a.out, WHAT, torch.device(a.device), rows, commits=commits)
     print(summary(rows))
     return 0
 

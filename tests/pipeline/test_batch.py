@@ -95,7 +95,7 @@ def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
 
 def test_a_batch_costs_memory_and_on_a_cpu_steps():
     """The plan counts the sums; a time on a CPU is one of renders; and elsewhere steps are those of one view."""
-    views = [View(v.name, dataclasses.replace(v.camera, width=4000, height=3000), v.image) for v in photos(4)]
+    views = [View(v.name, dataclasses.replace(v.camera, width=3000, height=2000), v.image) for v in photos(4)]
     config = PRESETS["default"]
     for device, fewer in (("cpu", 8), ("cuda", 1)):
         one, eight = (settings_by_views(dataclasses.replace(config, batch=b), views, device)[0].steps for b in (1, 8))

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.by_views import ONE_LAYER, settings_by_views
 from warpgs.pipeline.train.presets import PRESETS
 
 
@@ -21,6 +21,35 @@ def test_quick_is_never_slower_than_default(device, views, width, height):
     assert 0 < quick == min(600, default)
     given = dataclasses.replace(PRESETS["quick"], steps=700)
     assert settings_by_views(given, train, device)[0].steps == 700
+
+
+def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
+    """With more than nine views, and only where steps are left out; rates that are given hold, and the loss is said."""
+
+    def chosen(views, device, **optimizer):
+        train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=None)] * views
+        config = PRESETS["default"]
+        config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, **optimizer))
+        found, notes = settings_by_views(config, train, device)
+        return (found.optimizer.means_lr, found.optimizer.sh_lr), notes
+
+    usual = (1.6e-4, 2.5e-3)
+    assert chosen(9, "cpu")[0] == chosen(10, "cuda")[0] == usual
+    rates, notes = chosen(10, "cpu")
+    assert rates == (4e-4, 6.25e-3)
+    assert chosen(10, "cpu", means_lr=1e-3, sh_lr=2e-3)[0] == (1e-3, 2e-3)
+    assert "--no-cpu-limit takes all, about 16 min, and gains 0.7 dB or more" in notes[-1]
+
+
+def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
+    """Its steps take longer, so that both take the same time."""
+    train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=None)] * 3
+    config = PRESETS["default"]
+    one, two = (
+        settings_by_views(dataclasses.replace(config, method=dataclasses.replace(config.method, hier=hier)), train, "cpu")[0]
+        for hier in (False, True)
+    )
+    assert abs(ONE_LAYER * one.steps - two.steps) < 2 and one.steps < two.steps
 
 
 def test_a_fit_on_a_cpu_has_smaller_images_unless_told():

@@ -36,6 +36,13 @@ CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
+ONE_LAYER = 1.1
+"""Time of a step on a CPU with one layer over that with two, of which fewer Gaussians grow."""
+MEANS_LR, SH_LR, CPU_RATES = 1.6e-4, 2.5e-3, 2.5
+"""Learning rates of the means and of the constant colour, and the factor of both where the time of a CPU limits the steps of
+more than `SPARSE_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
+LOST_DB = 0.2
+"""PSNR that a fit on a CPU loses each time its steps are halved, at least [dB]; with many views it is more."""
 
 
 def steps_by_views(views: int, opaque: bool = True) -> int:
@@ -91,14 +98,19 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     steps = wanted
     if config.steps is None:
         pixels = max(v.camera.width * v.camera.height for v in train)
-        seconds = pixels_of_steps(config.batch * wanted, half, pixels) / CPU_PIXELS
+        seconds = pixels_of_steps(config.batch * wanted, half, pixels) / CPU_PIXELS * (1.0 if method.hier else ONE_LAYER)
         if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):
             most = cpu_seconds(views)
             steps = max(1, int(wanted * most / seconds))
+            lost = LOST_DB * math.log2(wanted / steps)
             limit = (
                 f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
-                f"--no-cpu-limit takes all, about {seconds / 60:.0f} min"
+                f"--no-cpu-limit takes all, about {seconds / 60:.0f} min, and gains {lost:.1f} dB or more"
             )
+    rates = {"means_lr": MEANS_LR, "sh_lr": SH_LR}
+    if limit and views > SPARSE_VIEWS:
+        rates = {n: float(f"{CPU_RATES * rate:.3g}") for n, rate in rates.items()}
+    optimizer = dataclasses.replace(optimizer, **{n: rate for n, rate in rates.items() if getattr(optimizer, n) is None})
     loss = config.loss
     if loss.smooth_weight is None:
         smooth = opaque and views <= SMOOTH_VIEWS and steps >= SMOOTH_STEPS
@@ -106,9 +118,11 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
         f"at most {wanted:,} steps{each}": config.steps, f"SH degree {degree}": config.sh_degree,
+        f"means_lr {optimizer.means_lr:g}": config.optimizer.means_lr,
         f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
         f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
+        f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
         f"smooth_weight {loss.smooth_weight:g}": config.loss.smooth_weight,
         "two layers" if method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,

@@ -40,8 +40,9 @@ def check_lrs(of: str, **rates: float | None) -> None:
 class OptimizerConfig:
     """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
 
-    means_lr: float = 1.6e-4
-    """Learning rate of the means, times the scene's extent, at the start."""
+    means_lr: float | None = 1.6e-4
+    """Learning rate of the means, times the scene's extent, at the start. None: 1.6e-4, or more where the time of a CPU limits
+    the steps."""
     means_lr_final: float = 1.6e-6
     """The same at the last step; log-linear between."""
     quats_lr: float = 1e-3
@@ -56,8 +57,8 @@ class OptimizerConfig:
     """Learning rate of the opacity logits. None: by the number of views."""
     opacities_decay: float | None = 0.0
     """Fraction of every opacity that each step takes, in [0, 0.1]; 0 for none. None: by the number of views."""
-    sh_lr: float = 2.5e-3
-    """Learning rate of the constant colour coefficient."""
+    sh_lr: float | None = 2.5e-3
+    """Learning rate of the constant colour coefficient. None: 2.5e-3, or more where the time of a CPU limits the steps."""
     sh_rest_factor: float = 0.05
     """Fraction of that for the other coefficients."""
 
@@ -75,6 +76,7 @@ class OptimizerConfig:
             stable_start: Fraction of the fit, in [0, 1), after which the rate of the scales falls.
         """
         assert self.scales_lr is not None and self.opacities_lr is not None  # `settings_by_views` has chosen
+        assert self.means_lr is not None and self.sh_lr is not None
         stable = (progress - stable_start) / (1 - stable_start)
         return {
             "means": extent * log_linear(self.means_lr, self.means_lr_final, progress),
@@ -87,6 +89,7 @@ class OptimizerConfig:
     @property
     def head_lrs(self) -> dict[str, float]:
         """Learning rate of the first 3 numbers of a row, where it differs from the others'."""
+        assert self.sh_lr is not None  # `settings_by_views` has chosen
         return {"sh": self.sh_lr}
 
 
