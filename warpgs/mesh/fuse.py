@@ -10,6 +10,7 @@ import torch
 
 from warpgs.errors import UsageError
 from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
+from warpgs.mesh.agreement import DepthMap, agreed, depth_map, neighbours
 from warpgs.mesh.grid import MAX_RESOLUTION, MIN_RESOLUTION, GridPlan, check_memory, plan_grid
 from warpgs.mesh.surface_views import DEPTHS, SAMPLES, sample_surface, surface_views
 from warpgs.mesh.triangles import decimate, extract, remove_small_parts
@@ -72,7 +73,7 @@ class FusedMesh:
 
 def integrate_views(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, plan: GridPlan, depth: str,
-    stage: Callable[[str], object],
+    maps: Sequence[DepthMap], stage: Callable[[str], object],
 ) -> DistanceGrid:  # fmt: skip
     """Return the grid after all views, in the order of the cameras.
 
@@ -82,10 +83,13 @@ def integrate_views(
         render: Settings of the rasterizer.
         plan: The grid.
         depth: Depth that is fused.
+        maps: Depth of each view, which the others are compared with.
         stage: Function that shows a line of progress.
     """
     grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, gaussians.means)
-    for view in surface_views(gaussians, cameras, render, depth, "fusing depth", stage):
+    views = surface_views(gaussians, cameras, render, depth, "fusing depth", stage)
+    for view, others in zip(views, neighbours(maps)):
+        view = agreed(view, [maps[i] for i in others])
         integrate(grid, view.camera, view.depth, view.weights)
     return grid
 
@@ -96,8 +100,8 @@ def fuse(
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see of a model.
 
-    What no camera sees stays open. One view is held in memory at a time; it is rendered three times, for the extent of the
-    scene, for distances and for colours.
+    What no camera sees stays open, and what cameras do not agree on. Each view is rendered three times, for the extent of the
+    scene, for distances and for colours. One is held in memory at a time, and the depths of all.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
@@ -112,11 +116,14 @@ def fuse(
         ResourceError: The grid does not fit into memory.
         UsageError: A camera is orthographic, or an option is out of range.
     """
-    views = surface_views(gaussians, cameras, render, options.depth, "finding surfaces", stage)
-    samples = [sample_surface(v, max(1, SAMPLES // len(cameras))) for v in views]
+    samples, maps = [], []
+    for view in surface_views(gaussians, cameras, render, options.depth, "finding surfaces", stage):
+        samples.append(sample_surface(view, max(1, SAMPLES // len(cameras))))
+        maps.append(depth_map(view, len(cameras)))
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
     planned(plan, check_memory(plan, gaussians.means.device))
-    grid = integrate_views(gaussians, cameras, render, plan, options.depth, stage)
+    grid = integrate_views(gaussians, cameras, render, plan, options.depth, maps, stage)
+    del maps
     unseen = 1 - np.count_nonzero(grid.weights.cpu().numpy()) / plan.points
     stage("finding triangles: marching cubes")
     whole = extract(grid)

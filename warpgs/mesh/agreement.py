@@ -1,0 +1,115 @@
+"""Agreement of views on depth: what other views see into, and none of them sees at that depth, is left out of a mesh.
+
+A fit of few views pays for depth only where two of them look. Where one view alone sees a surface, as beside the edge of what
+hides it from the others, its depth is unconstrained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from warpgs.constants import NEAR
+from warpgs.geometry import relative_pose
+from warpgs.mesh.surface_views import SurfaceView
+from warpgs.priors.view_choice import matching_views, shared_sight
+from warpgs.scene import Camera
+
+TOLERANCE = 0.02
+"""Largest difference of two depths of one surface, as a fraction of the depth: that of coverage (decision 019)."""
+NEIGHBOURS = 16
+"""Most views that each view is compared with: the nearest that see the same from another angle."""
+MAX_PIXELS = 2**26
+"""Most pixels of all stored maps, 256 MiB; with more, every map is thinned alike."""
+BOUNDS = (0.02, 0.98)
+"""Quantiles of a view's depths that lie between its nearest and farthest surface."""
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of one view, kept while others are compared with it."""
+
+    camera: Camera
+    """Pinhole camera of the whole image, arrays of numpy."""
+    depth: torch.Tensor
+    """z-depth [u] of every ``step``-th pixel of every ``step``-th row, 0 where there is no surface, shape [h, w]."""
+    step: int
+    """Pixels from one stored depth to the next."""
+    bounds: tuple[float, float]
+    """Depths [u] that most of it lies between."""
+
+
+def depth_map(view: SurfaceView, views: int) -> DepthMap:
+    """Return the depth of a view as it is kept for comparisons.
+
+    Args:
+        view: The view.
+        views: Number of views that are kept.
+    """
+    step = max(1, int(np.ceil((view.depth.numel() * views / MAX_PIXELS) ** 0.5)))
+    depth = view.depth[step // 2 :: step, step // 2 :: step]
+    depth = torch.where(torch.isfinite(depth), depth, 0).contiguous()
+    known = depth[depth > 0].cpu().numpy()
+    near, far = np.quantile(known, BOUNDS) if len(known) else (1.0, 1.0)
+    return DepthMap(view.camera, depth, step, (float(near), max(float(far), float(near) * 1.01)))
+
+
+def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
+    """Return the views that each view is compared with, by index, nearest first."""
+    cameras = [m.camera for m in maps]
+    sight = shared_sight(cameras, [m.bounds for m in maps])
+    return [matching_views(sight, cameras, i, NEIGHBOURS, range(len(maps))) for i in range(len(maps))]
+
+
+def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
+    """Return a view without the depths that no other view confirms.
+
+    A depth is kept where at least one other view has a surface at that point, nearer than `TOLERANCE`, and where none has a
+    surface in that direction: outside of all other images nothing speaks against it. So one view alone keeps all.
+
+    Args:
+        view: The view.
+        others: Depth of the views that it is compared with.
+    """
+    shown = torch.isfinite(view.depth) & (view.depth > 0)
+    confirmed, questioned = torch.zeros_like(shown), torch.zeros_like(shown)
+    for other in others:
+        difference = _difference(torch.where(shown, view.depth, 0), view.camera, other)
+        confirmed |= difference <= TOLERANCE
+        questioned |= torch.isfinite(difference)
+    kept = confirmed | ~questioned | ~shown
+    return replace(view, depth=torch.where(kept, view.depth, 0), weights=torch.where(kept, view.weights, 0))
+
+
+def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
+    """Return how far the points of a depth map [H, W] lie from the surface that another view has there, as a fraction of depth.
+
+    The nearest of the four depths around counts: what a pixel covers of a slanted surface has several. Infinite where the pixel
+    has no depth, outside of the other image and where all four have none. Without a product of matrices: its bits would depend
+    on the processor.
+    """
+    rotation, translation = relative_pose(camera, other.camera)
+    height, width = depth.shape
+    rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (height, width))
+    x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])
+    y = (rows - float(camera.K[1, 2])) / float(camera.K[1, 1])
+    px, py, z = (
+        depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
+        for r, t in zip(rotation, translation)
+    )
+    ahead = (depth > 0) & (z > NEAR)
+    K, safe = other.camera.K, torch.where(ahead, z, torch.inf)
+    u, v = (p / safe * float(K[i, i]) + float(K[i, 2]) for i, p in enumerate((px, py)))
+    inside = ahead & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
+    left, top = (torch.floor((a - (other.step // 2 + 0.5)) / other.step) for a in (u, v))
+    h, w = other.depth.shape
+    least = torch.full_like(depth, torch.inf)
+    for down in (0, 1):
+        row = (top + down).clamp(0, h - 1).long()
+        for right in (0, 1):
+            found = other.depth[row, (left + right).clamp(0, w - 1).long()]
+            least = torch.minimum(least, torch.where(found > 0, (found - z).abs(), torch.inf))
+    return torch.where(inside, least / safe, torch.inf)
