@@ -1,5 +1,7 @@
 """Compositing of any number of channels: against a product of matrices, calls of three channels, and finite differences."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -9,7 +11,7 @@ from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
-from warpgs.kernels.blend_channels import blend_channels, width_of
+from warpgs.kernels.blend_channels import _width, blend_channels, width_of
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 
@@ -111,6 +113,20 @@ def test_channels_are_the_bits_of_calls_of_three(device, dtype, channels):
 def test_passes_are_as_few_and_as_narrow_as_can_be(channels, width):
     """Channels of a pass, by the number of channels."""
     assert width_of(channels) == width
+
+
+@pytest.mark.parametrize(
+    ("is_cuda", "dtype", "absgrad", "width"),
+    [
+        (True, torch.float64, False, 3),
+        (True, torch.float64, True, 11),
+        (True, torch.float32, False, 11),
+        (False, torch.float64, False, 11),
+    ],
+)
+def test_float64_on_cuda_takes_narrow_passes(is_cuda, dtype, absgrad, width):
+    """Its local memory grows with the width; magnitudes of gradients need one pass."""
+    assert _width(SimpleNamespace(is_cuda=is_cuda, dtype=dtype), 11, absgrad) == width
 
 
 def test_channels_of_all_cameras_share_their_gradient(device):

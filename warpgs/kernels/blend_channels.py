@@ -32,10 +32,20 @@ GEOMETRY = 6
 """Values of a projected Gaussian before its colour; its depth and its box follow that."""
 
 
-def width_of(channels: int) -> int:
-    """Return the number of channels of a pass: the fewest of `WIDTHS` that keep the number of passes at its least."""
-    passes = -(-channels // WIDTHS[-1])
-    return next(width for width in WIDTHS if width * passes >= channels)
+def width_of(channels: int, widths: tuple[int, ...] = WIDTHS) -> int:
+    """Return the number of channels of a pass: the fewest of ``widths`` that keep the number of passes at its least."""
+    passes = -(-channels // widths[-1])
+    return next(width for width in widths if width * passes >= channels)
+
+
+def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
+    """Return the number of channels of a pass over projected Gaussians [C, N, 12].
+
+    The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an H100
+    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA takes the narrowest, but for magnitudes, which need one pass.
+    """
+    narrow = projected.is_cuda and not is_native(projected) and not absgrad
+    return width_of(channels, WIDTHS[:1] if narrow else WIDTHS)
 
 
 @functools.cache
@@ -107,9 +117,11 @@ def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
     return v_image if native or v_image.shape[-1] == width else _padded(v_image, width)
 
 
-def _groups(projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor) -> Iterator[_Group]:
-    """Yield the groups of all channels, in order; each must be done with before the next."""
-    count, width, real = colors.shape[-1], width_of(colors.shape[-1]), interop.real_of(colors)
+def _groups(
+    projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
+) -> Iterator[_Group]:  # fmt: skip
+    """Yield the groups of all channels, ``width`` in each, in order; each must be done with before the next."""
+    count, real = colors.shape[-1], interop.real_of(colors)
     colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
     inputs = [interop.rows(projected, real), interop.view(tiles.counts, wp.int32), interop.rows(colors, real)]
     for first in range(0, count, width):
@@ -128,7 +140,7 @@ class _BlendChannels(torch.autograd.Function):
         projected, colors = projected.contiguous(), colors.contiguous()
         image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
         found = None
-        for group in _groups(projected, tiles, colors, backgrounds):
+        for group in _groups(projected, tiles, colors, backgrounds, _width(projected, colors.shape[-1], settings.absgrad)):
             # the first pass gives all that does not depend on the channels
             part = image[..., group.channels]
             whole = part.shape[-1] == group.backgrounds.shape[-1]
@@ -153,9 +165,9 @@ class _BlendChannels(torch.autograd.Function):
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
         v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
         v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))
-        real, width = interop.real_of(projected), width_of(colors.shape[-1])
+        real, width = interop.real_of(projected), _width(projected, colors.shape[-1], ctx.settings.absgrad)
         outputs = [interop.rows(t, real) for t in (v_projected, v_colors)]
-        for group in _groups(projected, tiles, colors, backgrounds):
+        for group in _groups(projected, tiles, colors, backgrounds, width):
             first = group.channels.start
             if v_image is None and first > 0:
                 break
