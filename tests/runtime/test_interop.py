@@ -214,6 +214,22 @@ def test_a_recorded_launch_takes_structs_by_value():
     assert first.__ctype__().count == 1 and second.__ctype__().count == 3
 
 
+@wp.kernel(enable_backward=False)
+def turned(begin: int, turn: wp.mat33d, shift: wp.vec3d, out: wp.array(dtype=wp.float64)):  # fmt: skip
+    """Write entries of a vector after a rotation and a shift."""
+    i = begin + wp.tid()
+    out[i] = (turn * wp.vec3d(wp.float64(1.0), wp.float64(2.0), wp.float64(3.0)) + shift)[i]
+
+
+def test_a_recorded_launch_takes_vectors_and_matrices(device):
+    """The values of each call, not those of the first."""
+    for scale in (1.0, 2.0, -3.0):
+        out = torch.zeros(3, dtype=torch.float64, device=device)
+        turn = wp.mat33d(scale, 0.0, 0.0, 0.0, scale, 0.0, 0.0, 0.0, scale)
+        interop.launch(turned, 3, [turn, wp.vec3d(0.0, 0.0, scale), interop.view(out, wp.float64)], out.device)
+        assert out.tolist() == [scale, 2 * scale, 4 * scale]
+
+
 def test_a_thread_launches_with_its_own_arguments(monkeypatch):
     """One kernel from two threads at a time, over memory of other sizes, each interrupted between patch and launch."""
     patch, meeting, counts = interop._Recorded._patch, threading.Barrier(2), (1000, 30)

@@ -261,8 +261,10 @@ class _Recorded:
             elif known[i] != value:
                 if _is_struct(value):
                     ctypes.pointer(command.params[i + 2])[0] = value.__ctype__()  # copies its numbers
-                else:
+                elif isinstance(value, (int, float)):
                     command.params[i + 2].value = value
+                else:  # vectors and matrices
+                    command.set_param_at_index(i + 1, value)
                 known[i] = value
 
 
