@@ -99,7 +99,6 @@ def test_tables_of_numbers_are_generated():
 
 RESULT_PAGES = ("results.md", "method.md", "presets.md")
 NAMED_NUMBERS = {
-    ("results.md", "1.6"): "version of gsplat",
     ("method.md", "0.45"): "the square root of 0.2, the variance of Mip-Splatting",
     ("method.md", "1.5"): "`EXACT` of warpgs/priors/given_depth.py",
     ("method.md", "4.1"): "section of a paper",
