@@ -75,6 +75,7 @@ BY_HAND = {
     ("mutation.md", "| sample | run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
+    ("results.md", "| method | `fern`"): "published scores, each with its source",
     ("scenes.md", "| fault | key"): "limits in the code",
     ("scenes.md", "| input | limit"): "limits in the code",
     ("tiles.md", "| bound | margin"): "derived margins",
@@ -94,6 +95,47 @@ def test_tables_of_numbers_are_generated():
             if len(rows) > 1 and 2 * len(numbers) > len(rows) and not named:
                 broken.append(f"{page.name}: {table.splitlines()[0]}")
     assert not broken, "\n".join(broken)
+
+
+RESULT_PAGES = ("results.md", "method.md", "presets.md")
+NAMED_NUMBERS = {
+    ("method.md", "0.45"): "the square root of 0.2, the variance of Mip-Splatting",
+    ("method.md", "1.5"): "`EXACT` of warpgs/priors/given_depth.py",
+    ("method.md", "4.1"): "section of a paper",
+}
+"""Numbers of prose that stand in no table and in no preset: page, number, what it is."""
+
+
+def numbers_in(text: str) -> set[str]:
+    """Return the numbers with a decimal point in a text."""
+    return set(re.findall(r"(?<![\d.])\d+\.\d+(?![\d.]*\d)", text))
+
+
+def values_in(settings: object) -> set[float]:
+    """Return all numbers of nested settings."""
+    if isinstance(settings, dict):
+        return set().union(*map(values_in, settings.values()))
+    if isinstance(settings, (list, tuple)):
+        return set().union(*map(values_in, settings))
+    return {float(settings)} if isinstance(settings, (int, float)) else set()
+
+
+def test_numbers_of_result_pages_stand_in_a_table_or_a_preset():
+    """Prose repeats a number of the page's tables, which files hold, or names a setting; others are listed with a reason."""
+    settings, broken, used = set().union(*(values_in(c.to_json()) for c in PRESETS.values())), [], set()
+    for name in RESULT_PAGES:
+        text = (ROOT / "docs" / name).read_text("utf-8")
+        generated = "".join(re.findall(r"written by bench\.document -->(.*?)<!-- end of", text, re.DOTALL))
+        tables = numbers_in(generated + "".join(line for line in text.splitlines() if line.startswith("|")))
+        prose = re.sub(r"<!-- ([\w ]+): written by.*?<!-- end of \1 -->", "", text, flags=re.DOTALL)
+        prose = "\n".join(line for line in prose.splitlines() if not line.startswith("|"))
+        prose = re.sub(r"```.*?```|`[^`]*`|\$\$.*?\$\$|\$[^$]*\$|\]\([^)]*\)", "", prose, flags=re.DOTALL)
+        for number in sorted(numbers_in(prose) - tables):
+            used.add((name, number))
+            if float(number) not in settings and (name, number) not in NAMED_NUMBERS:
+                broken.append(f"{name}: {number}")
+    assert not broken, "\n".join(broken)
+    assert {*NAMED_NUMBERS} <= used
 
 
 SLOW_TO_READ = re.compile(

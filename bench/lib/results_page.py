@@ -35,6 +35,8 @@ CAPTURES = {
     "fox:8": ("fox", 8), "fox:all": ("fox", 43), "temple:4": ("temple", 4), "temple:12": ("temple", 12),
 }  # fmt: skip
 """Scene and number of training views of each row of the presets' result."""
+BEFORE_DECAY = "default:method.hier=true,optimizer.opacities_decay=0"
+"""`default` as it was before decision 023."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
 POSES = {
     "given": "given with the photographs",
@@ -73,8 +75,10 @@ def _scores(rows: list[dict]) -> str:
 
 
 def _change(own: dict[int, dict], base: dict[int, dict], key: str, digits: int) -> str:
-    """Return the mean difference over the seeds that both have, with its 95 % interval."""
+    """Return the mean difference over the seeds that both have, with its 95 % interval; words where no seed differs."""
     seeds = sorted(own.keys() & base)
+    if all(own[s][key] == base[s][key] for s in seeds):
+        return "not exercised"
     d = paired_difference([own[s][key] for s in seeds], [base[s][key] for s in seeds])
     return f"{d.mean:+.{digits}f} [{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
 
@@ -131,6 +135,17 @@ def views() -> str:
         body.append([f"{scene}, {count}", *(_scores(rows) if rows else "" for rows in own)])
     heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {result['versions']['gsplat']}"]
     return table(["scene, views", *heads], body) + source
+
+
+def few_views() -> str:
+    """Return the table of `default` today, with up to 9 opaque views, beside its settings of before."""
+    result, source = _result("few_views_h100")
+    found, body = by_seed(result["rows"]), []
+    for name in (n for n in CAPTURES if (n, "default") in found):
+        own, base = (list(found[name, preset].values()) for preset in ("default", BEFORE_DECAY))
+        change = _change(found[name, "default"], found[name, BEFORE_DECAY], "psnr", 2)
+        body.append([", ".join(map(str, CAPTURES[name])), _scores(base), _scores(own), change])
+    return table(["scene, views", "two layers, no opacity decay", "`default`", "change in PSNR"], body) + source
 
 
 def mcmc() -> str:
@@ -220,7 +235,7 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ladder, ablation, views, mcmc, objects, poses, same_image, antialiasing, meshes, repeats,
+    ladder, ablation, views, few_views, mcmc, objects, poses, same_image, antialiasing, meshes, repeats,
 )  # fmt: skip
 
 

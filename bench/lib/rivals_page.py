@@ -57,7 +57,7 @@ def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], abov
             score = f"{mean_sd([r['psnr'] for r in own.values()])} / {statistics.mean(r['ssim'] for r in own.values()):.3f}"
             body[-1] += [f"{steps_in(preset):,}", score + count, change]
     scenes = [name.split(":")[0] for name in names]
-    what = "change" if above else "difference to it"
+    what = "change" if above else f"difference to {arms[0].words}"
     head = [heading for s in scenes for heading in (f"{s}: steps", f"{s}: PSNR / SSIM", what)]
     return markdown(["step" if above else "method", *head], body, ["step" if above else "method"])
 
