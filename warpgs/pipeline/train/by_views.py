@@ -41,7 +41,7 @@ ONE_LAYER = 1.1
 MEANS_LR, SH_LR, CPU_RATES = 1.6e-4, 2.5e-3, 2.5
 """Learning rates of the means and of the constant colour, and the factor of both where the time of a CPU limits the steps of
 more than `SPARSE_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
-LOST_DB = 0.2
+LOST_DB = 0.18
 """PSNR that a fit on a CPU loses each time its steps are halved, at least [dB]; with many views it is more."""
 
 
