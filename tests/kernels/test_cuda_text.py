@@ -19,14 +19,15 @@ def modules() -> dict[str, wp.Module]:
     kernels += [make(size) for make in (median_depth.make_native, heaviest.make_native) for size in (8, 16)]
     variants = list(itertools.product(("stored", "activated", "covariances"), (True, False)))  # parameters, antialiased
     for variant in [*variants, ("stored", False, 25)]:
-        kernels += [make("pinhole", *variant) for make in (project_cuda.make_forward, project_cuda.make_backward)]
+        both = project_cuda.make_forward, project_cuda.make_backward
+        kernels += [make(real, "pinhole", *variant) for make in both for real in (wp.float32, wp.float64)]
     for channels in blend_channels.WIDTHS:
         kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]
         for depth, absgrad in itertools.product((True, False), repeat=2):
             made = blend_cuda.make_backward(8, depth, 64, True, channels, absgrad)
             kernels += [made.backward, made.gather]
     for model in CAMERA_MODELS.names():
-        kernels += [project_cuda.make_forward(model), project_cuda.make_backward(model)]
+        kernels += [project_cuda.make_forward(wp.float32, model), project_cuda.make_backward(wp.float32, model)]
     return {k.module.name: k.module for k in kernels}
 
 

@@ -40,11 +40,6 @@ def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
     return [interop.view(tensor, dtype) for tensor, dtype in zip(inputs, types)]
 
 
-def _native(tensor: torch.Tensor) -> bool:
-    """Return whether the kernels of `project_cuda` apply."""
-    return tensor.is_cuda and tensor.dtype == torch.float32
-
-
 def project_tensors(
     inputs: ProjectInputs, settings: ProjectSettings, allocator: Allocator = TORCH
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -67,8 +62,8 @@ def project_tensors(
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
     ]  # fmt: skip
-    if _native(means):
-        kernel, tasks, cost = project_cuda.make_forward(*settings.variant()), cameras * count, 5
+    if means.is_cuda:
+        kernel, tasks, cost = project_cuda.make_forward(real, *settings.variant()), cameras * count, 5
     else:
         kernel, tasks, cost = project_cpu.make_forward(real, *settings.variant()), cameras * -(-count // LANES), 5 * LANES
     interop.launch(kernel, tasks, arguments, means.device, cost=cost)
@@ -132,8 +127,10 @@ def project_gradients(
         interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
         interop.rows(v_projected, real),
     ]  # fmt: skip
-    if _native(projected):
-        kernel, tasks, cost = project_cuda.make_backward(*settings.variant()), -(-count // BLOCK) * BLOCK, 10
+    if projected.is_cuda:
+        kernel, tasks, cost = project_cuda.make_backward(real, *settings.variant()), -(-count // BLOCK) * BLOCK, 10
+        if real is wp.float64:
+            found[4].zero_()
         arguments.append(int(wants_camera))
     else:
         kernel = project_cpu_backward.make_backward(real, *settings.variant(), wants_camera)

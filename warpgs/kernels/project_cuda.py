@@ -1,4 +1,4 @@
-"""The kernels of `project` for CUDA and float32; `project_cpu` has those of other devices and types."""
+"""The kernels of `project` for CUDA, a thread for each Gaussian; `project_cpu` has those of the CPU."""
 
 import functools
 
@@ -13,26 +13,34 @@ from warpgs.kernels.project_inputs import PROJECTED_SIZE
 
 
 @functools.cache
-def make_forward(camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
+def make_forward(
+    real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
+):  # fmt: skip
     """Make the forward kernel.
 
     Args:
+        real: wp.float32, whose rows and coefficients are moved 16 bytes at a time, or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
         parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
         antialiased: True to multiply opacities by `compensation`.
         bases: Number of basis values that a colour may have (`sh.bases_for`).
     """
-    real = wp.float32
+    native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
     s = make_spans(real)
     basis = sh.make_functions(real, bases).basis
     vec3 = m.vec3
-    color_of = make_color(bases).color
+    color_of = make_color(bases).color if native else None
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
-    store = make_native().store_row
+    @wp.func
+    def store_values(projected: wp.array2d(dtype=real), i: int, values: vec12):
+        for k in range(wp.static(PROJECTED_SIZE)):
+            projected[i, k] = values[k]
+
+    store = make_native().store_row if native else store_values
     variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.forward.cuda.{camera_model}{variant}"
+    module = f"warpgs.kernels.project.forward.cuda.{real.__name__}.{camera_model}{variant}"
 
     @wp.func
     def project_one(
@@ -78,9 +86,16 @@ def make_forward(camera_model: str, parameters: str = "stored", antialiased: boo
         d = m.direction(means[n], view)
         y = basis(vec3(d[0], d[1], d[2]))
         color = vec3(real(0.5), real(0.5), real(0.5))
-        shaded = color_of(coefficients, n, sh_count, y)
-        color += vec3(shaded[0], shaded[1], shaded[2])
-        largest = shaded[3]
+        largest = real(0.0)
+        if wp.static(native):
+            shaded = color_of(coefficients, n, sh_count, y)
+            color += vec3(shaded[0], shaded[1], shaded[2])
+            largest = shaded[3]
+        else:
+            for k in range(wp.static(bases)):
+                if k < sh_count:
+                    color += y[k] * coefficients[n, k]
+                    largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
         if not (m.finite3(color) and largest <= real(LARGEST_COEFFICIENT)):  # the maximum passes a NaN by, the colour has it
             return 0
         result = vec12()
@@ -129,31 +144,35 @@ def make_forward(camera_model: str, parameters: str = "stored", antialiased: boo
 
 
 @functools.cache
-def make_backward(camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES):
+def make_backward(
+    real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
+):  # fmt: skip
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
-    The Gaussians that some camera sees are dealt to the first threads of each block.
+    In float32 the Gaussians that some camera sees are dealt to the first threads of each block.
 
     Args:
+        real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
         parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
         antialiased: True where opacities were multiplied by `compensation`.
         bases: Number of basis values that a colour may have (`sh.bases_for`).
     """
-    real = wp.float32
+    native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
     f = project_backward.make_functions(real, camera_model, parameters, antialiased, bases)
     functions = sh.make_functions(real, bases)
     vec3 = m.vec3
     vec4 = m.vec4
-    compact = make_native().compact
-    clear_rows = make_native().clear_rows
-    color_backward = make_color(bases).color_backward
+    values = functions.values
+    compact = make_native().compact if native else None
+    clear_rows = make_native().clear_rows if native else None
+    color_backward = make_color(bases).color_backward if native else None
 
     # four blocks to a multiprocessor
-    registers = {"cuda_max_registers": 128}
+    registers = {"cuda_max_registers": 128} if native else {}
     variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
-    module = f"warpgs.kernels.project.backward.cuda.{camera_model}{variant}"
+    module = f"warpgs.kernels.project.backward.cuda.{real.__name__}.{camera_model}{variant}"
 
     @wp.kernel(enable_backward=False, module=module, **registers)
     def backward(
@@ -164,25 +183,28 @@ def make_backward(camera_model: str, parameters: str = "stored", antialiased: bo
         width: int, height: int, sh_count: int, near: real, low_pass: real,
         projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), v_projected: wp.array2d(dtype=real),
         camera_gradients: int,
-        # outputs
+        # outputs, of which coefficients are zero on entry in float64
         v_means: wp.array(dtype=m.vec3), v_quats: wp.array(dtype=m.vec4), v_log_scales: wp.array(dtype=m.vec3),
         v_logit_opacities: wp.array(dtype=real), v_coefficients: wp.array2d(dtype=m.vec3),
         v_viewmats: wp.array2d(dtype=m.mat44), v_Ks: wp.array2d(dtype=m.mat33),
     ):  # fmt: skip
         n = begin + wp.tid()
         count = means.shape[0]
-        seen = int(0)
-        if n < count:
-            for camera in range(viewmats.shape[0]):
-                seen += tile_counts[camera * count + n]
-            if seen == 0:
-                v_means[n] = vec3()
-                v_quats[n] = vec4()
-                v_log_scales[n] = vec3()
-                v_logit_opacities[n] = real(0.0)
-        clear_rows(n, seen, v_coefficients)
-        n = compact(n, seen)
-        if n < 0:
+        if wp.static(native):
+            seen = int(0)
+            if n < count:
+                for camera in range(viewmats.shape[0]):
+                    seen += tile_counts[camera * count + n]
+                if seen == 0:
+                    v_means[n] = vec3()
+                    v_quats[n] = vec4()
+                    v_log_scales[n] = vec3()
+                    v_logit_opacities[n] = real(0.0)
+            clear_rows(n, seen, v_coefficients)
+            n = compact(n, seen)
+            if n < 0:
+                return
+        elif n >= count:
             return
         v_mean = vec3()
         v_quat = vec4()
@@ -217,8 +239,15 @@ def make_backward(camera_model: str, parameters: str = "stored", antialiased: bo
                 d = m.direction(means[n], view)
                 basis = functions.basis(vec3(d[0], d[1], d[2]))
                 v_color = f.color(projected, v_projected, i)
-                w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
-                stored += 1
+                w = values()
+                if wp.static(native):
+                    w = color_backward(coefficients, n, sh_count, basis, v_color, stored, v_coefficients)
+                    stored += 1
+                else:
+                    for k in range(wp.static(bases)):
+                        if k < sh_count:
+                            v_coefficients[n, k] = v_coefficients[n, k] + basis[k] * v_color
+                            w[k] = wp.dot(coefficients[n, k], v_color)
                 v_centered = f.centered(d, w)
                 v_mean += v_centered
 
