@@ -72,6 +72,28 @@ def test_a_gaussian_does_not_see_its_neighbours(device, dtype):
             assert torch.equal(whole[rows], part)
 
 
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_kernels_of_cuda_give_the_same_in_float64(monkeypatch, cameras):
+    """In float64 they are plain Warp, so they run on a CPU beside those of the CPU, culled and broken Gaussians among them."""
+    gaussians, cam = cloud(37, dtype=torch.float64, degree=3), camera(cameras=cameras, dtype=torch.float64)
+    tensors = [t.detach().clone() for t in gaussians.tensors().values()]
+    tensors[0][3], tensors[0][5, 2], tensors[1][8], tensors[2][18] = math.nan, -1.0, 0.0, math.inf
+    tensors[2][11, 0], tensors[3][20], tensors[4][33, 0, 0] = -math.inf, math.nan, 1e7
+    leaves = [*(t.requires_grad_() for t in tensors), cam.viewmat.clone().requires_grad_(), cam.K.clone().requires_grad_()]
+
+    def everything():
+        projected, counts = project(*leaves, width=cam.width, height=cam.height, degree=3, rule=EXACT)
+        return counts, projected, *torch.autograd.grad((projected * torch.arange(12.0)).sum(), leaves)
+
+    wanted = everything()
+    assert 20 < int((wanted[0] > 0).sum()) / cameras < 37
+    monkeypatch.setattr("warpgs.kernels.project._threads_each", lambda tensor: True)
+    found = everything()
+    assert torch.equal(found[0], wanted[0])
+    for a, b in zip(found[1:], wanted[1:]):
+        close("projection", a, b)
+
+
 def test_gradients_equal_reference(device, dtype):
     """Gradients of a random weighting of the results, for Gaussians, poses and intrinsics."""
     gaussians, cam = leaves(hand_placed(dtype, device)), camera(cameras=2, dtype=dtype, device=device)

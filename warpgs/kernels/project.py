@@ -40,6 +40,11 @@ def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
     return [interop.view(tensor, dtype) for tensor, dtype in zip(inputs, types)]
 
 
+def _threads_each(tensor: torch.Tensor) -> bool:
+    """Return whether the kernels of `project_cuda` apply, which take a thread for each Gaussian."""
+    return tensor.is_cuda
+
+
 def project_tensors(
     inputs: ProjectInputs, settings: ProjectSettings, allocator: Allocator = TORCH
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -62,7 +67,7 @@ def project_tensors(
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
         interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
     ]  # fmt: skip
-    if means.is_cuda:
+    if _threads_each(means):
         kernel, tasks, cost = project_cuda.make_forward(real, *settings.variant()), cameras * count, 5
     else:
         kernel, tasks, cost = project_cpu.make_forward(real, *settings.variant()), cameras * -(-count // LANES), 5 * LANES
@@ -127,7 +132,7 @@ def project_gradients(
         interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
         interop.rows(v_projected, real),
     ]  # fmt: skip
-    if projected.is_cuda:
+    if _threads_each(projected):
         kernel, tasks, cost = project_cuda.make_backward(real, *settings.variant()), -(-count // BLOCK) * BLOCK, 10
         if real is wp.float64:
             found[4].zero_()

@@ -1,4 +1,4 @@
-"""The forward kernel of `project` in plain Warp: that of the CPU, and of float64 on every device.
+"""The forward kernel of `project` for the CPU, in plain Warp.
 
 A task takes `LANES` Gaussians. What is alike for all of them is computed in loops over the lanes, without branches, so that the
 compiler vectorises these; loads, calls of the C library, and colours take one Gaussian at a time.

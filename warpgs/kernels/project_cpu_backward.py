@@ -1,4 +1,4 @@
-"""The backward kernel of `project` in plain Warp: that of the CPU, and of float64 on every device (see `project_cpu`)."""
+"""The backward kernel of `project` for the CPU, in plain Warp (see `project_cpu`)."""
 
 import functools
 
