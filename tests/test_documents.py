@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 from warpgs import PRESETS
+from warpgs.pipeline.train import by_views
 from warpgs.pipeline.train.by_views import settings_by_views
 
 ROOT = Path(__file__).parent.parent
@@ -121,8 +122,9 @@ def values_in(settings: object) -> set[float]:
 
 
 def test_numbers_of_result_pages_stand_in_a_table_or_a_preset():
-    """Prose repeats a number of the page's tables, which files hold, or names a setting; others are listed with a reason."""
-    settings, broken, used = set().union(*(values_in(c.to_json()) for c in PRESETS.values())), [], set()
+    """Prose repeats a number of the page's tables, which files hold, or names a setting or a constant of the rule by views."""
+    rules = {name: value for name, value in vars(by_views).items() if name.isupper()}
+    settings, broken, used = set().union(values_in(rules), *(values_in(c.to_json()) for c in PRESETS.values())), [], set()
     for name in RESULT_PAGES:
         text = (ROOT / "docs" / name).read_text("utf-8")
         generated = "".join(re.findall(r"written by bench\.document -->(.*?)<!-- end of", text, re.DOTALL))

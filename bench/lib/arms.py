@@ -12,7 +12,7 @@ from warpgs.pipeline.train.by_views import MIN_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`; the degree follows from the number of views."""
-STEPS = (1000, 2000, 4000)
+STEPS = (500, 1000, 2000)
 """Numbers of steps that training views left out choose from."""
 SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
 NO_GROWTH = "density.gradient=1e9"

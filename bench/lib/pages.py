@@ -5,7 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
-from bench.lib import accuracy_page, method_page, performance_page, result_file, results_page, trade_page, use_pages
+from bench.lib import (
+    accuracy_page,
+    method_page,
+    performance_page,
+    result_file,
+    results_page,
+    rivals_page,
+    trade_page,
+    use_pages,
+)
 
 DOCS = result_file.ROOT / "docs"
 PARTS: dict[str, Callable[[], dict[str, str]]] = {
@@ -16,7 +25,11 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
     "method.md": lambda: {"placement": method_page.placement()},
     "performance.md": performance_page.parts,
-    "results.md": results_page.parts,
+    "results.md": lambda: {
+        **results_page.parts(),
+        "rivals": rivals_page.rivals(),
+        "ladder of default": rivals_page.ladder_of_default(),
+    },
     "trade.md": trade_page.parts,
 }
 """Functions that return the generated parts of each page by name."""

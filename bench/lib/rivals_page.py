@@ -12,8 +12,6 @@ from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.statistics import family_confidence, paired_difference
 
-RIVALS_FILE, LADDER_FILE = "rivals_h100", "ladder_h100"
-"""Results of `bench.fits.rivals` by set."""
 SEEDS = 2
 """Fewest seeds of an interval."""
 
@@ -63,16 +61,21 @@ def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], abov
 
 
 def _page_table(name: str, arms: Sequence[Arm], above: bool) -> str:
-    rows = result_file.read(result_file.FOLDER / f"{name}.json")["rows"]
-    names = [n for n in ROWS if any(r["row"] == n for r in rows)]
-    return arms_table(arms, rows, names, above) + "\n" + result_file.source(name)
+    """Return the table of the kept results of a set, by machine; where there are none, the command that makes them."""
+    tables = []
+    for machine, result in result_file.stored(name).items():
+        rows = result["rows"]
+        names = [n for n in ROWS if any(r["row"] == n for r in rows)]
+        tables.append(arms_table(arms, rows, names, above) + "\n" + result_file.source(f"{name}_{machine}"))
+    command = f"python -m bench.fits.rivals DATA --rows fern:3 horns:3 --set {name} --out FILE"
+    return "\n".join(tables) or f"Not measured yet: `{command}`.\n"
 
 
 def rivals() -> str:
     """Return the table of methods under one rule."""
-    return _page_table(RIVALS_FILE, RIVALS, above=False)
+    return _page_table("rivals", RIVALS, above=False)
 
 
-def ladder() -> str:
+def ladder_of_default() -> str:
     """Return the table of the method's steps from plain 3DGS, each beside the one above it."""
-    return _page_table(LADDER_FILE, LADDER, above=True)
+    return _page_table("ladder", LADDER, above=True)
