@@ -50,6 +50,21 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
     return tensor[None] if tensor.ndim == axes else tensor
 
 
+def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
+    """Return what a camera holds under a name as a tensor [C, ...], one for each of the poses ``like`` [C, 4, 4].
+
+    Raises:
+        ValueError: It is neither one for all nor one for each.
+    """
+    tensor, cameras = as_batch(array, like, axes), len(like)
+    own = list(tensor.shape[1:])
+    if tensor.ndim != axes + 1 or len(tensor) not in (1, cameras):
+        raise ValueError(
+            f"camera.{name} must have shape {own} or {[cameras, *own]}, as many as camera.viewmat, not {list(array.shape)}"
+        )
+    return tensor if len(tensor) == cameras else tensor.expand(cameras, *own).contiguous()
+
+
 def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
     """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
 
@@ -60,14 +75,16 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
 
     Raises:
         TypeError: The scalar types of means and covariances, or of the factors, differ.
-        ValueError: The covariances or the factors have another shape, or are on another device.
+        ValueError: The covariances or the factors have another shape, or are on another device; or the camera holds
+            another number of intrinsics or lenses than of poses, and not one for all.
     """
     means = gaussians.means
-    viewmats, Ks = as_batch(camera.viewmat, means), as_batch(camera.K, means)
+    viewmats = as_batch(camera.viewmat, means)
+    Ks = _for_each("K", camera.K, viewmats)
     if camera.distortion is None:
         distortion = nothing((len(viewmats), 0), means.dtype, means.device)
     else:
-        distortion = as_batch(camera.distortion, means, 1)
+        distortion = _for_each("distortion", camera.distortion, viewmats, 1)
     factors = checked_factors(means, opacity_factors)
     if isinstance(gaussians, CovarianceGaussians):
         interop.check(means=(means, "N 3"), covars=(gaussians.covars, "N 3 3"))

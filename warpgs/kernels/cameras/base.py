@@ -68,7 +68,7 @@ def check_camera(camera: Camera) -> type[CameraModel]:
     if found != model.coefficients:
         raise UsageError(
             f"the camera model {camera.model!r} takes {model.coefficients} coefficients of distortion, found {found}; give "
-            "Camera.distortion the shape [P] or [C, P]"
+            "Camera.distortion the shape [P] or [C, P], zeros for a lens without distortion"
         )
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError(
