@@ -116,7 +116,7 @@ REASONS = {
     "runtime/processor.py": {"processor_name": SYSTEM},
     "runtime/rank_watch.py": {"machine": SYSTEM},
     "temporary.py": {"_own_file": "writes"},
-    "viewer/panel.py": {"Panel._add_importance": "reads an image for `decode`, whose reader is named here"},
+    "viewer/panel.py": {"Panel._add_sampling": "reads an image for `decode`, whose reader is named here"},
 }  # fmt: skip
 """Why a function that opens something is not read by the fuzzer, by file and function."""
 
