@@ -36,8 +36,8 @@ class Camera:
     model: str = "pinhole"
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
-    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4, k1
-    to k4; zeros for an ideal lens; None for a model without. They have no gradient: those that require one are refused."""
+    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4,
+    k1 to k4; zeros for an ideal lens; None for a model without. They have no gradient: those that require one are refused."""
 
     @property
     def center(self) -> np.ndarray:
