@@ -16,6 +16,7 @@ from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.kernels.tiles import InstanceMemory
+from warpgs.means2d import count_passes
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
 from warpgs.render.compose import (
@@ -362,4 +363,5 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
 
     shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
     rgb, alpha, depth = map(own, images)
+    count_passes(rest[0])
     return Render(rgb, alpha, depth, *rest, **shaped)
