@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple, overload
@@ -119,6 +120,8 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
             raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
     K = camera.K
     if not (isinstance(K, torch.Tensor) and K.is_cuda):
+        if not all(math.isfinite(value) for matrix in _matrices(K) for row in matrix for value in row):
+            raise ValueError(f"camera.K holds numbers that are not finite: {_matrices(K)}")
         # as numbers, which takes a third of the time of tensors
         fixed = ((abs(m[0][1]), abs(m[1][0]), abs(m[2][0]), abs(m[2][1]), abs(m[2][2] - 1)) for m in _matrices(K))
         if not all(value <= K_TOLERANCE for values in fixed for value in values):
@@ -162,6 +165,9 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     if values is None:
         return None
     pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
+    if pattern == "C N D" and name == "colors" and len(values) == len(inputs.means) != len(inputs.viewmats):
+        found = list(values.shape)
+        raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]: give spherical harmonics as sh of the Gaussians")
     interop.check(means=(inputs.means, "N 3"), viewmats=(inputs.viewmats, "C 4 4"), **{name: (values, pattern)})
     if values.shape[-1] == 0:
         raise ValueError(f"{name} must have at least one channel, not shape {list(values.shape)}")
@@ -200,8 +206,8 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     """
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     values: torch.Tensor = like.new_zeros(channels) if background is None else torch.as_tensor(background).to(like)
-    if values.ndim not in (1, 2) or values.shape[-1] != channels:
-        raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], not {list(values.shape)}")
+    if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
+        raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
@@ -241,7 +247,7 @@ def rasterize(
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range, or a pixel
+            a GPU, has a skew, another last row than 0, 0, 1 or a number that is not finite. Or the near or the far plane is outside its range, or a pixel
             outside the image. Or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
