@@ -247,8 +247,8 @@ def rasterize(
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew, another last row than 0, 0, 1 or a number that is not finite. Or the near or the far plane is outside its range, or a pixel
-            outside the image. Or lists differ in length.
+            a GPU, has a skew, another last row than 0, 0, 1 or a number that is not finite. Or the near or the far plane is
+            outside its range, or a pixel outside the image. Or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
