@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+import warpgs
 from tests.gaussians import camera, cloud
 from warpgs import Normalization, load, rasterize, read_ply, save, write_ply
 from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.errors import DataError, UsageError
+from warpgs.export.formats import write_gaussians
 from warpgs.io.normalize import normalize_view
 from warpgs.scene import Camera, View
 
@@ -91,3 +93,19 @@ def test_mistakes_are_named(tmp_path):
     save_file({"means": g.means}, tmp_path / "b")
     with pytest.raises(DataError, match="not a model of format"):
         load(tmp_path / "b")
+
+
+@pytest.mark.parametrize("write", [warpgs.write_ply, warpgs.save, write_gaussians], ids=lambda f: f.__name__)
+def test_only_stored_gaussians_are_written(tmp_path, write):
+    """Those by scales and opacities name their conversion, which can be written."""
+    means, quats, scales = torch.rand(2, 3), torch.rand(2, 4), torch.rand(2, 3)
+    activated = warpgs.ActivatedGaussians(means, quats, scales, torch.full((2,), 0.5))
+    path = tmp_path / "scene.ply"
+    with pytest.raises(TypeError, match=r"not ActivatedGaussians; give gaussians\.stored\(\)"):
+        write(path, activated, units="file")
+    covariances = warpgs.CovarianceGaussians(means, torch.eye(3).repeat(2, 1, 1), torch.full((2,), 0.5))
+    with pytest.raises(TypeError, match="not CovarianceGaussians; files hold quats, log scales and logits"):
+        write(path, covariances, units="file")
+    assert not path.exists()
+    write(path, activated.stored(), units="file")
+    assert path.exists()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from numbers import Real
 
+from warpgs.errors import UsageError
 from warpgs.field_docs import document_fields
 
 ALPHA_CUT = 1.0 / 255.0
@@ -91,6 +94,26 @@ class Rule:
     square_sigma: float = 0.0
     """0 for Gaussians that reach exactly as far as alpha >= alpha_cut. Else they reach the tiles that a square of half side
     ceil(square_sigma * longest axis) touches, as in the first 3DGS renderer."""
+
+    def __post_init__(self) -> None:
+        """Check types and ranges; those of ``near`` and ``far`` are checked where they are used.
+
+        Raises:
+            UsageError: A cut-off is of another type, or outside its range.
+        """
+        for name in ("alpha_cut", "alpha_max", "transmittance_stop", "near", "far", "low_pass", "square_sigma"):
+            if not isinstance(getattr(self, name), Real):
+                raise UsageError(f"Rule.{name} must be a number, not {getattr(self, name)!r}")
+        for name in ("alpha_cut", "transmittance_stop"):
+            if not 0 <= getattr(self, name) < 1:
+                raise UsageError(f"Rule.{name} must be at least 0 and below 1, not {getattr(self, name)}")
+        if not 0 < self.alpha_max < 1:
+            raise UsageError(f"Rule.alpha_max must be above 0 and below 1, not {self.alpha_max}")
+        for name in ("low_pass", "square_sigma"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"Rule.{name} must be a finite number of at least 0, not {getattr(self, name)}")
+        if not isinstance(self.inclusive_stop, bool):
+            raise UsageError(f"Rule.inclusive_stop must be True or False, not {self.inclusive_stop!r}")
 
 
 RULES = {

@@ -55,6 +55,17 @@ def checked_normalization(normalization: Normalization | None, units: str, where
     return normalization
 
 
+def check_stored(gaussians: object) -> None:
+    """Check that Gaussians are given by log scales and logits, as files hold them.
+
+    Raises:
+        TypeError: They are of another kind.
+    """
+    if not isinstance(gaussians, Gaussians):
+        how = "give gaussians.stored()" if hasattr(gaussians, "stored") else "files hold quats, log scales and logits"
+        raise TypeError(f"gaussians must be of Gaussians, not {type(gaussians).__name__}; {how}")
+
+
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
     """Return Gaussians in other units; the tensors are shared where nothing changes.
 
@@ -68,8 +79,10 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
         target: Units of the result: scene or file.
 
     Raises:
+        TypeError: The Gaussians are given by other parameters.
         UsageError: A name of units is unknown.
     """
+    check_stored(gaussians)
     check_units(source)
     check_units(target)
     if source == target:

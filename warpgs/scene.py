@@ -36,8 +36,8 @@ class Camera:
     model: str = "pinhole"
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
-    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4, k1
-    to k4; zeros for an ideal lens; None for a model without. They have no gradient: those that require one are refused."""
+    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4,
+    k1 to k4; zeros for an ideal lens; None for a model without. They have no gradient: those that require one are refused."""
 
     @property
     def center(self) -> np.ndarray:
@@ -377,22 +377,13 @@ class Render:
         After it ``means2d.grad`` holds their gradients, shape [C, N, 2], and ``means2d.absgrad``, with
         ``RasterizeOptions.absgrad``, the sums over pixels of the gradients' magnitudes. They are a copy for a strategy to hold:
         to take a gradient of them is an error.
+
+        Raises:
+            UsageError: A backward pass went through the render already.
         """
-        means2d = self.projected.detach()[..., :2]
-        columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if self.absgrad else {})
+        from warpgs.means2d import projected_means
 
-        def keep(gradient: torch.Tensor) -> None:
-            for name, part in columns.items():
-                before, found = getattr(means2d, name, None), gradient.detach()[..., part]
-                setattr(means2d, name, found if before is None else before + found)
-
-        def refuse(gradient: torch.Tensor) -> None:
-            raise RuntimeError("means2d has no gradient into the Gaussians: take Render.projected[..., :2], which has one")
-
-        if self.projected.requires_grad:
-            means2d.requires_grad_().register_hook(refuse)
-            self.projected.register_hook(keep)
-        return means2d
+        return projected_means(self.projected, self.absgrad)
 
     @property
     def visible(self) -> torch.Tensor:

@@ -158,7 +158,7 @@ def test_wrong_channels_are_named():
         (ValueError, "features must have at least one channel", {"features": values[:, :0]}),
         (
             ValueError,
-            r"background must have shape \[8\] or \[C, 8\], not \[3\]",
+            r"background must have shape \[8\] or \[C, 8\], C=2, not \[3\]",
             {"colors": values, "background": behind[0, :3]},
         ),
         (ValueError, r"background must have shape \[3\] .*, not \[2, 8\]", {"features": values, "background": behind}),

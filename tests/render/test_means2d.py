@@ -68,6 +68,30 @@ def test_a_strategy_holds_the_projected_means():
     assert torch.equal(means2d.detach(), r.projected.detach()[..., :2])
 
 
+def test_means2d_after_the_backward_pass_is_an_error():
+    """Its gradients are gone; a render that was not read yet may be read after a pass through another one."""
+    gaussians, cam = leaves(cloud(50)), camera(dtype=torch.float32)
+    r, other = rasterize(gaussians, cam), rasterize(gaussians, cam)
+    r.rgb.sum().backward()
+    for _ in range(2):
+        with pytest.raises(UsageError, match=r"read render\.means2d before the backward pass"):
+            _ = r.means2d
+    means2d = other.means2d
+    other.rgb.sum().backward()
+    assert bool(means2d.grad.any()) and other.means2d is means2d
+
+
+def test_a_missing_absgrad_names_the_option():
+    """Where the option is off, and before the backward pass; means are plain tensors in other operations."""
+    for options in (RasterizeOptions(), RasterizeOptions(absgrad=True)):
+        means2d = rasterize(leaves(cloud(5)), camera(dtype=torch.float32), options).means2d
+        with pytest.raises(AttributeError, match=r"RasterizeOptions\(absgrad=True\) and a backward pass"):
+            _ = means2d.absgrad
+        with pytest.raises(AttributeError, match="has no attribute 'other'"):
+            _ = means2d.other
+        assert type(means2d + 1) is type(means2d.detach()) is torch.Tensor
+
+
 def test_without_gradients_means2d_is_plain():
     """No gradient to hold where none is recorded."""
     with torch.no_grad():

@@ -160,6 +160,29 @@ def test_arguments_of_another_type_or_shape_are_named():
             "skew is not rendered",
             (gaussians, dataclasses.replace(cam, K=skewed)),
         ),
+        (
+            ValueError,
+            "camera.K holds numbers that are not finite",
+            (gaussians, dataclasses.replace(cam, K=cam.K * torch.tensor([[torch.nan, 1, 1], [1, 1, 1], [1, 1, 1]]))),
+        ),
+        (
+            ValueError,
+            r"background must have shape \[3\] or \[C, 3\], C=1, not \[2, 3\]",
+            (gaussians, cam, RasterizeOptions(background=torch.zeros(2, 3))),
+        ),
+        (
+            ValueError,
+            r"colors \[3, 4, 3\] .* give spherical harmonics as sh of the Gaussians",
+            (gaussians, cam, RasterizeOptions(colors=torch.zeros(3, 4, 3))),
+        ),
+        *(
+            (
+                TypeError,
+                f"means must be float32 or float64, not {dtype}; means.float",
+                (Gaussians(**{n: t.to(dtype) for n, t in gaussians.tensors().items()}), cam),
+            )
+            for dtype in (torch.float16, torch.bfloat16, torch.int64)
+        ),
         (UsageError, "detach them", (gaussians, cam, learned)),
         (
             ResourceError,

@@ -298,7 +298,7 @@ def test_check_names_what_disagrees():
     assert interop.check(a=(a, "N 3"), b=(b, "K N")) == {"N": 2, "K": 4}
     with pytest.raises(TypeError, match="a must be a torch tensor, not list"):
         interop.check(a=([1.0], "N"))
-    with pytest.raises(TypeError, match=r"float32 or float64 tensors, not torch\.int32"):
+    with pytest.raises(TypeError, match=r"a must be float32 or float64, not torch\.int32"):
         interop.check(a=(a.int(), "N 3"))
     with pytest.raises(TypeError, match=r"b is torch\.float64 but a is torch\.float32"):
         interop.check(a=(a, "N 3"), b=(b.double(), "K N"))

@@ -63,6 +63,7 @@ def write_ply(
         warpgs.errors.DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates; or the
             normalization is no similarity. Nothing is written.
         warpgs.errors.ResourceError: The folder or the disk does not take the file.
+        TypeError: The Gaussians are given by other parameters: ``stored()`` of `ActivatedGaussians` converts them.
         warpgs.errors.UsageError: The units are unknown, or scene units come without a normalization.
     """
     path = Path(path)

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from warpgs.constants import Rule
+from warpgs.errors import UsageError
 from warpgs.field_docs import document_fields
 from warpgs.render.compose import settings_of
 from warpgs.render.settings import RenderSettings
 from warpgs.rules import rule_named
 from warpgs.scene import Camera
+
+SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "absgrad", "antialiased", "record")
+"""Options that are True or False."""
+
+WHOLE_NUMBERS = ("sh_degree", "tile_size", "heaviest", "memory_budget", "capacity", "max_instances")
+"""Options that are whole numbers, or None for their default."""
 
 
 @document_fields
@@ -82,6 +90,22 @@ class RasterizeOptions:
     gradients in a fixed order and, in the main thread, to calls without gradients. It does not apply with colors, features,
     opacity factors, contributions, median depth, heaviest, error bound and limits (docs/decisions/010-recorded-calls.md).
     Choose False where other threads wait for the whole device, as torch.cuda.synchronize does."""
+
+    def __post_init__(self) -> None:
+        """Check the types of switches and whole numbers; ranges are checked in `rasterize`.
+
+        Raises:
+            UsageError: An option is of another type, or a degree is none that is stored.
+        """
+        for name in SWITCHES:
+            if not isinstance(getattr(self, name), (bool, np.bool_)):
+                raise UsageError(f"{name} must be True or False, not {getattr(self, name)!r}")
+        for name in WHOLE_NUMBERS:
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer, type(None))):
+                raise UsageError(f"{name} must be a whole number, not {value!r}")
+        if self.sh_degree is not None and self.sh_degree < 0:
+            raise UsageError(f"sh_degree must be at least 0, not {self.sh_degree}")
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple, overload
@@ -16,6 +17,7 @@ from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.kernels.tiles import InstanceMemory
+from warpgs.means2d import count_passes
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
 from warpgs.render.compose import (
@@ -118,6 +120,8 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
             raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
     K = camera.K
     if not (isinstance(K, torch.Tensor) and K.is_cuda):
+        if not all(math.isfinite(value) for matrix in _matrices(K) for row in matrix for value in row):
+            raise ValueError(f"camera.K holds numbers that are not finite: {_matrices(K)}")
         # as numbers, which takes a third of the time of tensors
         fixed = ((abs(m[0][1]), abs(m[1][0]), abs(m[2][0]), abs(m[2][1]), abs(m[2][2] - 1)) for m in _matrices(K))
         if not all(value <= K_TOLERANCE for values in fixed for value in values):
@@ -161,6 +165,9 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     if values is None:
         return None
     pattern = "C N D" if isinstance(values, torch.Tensor) and values.ndim == 3 else "N D"
+    if pattern == "C N D" and name == "colors" and len(values) == len(inputs.means) != len(inputs.viewmats):
+        found = list(values.shape)
+        raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]: give spherical harmonics as sh of the Gaussians")
     interop.check(means=(inputs.means, "N 3"), viewmats=(inputs.viewmats, "C 4 4"), **{name: (values, pattern)})
     if values.shape[-1] == 0:
         raise ValueError(f"{name} must have at least one channel, not shape {list(values.shape)}")
@@ -199,8 +206,8 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     """
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
     values: torch.Tensor = like.new_zeros(channels) if background is None else torch.as_tensor(background).to(like)
-    if values.ndim not in (1, 2) or values.shape[-1] != channels:
-        raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], not {list(values.shape)}")
+    if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
+        raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
 
 
@@ -240,8 +247,8 @@ def rasterize(
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
             other, a transform of torch.func is active, or a second derivative is asked for.
         ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew or another last row than 0, 0, 1. Or the near or the far plane is outside its range, or a pixel
-            outside the image. Or lists differ in length.
+            a GPU, has a skew, another last row than 0, 0, 1 or a number that is not finite. Or the near or the far plane is
+            outside its range, or a pixel outside the image. Or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
@@ -362,4 +369,5 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
 
     shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
     rgb, alpha, depth = map(own, images)
+    count_passes(rest[0])
     return Render(rgb, alpha, depth, *rest, **shaped)

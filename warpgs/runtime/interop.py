@@ -367,7 +367,8 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
             raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
         if first is None:
             first_name, first = name, tensor
-            real_of(tensor)
+            if tensor.dtype not in REALS:
+                raise TypeError(f"{name} must be float32 or float64, not {tensor.dtype}; {name}.float() converts it")
         if tensor.dtype != first.dtype:
             raise TypeError(f"{name} is {tensor.dtype} but {first_name} is {first.dtype}; give both the same type")
         if tensor.device != first.device:

@@ -23,10 +23,13 @@ def let_idle_threads_sleep() -> None:
 
 @functools.cache
 def warn_if_spinning() -> None:
-    """Warn, in the first call, where torch was imported first."""
+    """Warn, in the first call, where torch was imported first. The warning names the line that called the package."""
     if SPINNING:
+        frame, level = sys._getframe(), 1
+        while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("warpgs", "torch"):
+            frame, level = frame.f_back, level + 1
         warnings.warn(
             f"idle threads of torch slow down rendering on a CPU: import warpgs before torch, or set {VARIABLE}=passive",
             RuntimeWarning,
-            stacklevel=2,
+            stacklevel=level,
         )

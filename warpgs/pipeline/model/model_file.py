@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from warpgs import schema
-from warpgs.coordinates import checked_normalization, convert_camera, convert_gaussians
+from warpgs.coordinates import check_stored, checked_normalization, convert_camera, convert_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes
 from warpgs.input_files import read_input, unread_reason
@@ -88,10 +88,12 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     Raises:
         DataError: A number is not finite, or the normalization is no similarity.
         ResourceError: The file cannot be written.
+        TypeError: The Gaussians are given by other parameters: ``stored()`` of `ActivatedGaussians` converts them.
         UsageError: The units are unknown, or scene units come without a normalization.
     """
     from safetensors.torch import save as to_bytes
 
+    check_stored(gaussians)
     normalization = checked_normalization(normalization, units, f"{path}: not written")
     tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     for name, t in tensors.items():

@@ -1,0 +1,47 @@
+"""Options and rules of wrong types or ranges: an error where they are made, which names the field."""
+
+import math
+
+import numpy as np
+import pytest
+
+from warpgs import RasterizeOptions, Rule
+from warpgs.errors import UsageError
+from warpgs.render.options import SWITCHES, WHOLE_NUMBERS
+
+
+@pytest.mark.parametrize(
+    "field, values",
+    {
+        "alpha_cut": (-1, 1, math.nan, "0.1"),
+        "alpha_max": (0, 1, 2, math.nan, None),
+        "transmittance_stop": (-0.1, 1, 2, math.nan),
+        "low_pass": (-1, math.nan, math.inf, "0.1"),
+        "square_sigma": (-1, math.nan, math.inf),
+        "inclusive_stop": ("no", 1),
+        "near": ("0.1",),
+        "far": ("10",),
+    }.items(),
+)
+def test_a_rule_checks_its_cut_offs(field, values):
+    """Types and ranges; numpy's numbers are numbers, and the ends of a range are in it."""
+    for value in values:
+        with pytest.raises(UsageError, match=rf"Rule\.{field} must be .*{value}"):
+            Rule("own", **{field: value})
+    assert Rule("own", alpha_cut=0, transmittance_stop=0.0, low_pass=np.float32(0)).low_pass == 0
+
+
+def test_options_check_their_types():
+    """A switch takes no text, whole numbers no text, no switch and no fraction."""
+    for name in SWITCHES:
+        for value in ("no", "antialiased", 1, None):
+            with pytest.raises(UsageError, match=f"{name} must be True or False, not {value!r}"):
+                RasterizeOptions(**{name: value})
+        RasterizeOptions(**{name: np.bool_(True)})
+    for name in WHOLE_NUMBERS:
+        for value in ("1", 1.5, True):
+            with pytest.raises(UsageError, match=f"{name} must be a whole number, not {value!r}"):
+                RasterizeOptions(**{name: value})
+        RasterizeOptions(**{name: np.int64(8)})
+    with pytest.raises(UsageError, match="sh_degree must be at least 0, not -1"):
+        RasterizeOptions(sh_degree=-1)

@@ -1,0 +1,57 @@
+"""Projected means that hold their gradients after a backward pass, as density strategies read them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from warpgs.errors import UsageError
+
+PASSED = "_backward_passes"
+"""Attribute of projected Gaussians: a list with an entry for each backward pass through them."""
+
+
+class ProjectedMeans(torch.Tensor):
+    """A tensor [C, N, 2] that explains where its ``absgrad`` is missing; results of operations are plain tensors."""
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def __getattr__(self, name: str) -> Any:
+        """Raise AttributeError; for ``absgrad`` it says what is missing."""
+        if name != "absgrad":
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")
+
+
+def count_passes(projected: torch.Tensor) -> None:
+    """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`."""
+    if projected.requires_grad:
+        passes: list[bool] = []
+        setattr(projected, PASSED, passes)
+        projected.register_hook(lambda gradient: passes.append(True))
+
+
+def projected_means(projected: torch.Tensor, absgrad: bool) -> torch.Tensor:
+    """Return the means [C, N, 2] of projected Gaussians [C, N, 12], which hold their gradients after the next backward pass.
+
+    Raises:
+        UsageError: A backward pass went through them already.
+    """
+    if getattr(projected, PASSED, None):
+        raise UsageError("read render.means2d before the backward pass: gradients of a pass before the first read are not kept")
+    means2d = projected.detach()[..., :2].as_subclass(ProjectedMeans)
+    columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if absgrad else {})
+
+    def keep(gradient: torch.Tensor) -> None:
+        for name, part in columns.items():
+            before, found = getattr(means2d, name, None), gradient.detach()[..., part]
+            setattr(means2d, name, found if before is None else before + found)
+
+    def refuse(gradient: torch.Tensor) -> None:
+        raise RuntimeError("means2d has no gradient into the Gaussians: take Render.projected[..., :2], which has one")
+
+    if projected.requires_grad:
+        means2d.requires_grad_().register_hook(refuse)
+        projected.register_hook(keep)
+    return means2d
