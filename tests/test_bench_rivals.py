@@ -63,6 +63,16 @@ def test_every_arm_names_its_steps_once():
             assert found.steps == steps
 
 
+def test_an_arm_sets_what_a_strategy_of_ones_own_has():
+    """By the names of its flags, after the strategy; a name that it lacks is refused."""
+    own = "3dgs:strategy=examples/05_own_strategy.py:Sprout,sprout.growth="
+    assert config_of(f"{own}0.5").strategy_config.growth == 0.5
+    assert config_of(f"{own}0.5,steps=7,sprout.every=3").strategy_config.every == 3
+    for bad in (f"{own}0.5,sprout.speed=1", "3dgs:sprout.growth=0.5"):
+        with pytest.raises(UsageError, match="sets nothing"):
+            config_of(bad)
+
+
 def test_steps_are_chosen_on_views_left_out():
     """The best mean; a number that lacks a view, a test score and a failure count for nothing."""
     arm = Arm("a", "3dgs:sh_degree=0", (10, 20, 30))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -9,7 +10,7 @@ import os
 import pkgutil
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import ModuleType
 from typing import ClassVar, Generic, Protocol, TypeVar
@@ -57,7 +58,7 @@ class Registry(Generic[T]):
 
         def decorate(cls: type[T]) -> type[T]:
             before = self._classes.get(name)
-            if before is not None and before.__module__.startswith("warpgs.") and not cls.__module__.startswith("warpgs."):
+            if before is not None and _is_ours(before) and not _is_ours(cls):
                 raise UsageError(f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours by another name")
             cls.name = name
             self._classes[name] = cls
@@ -106,9 +107,11 @@ class Registry(Generic[T]):
         if name in self._classes or name in self.names():
             return self._classes[name]
         if ":" in name:
+            own = name.rpartition(":")[2]
+            in_study = f'; in a study: a preset in a .py file, with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
                 f"the {self.kind} {name!r} is a class of your own, which is never imported because a file names it; give it "
-                "again, on the command line or as a class in Python"
+                f"again, on the command line or as a class in Python{in_study}"
             )
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 
@@ -147,13 +150,41 @@ def load_object(kind: str, spec: str) -> object:
     """
     where, _, name = spec.rpartition(":")
     try:
-        module = _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
+        module = module_of(where)
     except (ImportError, OSError) as e:
         raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); give path/to/file.py:{name or 'NAME'}") from e
     if not hasattr(module, name):
         raise UsageError(f"the {kind} {spec!r} is not there: {where} has no {name}; give a name that it defines")
     LOADED.add(module.__name__)
     return getattr(module, name)
+
+
+def own_code(classes: Iterable[type]) -> dict[str, str]:
+    """Return the SHA-256 of the source file of each class that is not of warpgs, by its registered name.
+
+    A class without a file, as of a notebook, is left out.
+    """
+    digests = {str(getattr(c, "name", c.__qualname__)): _digest(c) for c in classes if not _is_ours(c)}
+    return {name: digest for name, digest in sorted(digests.items()) if digest}
+
+
+@functools.cache
+def _digest(cls: type) -> str:
+    """Return the SHA-256 of the file of a class when first asked for, as it may be edited later; empty without one."""
+    return module_digest(sys.modules.get(cls.__module__))
+
+
+def module_digest(module: ModuleType | None) -> str:
+    """Return the SHA-256 of the file of a module; empty without one."""
+    path = getattr(module, "__file__", None)
+    try:
+        return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else ""
+    except OSError:  # a module of an archive, or one that is gone since
+        return ""
+
+
+def _is_ours(cls: type) -> bool:
+    return cls.__module__.startswith("warpgs.")
 
 
 def _line_about(cls: type) -> str:
@@ -179,6 +210,16 @@ def own_frame(error: BaseException) -> str:
             place = f"{traceback.tb_frame.f_code.co_filename}, line {traceback.tb_lineno}"
         traceback = traceback.tb_next
     return place
+
+
+def module_of(where: str) -> ModuleType:
+    """Return the module of a dotted name or of the path of a .py file, importing it: runs that code.
+
+    Raises:
+        ImportError: The module is not there.
+        OSError: The file is not there.
+    """
+    return _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
 
 
 def _import_module(name: str) -> ModuleType:

@@ -7,9 +7,12 @@ import sys
 from pathlib import Path
 
 WORDS = {
+    "arms": "methods to compare: the first so many of the set, or their names where the default is a list",
+    "data": "folder of the scenes (docs/reproduce.md)",
     "device": "cpu, cuda or auto",
     "downscale": "factor by which both sides of images shrink",
     "first_seed": "so that several processes can share the work",
+    "folds": "most fits that leave training views out, for each number of steps; fewer are faster and less certain",
     "jobs": "fits at a time; times mean something with 1 alone",
     "only": "a configuration's name, or its beginning",
     "out": "JSON file to write; finished rows are kept where the program says so",
@@ -18,6 +21,8 @@ WORDS = {
     "rows": "named rows, or FOLDER@SPLIT@DOWNSCALE",
     "seconds": "after this long no further fit is begun",
     "seeds": "number of seeds, or the seeds themselves where the default is a list",
+    "set": "comparison: rivals, ladder or ablation (bench/lib/arms.py)",
+    "shrink": "factor by which both sides of images shrink further, to try the program",
     "split": "as in `warpgs fit --split`",
     "threads": "CPU threads; 0 for as many as there are",
     "work": "folder that keeps scenes and fits; a temporary one where not given",
@@ -47,8 +52,9 @@ def parse(
     program = f"python -m {spec.name}" if spec else None
     parser = argparse.ArgumentParser(program, description=doc, formatter_class=_Help)
     for name, kind in (places or {}).items():
-        many = {"nargs": "+"} if isinstance(kind, list) else {"nargs": "?"} if name.endswith("?") else {}
+        many: dict = {"nargs": "+"} if isinstance(kind, list) else {"nargs": "?"} if name.endswith("?") else {}
         kind = kind[0] if isinstance(kind, list) else kind
+        many["help"] = WORDS.get(name.rstrip("?"))
         parser.add_argument(name.rstrip("?"), **({"choices": kind} if isinstance(kind, tuple) else {"type": kind}), **many)
     for name, default in flags.items():
         how: dict = {"help": WORDS.get(name, " "), "dest": name, "required": name in need}

@@ -30,6 +30,7 @@ from warpgs.pipeline.train.by_views import DEGREES
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.plugins import flag_group
 from warpgs.scene import Scene, View
 
 PEER, PEER_POINTS = "gsplat", "gsplat-points"
@@ -75,7 +76,7 @@ def config_of(preset: str, seed: int = 0) -> FitConfig:
     """Return the settings of one of our presets with a seed; ``default`` is that of a user who names none.
 
     ``PRESET:a.b=value,c=value`` changes what it names; values are JSON, a bare word is a word. A strategy may be
-    ``FILE.py:CLASS``; settings of its own come after it.
+    ``FILE.py:CLASS``; settings of its own come after it, by the names of their flags, as in ``lottery.growth=0.2``.
 
     Raises:
         UsageError: The preset or a setting is unknown, or a value is out of range.
@@ -107,12 +108,14 @@ def peer_settings(preset: str, train: list[View]) -> gsplat_trainer.Settings:
 
 
 def _change(values: dict, preset: str, changes: str) -> None:
-    """Change nested values as a preset says after its colon."""
+    """Change nested values as a preset says after its colon; settings of a strategy stand in the group of its flags."""
     for change in filter(None, changes.split(",")):
         key, sep, value = change.partition("=")
         *groups, last = key.split(".")
         place = values
         for group in groups:
+            if place is values and values.get("strategy_config") is not None and group == flag_group(values["strategy"]):
+                group = "strategy_config"
             place = place.get(group) if isinstance(place, dict) else None
         if not sep or not isinstance(place, dict) or last not in place:
             raise UsageError(f"{preset!r}: {change!r} sets nothing; write GROUP.NAME=VALUE as in optimizer.scales_lr=0.1")

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 
 from bench.lib import result_file
 from bench.lib.preset_table import by_seed
+from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.statistics import paired_difference
 
@@ -37,6 +38,8 @@ CAPTURES = {
 """Scene and number of training views of each row of the presets' result."""
 BEFORE_DECAY = "default:method.hier=true,optimizer.opacities_decay=0"
 """`default` as it was before decision 023."""
+BEFORE_SMOOTH = "default:loss.smooth_weight=0,steps=3000"
+"""`default` as it was before decision 024."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
 POSES = {
     "given": "given with the photographs",
@@ -132,20 +135,31 @@ def views() -> str:
     found, body = by_seed(result["rows"]), []
     for name, (scene, count) in CAPTURES.items():
         own = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
-        body.append([f"{scene}, {count}", *(_scores(rows) if rows else "" for rows in own)])
+        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", *(_scores(rows) if rows else "" for rows in own)])
     heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {result['versions']['gsplat']}"]
-    return table(["scene, views", *heads], body) + source
+    return markdown(["scene, views", "split", *heads], body, ["scene, views", "split"]) + source
 
 
 def few_views() -> str:
-    """Return the table of `default` today, with up to 9 opaque views, beside its settings of before."""
-    result, source = _result("few_views_h100")
+    """Return the table of `default` with up to 9 opaque views beside its settings before decision 023."""
+    return _change_of_default("few_views_h100", BEFORE_DECAY, "two layers, no opacity decay")
+
+
+def smooth_depth() -> str:
+    """Return the table of `default` with up to 4 opaque views beside its settings before decision 024."""
+    return _change_of_default("few_views_smooth_h100", BEFORE_SMOOTH, "depth not smoothed, 3000 steps")
+
+
+def _change_of_default(name: str, before: str, words: str) -> str:
+    """Return the table of `default` beside its settings of before, over the seeds that both have."""
+    result, source = _result(name)
     found, body = by_seed(result["rows"]), []
-    for name in (n for n in CAPTURES if (n, "default") in found):
-        own, base = (list(found[name, preset].values()) for preset in ("default", BEFORE_DECAY))
-        change = _change(found[name, "default"], found[name, BEFORE_DECAY], "psnr", 2)
-        body.append([", ".join(map(str, CAPTURES[name])), _scores(base), _scores(own), change])
-    return table(["scene, views", "two layers, no opacity decay", "`default`", "change in PSNR"], body) + source
+    for row in (n for n in CAPTURES if (n, "default") in found):
+        own, base = found[row, "default"], found[row, before]
+        seeds = sorted(own.keys() & base.keys())
+        scores = [_scores([of[s] for s in seeds]) for of in (base, own)]
+        body.append([", ".join(map(str, CAPTURES[row])), *scores, _change(own, base, "psnr", 2)])
+    return table(["scene, views", words, "`default`", "change in PSNR"], body) + source
 
 
 def mcmc() -> str:
@@ -235,7 +249,7 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ladder, ablation, views, few_views, mcmc, objects, poses, same_image, antialiasing, meshes, repeats,
+    ladder, ablation, views, few_views, smooth_depth, mcmc, objects, poses, same_image, antialiasing, meshes, repeats,
 )  # fmt: skip
 
 

@@ -2,9 +2,11 @@
 
 import csv
 import dataclasses
+import hashlib
 import io
 import json
 import shutil
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -30,7 +32,8 @@ from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_varia
 from warpgs.pipeline.study.statistics import paired_difference
 from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.presets import PRESETS, preset_settings
+from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -109,10 +112,16 @@ def test_all_files_are_there_and_the_figure_has_a_column_per_setting(finished):
     assert study["seeds"] == 2 and set(study["variants"]) == {"a", "b b"} and len(study["scenes"]["still"]["fingerprint"]) == 64
 
 
-def copy_of(finished, tmp_path, **changes):
+def copied(finished, out, **changes):
+    """The request of the finished study with changes, in a copy of its folder, which is made once."""
     request, _ = finished
-    shutil.copytree(request.out, tmp_path / "out")
-    return dataclasses.replace(request, out=tmp_path / "out", **changes)
+    if not out.exists():
+        shutil.copytree(request.out, out)
+    return dataclasses.replace(request, out=out, **changes)
+
+
+def copy_of(finished, tmp_path, **changes):
+    return copied(finished, tmp_path / "out", **changes)
 
 
 def states(request):
@@ -159,6 +168,32 @@ def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
     assert "had another configuration; moved to 0.old1" in text and "could not be continued" in text
     assert (broken.parent / "0.old1" / TENSORS).read_bytes() == b"nothing"
     assert metrics_of(changed, "b b", 0)["steps"] == 12
+
+
+def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, monkeypatch):
+    """Same settings and same name, but other code: the old run says nothing of it."""
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+    path = tmp_path / "mine.py"
+    code = "from warpgs import Strategy\nclass Mine(Strategy):\n    rate = {}\nmine = {{'base': 'quick', 'strategy': Mine}}\n"
+
+    def study(rate):
+        path.write_text(code.format(rate))
+        for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
+            del sys.modules[name]  # as in a new process
+        mine, origin = preset_settings(f"{path}:mine")
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        assert f"(SHA-256 {digest[:12]})" in origin
+        request = copied(
+            finished, tmp_path / "out", seeds=1, variants={"a": A, "mine": dataclasses.replace(A, strategy=mine.strategy)}
+        )
+        run_study(request)
+        record = json.loads((run_folder(request, "still", "mine", 0) / "config.json").read_text())
+        assert record["own_code"] == {mine.strategy: digest}
+        return states(request), (request.out / "table.md").read_text()
+
+    assert study(1)[0] == ["kept", "fitted"] and study(1)[0] == ["kept", "kept"]
+    again, text = study(2)
+    assert again == ["kept", "redone"] and "had another code of your own; moved to 0.old1" in text
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,7 @@ def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, spl
     """Name the properties in which a stored run differs from the one that is wanted; empty where in none."""
     wanted = {
         "configuration": (record.get("config_hash"), config.fingerprint()),
+        "code of your own": (record.get("own_code", {}), config.own_code()),
         "data": (record.get("fingerprint"), fingerprint),
         "training views": (record.get("train"), split and list(split.train)),
         "held-out views": (record.get("test"), split and list(split.test)),
@@ -97,8 +98,8 @@ def ensure_run(
 ) -> Outcome:
     """Ensure that a run folder holds the finished run that is asked for.
 
-    A finished run of the same configuration, data, views, kind of device and version is kept. A half-finished one is
-    continued from its checkpoint. What is there and is neither is moved aside, and the run is done anew.
+    A finished run of the same configuration, code of the user's own, data, views, kind of device and version is kept. A
+    half-finished one is continued from its checkpoint. What is there and is neither is moved aside, and the run is done anew.
 
     Args:
         request: The fit; ``out`` is its folder, ``resume`` is decided here.

@@ -35,6 +35,8 @@ class FarmJob:
         r = self.request
         weights = None if r.lpips_weights is None else str(r.lpips_weights)
         values = [dataclasses.asdict(r.scene), r.config.to_json(), weights, r.device]
+        if own := r.config.own_code():
+            values.append(own)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -116,7 +116,7 @@ def record_of(
         "train": split.train, "test": split.test, "notes": notes,
         "normalization": {"offset": scene.normalization.offset.tolist(), "scale": scene.normalization.scale},
         "background": scene.background, "transparent": scene.transparent,
-        "config": config.to_json(), "config_hash": config.fingerprint(),
+        "config": config.to_json(), "config_hash": config.fingerprint(), "own_code": config.own_code(),
         "device": device.type, "versions": versions(),
         "cameras": {v.name: camera_values(v.camera) for v in scene.views},
     }  # fmt: skip
@@ -164,9 +164,14 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             f"{stored['pruned']['source']}"
         )
     _check_named_again(record["config"], stored["config"], out)
-    for key in ("fingerprint", "train", "test", "config", "device"):
-        now, then = json.loads(json.dumps(record[key])), stored.get(key)
+    for key in ("fingerprint", "train", "test", "config", "device", "own_code"):
+        now, then = json.loads(json.dumps(record[key])), stored.get(key, {} if key == "own_code" else None)
         if now != then:
+            if key == "own_code":
+                raise UsageError(
+                    f"--resume: the code of {', '.join(now)} was edited since the run in {out} began, or its version is not "
+                    "recorded; restore that file, or give a new --out"
+                )
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"

@@ -77,7 +77,7 @@ _RECORD = fields(
         ),
         "cameras": mapping(_CAMERA, _view_name),
     },
-    {"scene_format": text, "transparent": flag, "pruned": fields({"source": text})},
+    {"scene_format": text, "transparent": flag, "own_code": mapping(text), "pruned": fields({"source": text})},
 )  # fmt: skip
 
 

@@ -23,7 +23,7 @@ from warpgs.pipeline.train.strategies.base import STRATEGIES, find_strategy
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.pipeline.train.view_modules.base import VIEW_MODULES, ViewModule, check_modules
-from warpgs.plugins import Registry
+from warpgs.plugins import Registry, own_code
 from warpgs.priors.view_prior import PriorConfig
 from warpgs.rules import rule_named
 from warpgs.schema import SchemaError, anything, mapping, of_type
@@ -135,10 +135,16 @@ class FitConfig:
         own = find_strategy(self.strategy).Config if STRATEGIES.knows(self.strategy) else None
         if own is not None and self.strategy_config is None:
             object.__setattr__(self, "strategy_config", own())
+        self.own_code()  # the file as it is now: the user may edit it while a study runs
 
     def groups(self) -> Settings:
         """Return the groups of settings by their class, as parts of a fit read them."""
         return Settings(value for value in vars(self).values() if dataclasses.is_dataclass(value))
+
+    def own_code(self) -> dict[str, str]:
+        """Return the SHA-256 of the source file of each class of the user's own, by its name."""
+        strategy = [find_strategy(self.strategy)] if STRATEGIES.knows(self.strategy) else []
+        return own_code([*strategy, *(type(part) for name in _PARTS for part in getattr(self, name))])
 
     def to_json(self) -> dict[str, Any]:
         """Return nested plain values, as stored in a run folder."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpgs.errors import DataError, UsageError
 from warpgs.input_files import read_input, unread_reason
-from warpgs.plugins import load_object
+from warpgs.plugins import load_object, module_digest, module_of
 from warpgs.runtime.terminal import Detail
 from warpgs.schema import SchemaError, check_depth
 
@@ -121,7 +121,8 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
     if not isinstance(found, (FitConfig, Mapping)):
         raise UsageError(f"the preset {name!r} is of type {type(found).__name__}; make it a FitConfig or a mapping of settings")
     config, origin = preset_settings(found)
-    return config, f"{name}, {origin}"
+    digest = module_digest(module_of(name.rpartition(":")[0]))
+    return config, f"{name}{f' (SHA-256 {digest[:12]})' if digest else ''}, {origin}"
 
 
 def chosen_settings(
