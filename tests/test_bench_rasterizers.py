@@ -114,23 +114,28 @@ def result_of_others() -> dict:
     programs = {"warpgs": 1.0, "warpgs atomic": 0.9, "gsplat dense": 2.0, "Faster-GS": 1.25}
     times = {d: {who: {"median": t * k} for who, t in programs.items()} for d, k in (("image", 1), ("forward", 2), ("both", 5))}
     size = {"gaussians": 1000, "visible": 900, "instances": 4000, "width": 320, "height": 240}
-    row = {
-        "configuration": "1k at 320x240",
-        **size,
-        "gpu_ms": times,
-        "wall_ms": times,
-        "peak_mib": dict.fromkeys(programs, 3.5),
-    }
+
+    def row(channels: int, factor: int) -> dict:
+        gpu, wall = (
+            {d: {who: {"median": k * m["median"]} for who, m in own.items()} for d, own in times.items()}
+            for k in (factor, 2 * factor)
+        )
+        values = {"gpu_ms": gpu, "wall_ms": wall, "peak_mib": dict.fromkeys(programs, 3.5 * factor)}
+        return {"configuration": "1k at 320x240", **size, "channels": channels, **values}
+
     steps = {"warpgs graph": {"median": 2.0}, "gsplat": {"median": 8.0}}
-    return {"rows": [row | {"channels": 3, "step_wall_ms": steps}, row | {"channels": 32}]}
+    return {"rows": [row(3, 1) | {"step_wall_ms": steps}, row(32, 2)]}
 
 
 def test_tables_of_other_rasterizers():
     """Each program has its row; ratios and sums are right."""
     result = result_of_others()
-    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 | 1.25 | 6.25 | 3.5 |" in rasterizers_page.times_table(result)
-    assert "| 1k, 320 x 240 | gsplat dense | 2 | 4 | 10 | 3.5 |" in rasterizers_page.channels_table(result)
-    assert "Faster-GS" not in rasterizers_page.channels_table(result)
+    made = rasterizers_page.times_table(result)
+    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 | 2.5 | 5 | 12.5 | 3.5 |" in made
+    chosen = rasterizers_page.times_table(result, 32, ("gsplat dense",))
+    assert "| 1k, 320 x 240 | gsplat dense | 4 | 8 | 20 | 8 | 16 | 40 | 7 |" in chosen and "warpgs" not in chosen
+    ratios = "0.50 | 0.50 | 0.50 | 0.50 | 0.50 | 0.50 | 1.00 |"
+    assert f"| 1k, 320 x 240 | gsplat dense | {ratios}" in rasterizers_page.ratios_table(result)
     assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)
     made = rasterizers_page.buffers_table(result)
     assert "| gradient of each instance | blending | 0.183 |" in made and "| measured: gsplat dense |  | 3.5 |" in made

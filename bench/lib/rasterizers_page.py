@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bench.lib.buffers import BLEND, PROJECT, Counts, at_most, buffers
 from bench.lib.gradient_errors import TENSORS
-from bench.lib.rasterizers import ATOMIC, FAST_MATH, GSPLAT, OURS
+from bench.lib.rasterizers import ATOMIC, FAST_MATH, FASTER_GS, GSPLAT, OURS
 from bench.lib.tables import figure, markdown
 
 LEFT = ("Gaussians, image", "program", "scene", "cut-offs", "buffer")
@@ -22,27 +22,29 @@ def _of(result: dict, channels: int) -> list[dict]:
     return [r for r in result["rows"] if r["channels"] == channels]
 
 
-def times_table(result: dict) -> str:
-    """Return GPU time by direction, wall time of image and gradients, and peak memory of each program."""
+def times_table(result: dict, channels: int = 3, programs: tuple[str, ...] = ()) -> str:
+    """Return GPU and wall time by direction, and peak memory, of each program that took ``channels``, or of some of them."""
     body = []
-    for row in _of(result, 3):
+    for row in _of(result, channels):
         for who, peak in row["peak_mib"].items():
-            gpu = [figure(row["gpu_ms"][d][who]["median"]) for d in DIRECTIONS]
-            wall = [figure(row["wall_ms"][d][who]["median"]) for d in ("image", "both")]
-            body.append([_size(row), who, *gpu, *wall, figure(peak)])
-    head = ["Gaussians, image", "program", "image [ms]", "forward [ms]", "both [ms]", "wall: image [ms]", "both [ms]", "MiB"]
-    return markdown(head, body, LEFT)
+            if not programs or who in programs:
+                times = [figure(row[kind][d][who]["median"]) for kind in ("gpu_ms", "wall_ms") for d in DIRECTIONS]
+                body.append([_size(row), who, *times, figure(peak)])
+    times = [f"{kind}: {DIRECTIONS[0]} [ms]" for kind in ("GPU", "wall")]
+    rest = [f"{d} [ms]" for d in DIRECTIONS[1:]]
+    return markdown(["Gaussians, image", "program", times[0], *rest, times[1], *rest, "MiB"], body, LEFT)
 
 
-def channels_table(result: dict) -> str:
-    """Return GPU time and memory of 32 channels, ours and gsplat's."""
+def ratios_table(result: dict, channels: int = 3) -> str:
+    """Return our times and memory over those of each other program, by size."""
     body = []
-    for row in _of(result, 32):
-        for who in (OURS, ATOMIC, GSPLAT):
-            if who in row["peak_mib"]:
-                gpu = [figure(row["gpu_ms"][d][who]["median"]) for d in DIRECTIONS]
-                body.append([_size(row), who, *gpu, figure(row["peak_mib"][who])])
-    return markdown(["Gaussians, image", "program", "image [ms]", "forward [ms]", "both [ms]", "MiB"], body, LEFT)
+    for row in _of(result, channels):
+        for who in (w for w in (GSPLAT, FASTER_GS) if w in row["peak_mib"]):
+            times = [row[kind][d] for kind in ("gpu_ms", "wall_ms") for d in DIRECTIONS]
+            ratios = [t[OURS]["median"] / t[who]["median"] for t in times] + [row["peak_mib"][OURS] / row["peak_mib"][who]]
+            body.append([_size(row), who, *(f"{r:.2f}" for r in ratios)])
+    head = ["Gaussians, image", "warpgs over", "GPU: image", "forward", "both", "wall: image", "forward", "both", "memory"]
+    return markdown(head, body, (*LEFT, "warpgs over"))
 
 
 def steps_table(result: dict) -> str:
@@ -64,8 +66,8 @@ def buffers_table(result: dict) -> str:
         body.append([name, held, *(figure(held_by[name][0] / MIB) for held_by in lists)])
     body.append(["sum at the larger moment", "", *(figure(at_most(n) / MIB) for n in counts)])
     body.append(["the same with atomic sums", "", *(figure(at_most(n, False) / MIB) for n in counts)])
-    for who in (OURS, ATOMIC, GSPLAT):
-        body.append([f"measured: {who}", "", *(figure(r["peak_mib"][who]) if who in r["peak_mib"] else "" for r in rows)])
+    for who in (OURS, GSPLAT):
+        body.append([f"measured: {who}", "", *(figure(r["peak_mib"][who]) for r in rows)])
     return markdown(["buffer", "held in", *map(_size, rows)], body, (*LEFT, "held in"))
 
 

@@ -162,6 +162,29 @@ def _change_of_default(name: str, before: str, words: str) -> str:
     return table(["scene, views", words, "`default`", "change in PSNR"], body) + source
 
 
+def coverage() -> str:
+    """Return the table of shares of pixels and errors by the number of training views that saw them."""
+    result, source = _result("coverage_h100")
+    found = {(r["scene"], r["preset"]): r["classes"] for r in result["rows"]}
+    body = []
+    for scene in ("fern:3", "horns:3"):
+        for seen, words in (("0", "no view"), ("1", "one"), ("2+", "two or more")):
+            body.append([f"{scene.replace(':', ', ')}: {words}"])
+            for preset in (BEFORE_DECAY, "default"):
+                own = found[scene, preset][seen]
+                body[-1] += [f"{100 * own[k]:.0f} %" for k in ("share_of_pixels", "share_of_error")] + [f"{own['psnr']:.2f}"]
+    head = [
+        "scene, views: pixels seen by",
+        "two layers, no decay: pixels",
+        "error",
+        "PSNR",
+        "`default`: pixels",
+        "error",
+        "PSNR",
+    ]
+    return table(head, body) + source
+
+
 def mcmc() -> str:
     """Return the table of MCMC beside gsplat's."""
     result, source = _result("mcmc_h200")
@@ -249,7 +272,8 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ladder, ablation, views, few_views, smooth_depth, mcmc, objects, poses, same_image, antialiasing, meshes, repeats,
+    ladder, ablation, views, few_views, smooth_depth, coverage, mcmc, objects, poses, same_image, antialiasing, meshes,
+    repeats,
 )  # fmt: skip
 
 
