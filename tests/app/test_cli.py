@@ -224,6 +224,37 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     )
 
 
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        ("render RUN out.mp4", "out.mp4 is one word too many; did you mean --out out.mp4?"),
+        ("plot RUN a.png --size 320 240", "did you mean --out a.png?"),
+        ("mesh RUN a.glb", "did you mean --out a.glb?"),
+        ("export RUN scene.html", "scene.html is one word too many; did you mean --to scene.html?"),
+        ("export RUN a.ply --to b.ply", "a.ply is one word too many; `warpgs export --help` tells what it takes"),
+        ("render RUN --size 720", "--size needs two numbers: width height, such as --size 1280 720"),
+        ("render RUN --size 720 --fps 30", "--size needs two numbers"),
+        ("plot RUN --size 720x480", "--size needs two numbers"),
+        ("render RUN --size", "--size needs two numbers"),
+        ("export RUN --to page.htm", "page.htm: format .htm is not supported; did you mean page.html?"),
+        ("view scene.html", "scene.html: is a web page; open this file in a browser"),
+    ],
+)
+def test_words_in_the_wrong_place_get_the_right_command(run, tmp_path, monkeypatch, capsys, words, hint):
+    """One line, and nothing is written."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.html").touch()
+    code = 3 if words.startswith("view") else 2
+    text = failure(capsys, code, *[str(run) if w == "RUN" else w for w in words.split()])
+    assert hint in text and len(text.splitlines()) == 1 and [p.name for p in tmp_path.iterdir()] == ["scene.html"]
+
+
+def test_the_help_of_export_lists_the_page(capsys):
+    with pytest.raises(SystemExit):
+        main(["export", "--help"])
+    assert "  .html: " in capsys.readouterr().out
+
+
 def test_cuda_where_there_is_none(scene, tmp_path, capsys, monkeypatch):
     """Asking for CUDA without a device is a resource error that names the way out."""
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

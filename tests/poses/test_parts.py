@@ -13,7 +13,7 @@ from warpgs.poses.find import _check_found
 from warpgs.poses.mapping import FoundCamera, FoundView, Mapping
 from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 from warpgs.poses.pairs import choose_pairs, similarity
-from warpgs.poses.photographs import Photograph, find_photographs, prepare
+from warpgs.poses.photographs import Photograph, find_photographs, folder_notes, prepare
 from warpgs.poses.record import record_of, report_lines
 from warpgs.poses.video import sharpest, write_frames
 
@@ -73,6 +73,26 @@ def test_masks_are_no_photographs(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     assert [p.name for p in find_photographs(tmp_path)] == ["a.png"]
+
+
+def test_images_of_earlier_runs_are_no_photographs(tmp_path):
+    """A run below the photographs is left out with all below it, also one that holds found poses alone; both are named."""
+    names = ("a.png", "b/c.png", "b/run/renders/d.png", "b/run/path-auto/0000.png", "b/run/e.png", "posed/scene/images/f.png")
+    others = ("g/h.png", "b/run/config.json", "b/run/metrics.jsonl", "posed/scene/poses.json", "g/config.json")
+    for name in (*names, *others):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    assert [p.relative_to(tmp_path).as_posix() for p in find_photographs(tmp_path)] == ["a.png", "b/c.png", "g/h.png"]
+    assert folder_notes(tmp_path) == [
+        "skipped as earlier runs: b/run, posed", "photographs by folder: 1 in the folder itself, 1 in b, 1 in g"
+    ]  # fmt: skip
+
+
+def test_one_folder_of_photographs_needs_no_notes(tmp_path):
+    for name in ("images/a.png", "images/b.png", "c.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    assert folder_notes(tmp_path) == []
 
 
 def test_frames_of_a_video_are_sharp_and_evenly_spaced(tmp_path):

@@ -10,8 +10,9 @@ from PIL import Image
 
 from tests.report.test_page_in_browser import BROWSERS
 from tests.scenes import ring, three_gaussians
+from tests.viewer.chromium import Chromium
 from warpgs.render.rasterize import rasterize
-from warpgs.viewer.html import SORT_FROM_DISK, write_html
+from warpgs.viewer.html import SORT_FROM_DISK, middle_first, write_html
 
 pytest.importorskip("viser")
 WIDTH, HEIGHT = 700, 600
@@ -66,6 +67,46 @@ def crowd():
     means = g.means * g.means.new_tensor([0.3, 0.3, 1.0])
     g = dataclasses.replace(g, means=means, log_scales=g.log_scales + 0.4)
     return type(g)(**{n: t[order] for n, t in g.tensors().items()})
+
+
+def test_the_middle_of_the_cameras_comes_first():
+    """The one nearest to the mean of all centres, then the others in their order."""
+    cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
+    assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
+
+
+def moved(x):
+    viewmat = np.eye(4)
+    viewmat[0, 3] = -x
+    return dataclasses.replace(ring(1)[0], viewmat=viewmat)
+
+
+@pytest.mark.browser
+def test_a_page_tells_how_to_move_and_returns(tmp_path):
+    """The line of help stands there, no scene tree does, and the key R and the button lead back to the first view."""
+    path = tmp_path / "scene.html"
+    write_html(path, crowd(), [ring(3)[1]], title="my <scene>")
+    browser = Chromium(tmp_path)
+    try:
+        browser.open(path.as_uri())
+        browser.wait("window.__viserMutable?.resetCameraPose && document.querySelector('canvas') !== null")
+        browser.wait("document.querySelector('[aria-label$=\"scene tree\"]') !== null")
+        assert browser.value("document.title") == "my <scene>" and "Drag to turn" in browser.value("document.body.innerText")
+        assert browser.value("document.querySelector('[aria-label$=\"scene tree\"]').checkVisibility()") is False
+        place = "JSON.stringify(__viserMutable.camera.position.toArray().map(x => Math.round(1e3 * x)))"
+        browser.wait("document.querySelector('#warpgs-help button').checkVisibility()")
+        before = browser.value(place)
+        for back in (
+            "dispatchEvent(new KeyboardEvent('keydown', {key: 'r', bubbles: true}))",
+            "document.querySelector('#warpgs-help button').click()",
+        ):
+            browser.value("void __viserMutable.cameraControl.rotate(0.7, 0.2, false)")
+            browser.wait(f"{place} !== {before!r}")
+            browser.value(f"void {back}")
+            browser.wait(f"{place} === {before!r}")
+        assert not [line for line in browser.console() if "Content Security Policy" in line]
+    finally:
+        browser.close()
 
 
 @pytest.mark.browser

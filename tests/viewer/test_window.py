@@ -265,7 +265,7 @@ def test_a_page_names_nobody(folder, tmp_path, capsys):
     assert (
         "default-src 'none'" in text
         and text.index("URLSearchParams=") < text.index("<script data-p")
-        and "<title>warpgs</title>" in text
+        and "<title>scene</title>" in text
     )
     head, _, data = text.partition('__VISER_EMBED_DATA__="')
     assert str(folder) not in text and "warpgs/" not in head

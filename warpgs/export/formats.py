@@ -62,6 +62,8 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
         if kind.fits(path):
             return kind
     name = Path(path).name.lower()
+    if name.endswith(".htm"):
+        raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
     cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
     raise UsageError(
         f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "

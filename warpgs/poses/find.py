@@ -21,6 +21,7 @@ from warpgs.poses.matcher import Matcher, open_matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
+    folder_notes,
     image_root,
     photographs_inside,
     prepare,
@@ -114,6 +115,7 @@ def find_poses(
     network = None if matcher is None else open_matcher(matcher, threads)
     with filling(out) as scene:
         work, kind = scene / "work", "video" if is_video(source) else "photographs"
+        digest = source_digest(source, allow_outside)  # before anything is written, which may be below the source
         make_folder(work / "small")
         photographs, names, notes = _prepared(source, work, frames, max_pixels, progress)
         found = find_model(photographs, names, kind, work, progress, threads)
@@ -121,7 +123,7 @@ def find_poses(
             found, more = _with_network(network, found, photographs, names, kind, work, progress, threads)
             notes += more
         _check_found(source, found, photographs)
-        record = record_of(found, photographs, source_digest(source, allow_outside), notes)
+        record = record_of(found, photographs, digest, notes)
         for done, i in enumerate(found.views):
             progress(f"writing images: {done + 1} of {len(found.views)}")
             write_copy(photographs[i], scene / "images", max_pixels)
@@ -200,6 +202,7 @@ def _prepared(
         notes.append(f"{min(frames, total)} of {total} frames are taken: the sharpest of as many equal stretches of the video")
     root = image_root(root)
     paths, unread = find_photographs(root), unread_note(root)
+    notes += folder_notes(root)
     if unread:
         notes.append(f"left out: {unread}")
     if len(paths) < MIN_PHOTOGRAPHS:

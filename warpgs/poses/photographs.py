@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -20,6 +22,10 @@ from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 
 MASK_FOLDERS = ("mask", "masks", "idrmasks")
 """Folders beside or below photographs that hold masks."""
+RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
+"""Files that tell, beside a config.json, the folder of a run."""
+SHOWN_FOLDERS = 10
+"""Folders of photographs that a note names."""
 MATCHING_SIDE = 2000
 """Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
 DIAGONAL_35MM = math.hypot(36, 24)
@@ -56,10 +62,45 @@ def image_root(folder: Path) -> Path:
     return inner if inner.is_dir() and list_images(inner) else folder
 
 
-def find_photographs(folder: Path) -> list[Path]:
-    """Return the image files of a folder of photographs, sorted by name; masks are left out. No file is opened."""
+def _is_run(folder: Path) -> bool:
+    """Return whether a folder is one that `warpgs fit` fills, by its files."""
+    if (folder / "scene" / "poses.json").is_file():  # a fit that has found poses only
+        return True
+    return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
+
+
+def _sorted_out(folder: Path) -> tuple[list[Path], list[str]]:
+    """Return the image files of a folder of photographs, and the names of the runs below it, whose images are left out."""
     root = image_root(folder)
-    return [p for p in list_images(root) if not set(p.relative_to(root).parts[:-1]) & set(MASK_FOLDERS)]
+    is_run = functools.cache(_is_run)
+    files, runs = [], set()
+    for path in list_images(root):
+        parents = [root / p for p in path.relative_to(root).parents[-2::-1]]  # the outermost first, without the root
+        run = next(filter(is_run, parents), None)
+        if run is not None:
+            runs.add(run.relative_to(root).as_posix())
+        elif not {p.name for p in parents} & set(MASK_FOLDERS):
+            files.append(path)
+    return files, sorted(runs)
+
+
+def find_photographs(folder: Path) -> list[Path]:
+    """Return the image files of a folder of photographs, sorted by name; no file is opened.
+
+    Masks are left out, and so are the images of earlier runs below the folder.
+    """
+    return _sorted_out(folder)[0]
+
+
+def folder_notes(folder: Path) -> list[str]:
+    """Return notes on skipped runs, and on where the photographs lie if they lie in several folders."""
+    root = image_root(folder)
+    files, runs = _sorted_out(folder)
+    count = Counter(p.parent.relative_to(root).as_posix() for p in files)
+    places = [f"{n} in {'the folder itself' if name == '.' else name}" for name, n in sorted(count.items())]
+    more = [f"{len(places) - SHOWN_FOLDERS} more folders"] if len(places) > SHOWN_FOLDERS else []
+    notes = [f"skipped as earlier runs: {', '.join(runs)}"] if runs else []
+    return [*notes, *([f"photographs by folder: {', '.join([*places[:SHOWN_FOLDERS], *more])}"] if len(places) > 1 else [])]
 
 
 def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:

@@ -35,6 +35,17 @@ POLICY = (
 """Content security policy of the page: it may use its own contents, and request nothing."""
 NO_REMARKS = "<style>.mantine-Notifications-root{display:none}</style>"
 """Style that hides viser's remark on browsers without a GPU, which stood before the model."""
+NO_SCENE_TREE = '<style>:has(>[aria-label$="scene tree"]){display:none!important}</style>'
+"""Style that hides viser's button for the scene tree, in which stands one name."""
+HELP = (
+    "<style>#warpgs-help{position:fixed;top:.8em;right:.8em;z-index:2;font:13px sans-serif;color:#fff;text-shadow:0 0 3px #000}"
+    "#warpgs-help button{font:inherit;margin-left:.5em;cursor:pointer}</style>"
+    '<div id="warpgs-help">Drag to turn, scroll to zoom<button>Reset (R)</button></div>'
+    "<script>{const back=()=>{const m=window.__viserMutable;m?.resetCameraPose?m.resetCameraPose(true):location.reload()};"
+    "document.querySelector('#warpgs-help button').addEventListener('click',back);"
+    "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
+)
+"""Line of help with a button that leads back to the first view; it loads the page again where viser offers no way back."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
@@ -52,6 +63,15 @@ def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gau
     server.initial_camera.up = -np.asarray(camera.viewmat[1, :3])
     server.initial_camera.fov = fov_y(camera)
     server.initial_camera.far = 1e5  # else what lies beyond 1000 u is cut off
+
+
+def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
+    """Return cameras with the one nearest to the mean of their centres first, and the others in their order."""
+    if not cameras:
+        return []
+    centers = np.array([c.center for c in cameras])
+    nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
+    return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]
 
 
 def plain_background(color: Sequence[float]) -> np.ndarray:
@@ -95,14 +115,15 @@ def page_of(
     finally:
         stop_server(server)
     head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
-    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}"
+    head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
     notes = ["the page shows colours without view dependence; the run and its PLY keep them"]
     if gaussians.sh_degree == 0:
         notes.clear()
     if stored.shortened:
         notes.append(f"{stored.shortened:,} Gaussians are longer than the page can hold, and are shown shorter")
-    return text.replace("<head>", head, 1), notes
+    text, end, rest = text.replace("<head>", head, 1).rpartition("</body>")
+    return f"{text}{HELP}{end}{rest}", notes
 
 
 def write_html(
@@ -131,7 +152,7 @@ def write_html(
 
 
 def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
-    """Write a run as one HTML file that starts at its first training camera; returns lines for the user.
+    """Write a run as one HTML file that starts at the middle training camera; returns lines for the user.
 
     Args:
         folder: The run folder.
@@ -154,7 +175,8 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
     with hold_folder(target.parent) as held:
         cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
-        notes = write_html(target, gaussians, cameras, run.background)
+        title = target.stem.encode("utf-8", "replace").decode()  # of a name that is not UTF-8 what is
+        notes = write_html(target, gaussians, middle_first(cameras), run.background, title)
     if run.antialiased:
         notes.append("the page shows the model without antialiasing: too bright from afar and in small windows")
     size = format_bytes(target.stat().st_size)

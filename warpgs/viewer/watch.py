@@ -47,6 +47,8 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     choose_device(device)
     if path.is_dir():
         read_record(path)
+    elif path.suffix.lower() in (".html", ".htm") and path.is_file():
+        raise DataError(f"{path}: is a web page; open this file in a browser")
     elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
         known = ", ".join(suffixes())
         raise DataError(

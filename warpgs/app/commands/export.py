@@ -20,10 +20,10 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`."""
         to: Path
-        """File to write; its suffix chooses the format, or .html: a page that shows the model in any browser. For cameras:
-        cameras.json, transforms.json, or sparse (COLMAP)."""
+        """File to write; its suffix chooses the format. For cameras: cameras.json, transforms.json, or sparse (COLMAP)."""
 
-    a = parse_flags(Export, arguments, "warpgs export", f"{about}\n\n{format_lines()}")
+    page = "  .html: a page that shows the model in any browser"
+    a = parse_flags(Export, arguments, "warpgs export", f"{about}\n\n{format_lines()}\n{page}")
     formats, filters = chosen_formats(a, a.to), filters_of(a)
     if a.to.suffix.lower() == ".html" and not formats:
         from warpgs.viewer.html import export_html
