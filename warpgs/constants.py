@@ -107,8 +107,8 @@ class Rule:
         for name in ("alpha_cut", "transmittance_stop"):
             if not 0 <= getattr(self, name) < 1:
                 raise UsageError(f"Rule.{name} must be at least 0 and below 1, not {getattr(self, name)}")
-        if not 0 < self.alpha_max < 1:
-            raise UsageError(f"Rule.alpha_max must be above 0 and below 1, not {self.alpha_max}")
+        if not 0 < self.alpha_max <= 1:
+            raise UsageError(f"Rule.alpha_max must be above 0 and at most 1, not {self.alpha_max}")
         for name in ("low_pass", "square_sigma"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise UsageError(f"Rule.{name} must be a finite number of at least 0, not {getattr(self, name)}")

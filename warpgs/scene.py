@@ -249,6 +249,10 @@ class Gaussians:
         """Return the five tensors by field name, in a fixed order."""
         return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
 
+    def to(self, device: str | torch.device) -> Gaussians:
+        """Return the same N Gaussians on a device. Differentiable, as `torch.Tensor.to` is."""
+        return Gaussians(**{name: t.to(device) for name, t in self.tensors().items()})
+
 
 @dataclass(frozen=True)
 class ActivatedGaussians:

@@ -1,11 +1,11 @@
-"""Batches of cameras that share intrinsics or lens coefficients, and the errors of cameras that do not fit together."""
+"""Cameras and Gaussians brought together: shared intrinsics and lenses, errors of those that do not fit, and devices."""
 
 import dataclasses
 
 import pytest
 import torch
 
-from tests.gaussians import camera, cloud
+from tests.gaussians import camera, cloud, leaves
 from warpgs.render.rasterize import rasterize
 
 COEFFICIENTS = {"fisheye": 4, "opencv": 8}
@@ -48,3 +48,12 @@ def test_cameras_that_do_not_fit_together(change, message):
     cam = dataclasses.replace(camera(20, 12, cameras=2, dtype=torch.float32), model="fisheye", distortion=torch.zeros(4))
     with pytest.raises(ValueError, match=message):
         rasterize(cloud(5), dataclasses.replace(cam, **change))
+
+
+def test_gaussians_move_to_a_device(device):
+    """All five tensors, with gradients back to those that moved."""
+    gaussians = leaves(cloud(5))
+    moved = gaussians.to(device)
+    assert all(t.device.type == device.type for t in moved.tensors().values())
+    rasterize(moved, camera(20, 12, dtype=torch.float32)).rgb.sum().backward()
+    assert gaussians.means.grad.device.type == "cpu" and bool(gaussians.means.grad.any())

@@ -140,7 +140,7 @@ def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
     except (KeyError, ValueError, UsageError) as e:
         raise DataError(f"{path}: its header is damaged ({e}); write it again with warpgs.save") from e
     gaussians = checked_gaussians(tensors, str(path))
-    gaussians = Gaussians(**{n: t.to(device) for n, t in gaussians.tensors().items()})
+    gaussians = gaussians.to(device)
     return Model(convert_gaussians(gaussians, normalization, units, "scene"), normalization)
 
 

@@ -306,7 +306,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     cameras = _cameras(record["cameras"], folder / CONFIG) | _cameras(state.get("cameras", {}), folder / TENSORS)
     train, test, rule = tuple(record["train"]), tuple(record["test"]), record["config"]["rule"]
     return StoredRun(
-        Gaussians(**{n: t.to(where) for n, t in gaussians.tensors().items()}),
+        gaussians.to(where),
         Normalization(np.array(offset, np.float64), float(scale)),
         cameras, train, test, rule, (red, green, blue), step, folder, record, transparent=record.get("transparent", False),
         antialiased=record["config"].get("antialiased", False),

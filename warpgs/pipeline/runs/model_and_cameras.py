@@ -16,7 +16,7 @@ from warpgs.io.load import load_scene
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.rules import rule_named
-from warpgs.scene import Camera, Gaussians, Normalization
+from warpgs.scene import Camera, Normalization
 
 RULE = "inria"
 """Rule that files of Gaussians are rendered with where none is named: most were trained with it."""
@@ -58,7 +58,7 @@ def open_file(
     # the unit stays that of the file, in which the near plane of a rule is given
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
     gaussians, declared = read_with_antialiasing(path, normalization, "scene")
-    gaussians = Gaussians(**{name: t.to(where) for name, t in gaussians.tensors().items()})
+    gaussians = gaussians.to(where)
     notes += [note] if (note := format_of(path).note) else []
     if declared:
         notes.append(f"{path.name} is antialiased, and so are its renders, with a pixel filter of {LOW_PASS:g} px²")
