@@ -1,4 +1,4 @@
-"""Early stopping by held-out blocks, with every strategy; that it is repeatable and resumable, and changes nothing when off."""
+"""Early stopping by left-out blocks, with every strategy; that it is repeatable and resumable, and changes nothing when off."""
 
 import dataclasses
 import json
@@ -125,7 +125,7 @@ def test_errors_of_other_blocks_are_refused():
     fit = advanced(GROWING, 13)
     tensors, plain = fit.stopping.state()
     assert plain["measured"]
-    with pytest.raises(DataError, match=r"held-out blocks have shape.*fit again"):
+    with pytest.raises(DataError, match=r"left-out blocks have shape.*fit again"):
         Stopping(AT_ONCE).load(tensors, plain)
 
 

@@ -23,5 +23,5 @@ def complexity_summary(figures: dict) -> str:
     f = figures["complexity"]
     text = f"{f['count']:,} Gaussians of mean SH degree {f['mean_degree']:.2f}, {format_bytes(f['bytes'])} uncompressed"
     if f["marginal_db"] is not None:
-        text += f"; held-out blocks gained {f['marginal_db']:+.3f} dB between the last two measurements"
+        text += f"; left-out blocks gained {f['marginal_db']:+.3f} dB between the last two measurements"
     return f"{text}; growth stopped because {f['why']}" if f["held_out"] else f"{text}; {f['why']}"

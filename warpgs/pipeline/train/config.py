@@ -92,7 +92,7 @@ class FitConfig:
     """View modules, which learn parameters of each training view with the Gaussians (docs/your-photos.md); the class of each is
     registered by a name, and each of ours has a flag of its name."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
-    """Early stopping by held-out blocks of the training views, with any strategy (docs/decisions/020)."""
+    """Early stopping by left-out blocks of the training views, with any strategy (docs/decisions/020)."""
     init: InitConfig = field(default_factory=InitConfig)
     """Source and first values of the Gaussians."""
     loss: LossConfig = field(default_factory=LossConfig)

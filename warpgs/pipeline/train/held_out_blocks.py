@@ -119,7 +119,7 @@ def decibels(errors: torch.Tensor) -> float:
 
 @dataclass(frozen=True)
 class Gain:
-    """Gain of a change on the held-out blocks."""
+    """Gain of a change on the left-out blocks."""
 
     mean: float
     """Mean over blocks of the fall of their error [dB]."""

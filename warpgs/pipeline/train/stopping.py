@@ -1,4 +1,4 @@
-"""Early stopping of a fit by the error of held-out blocks of pixels, beside any strategy (docs/decisions/020)."""
+"""Early stopping of a fit by the error of left-out blocks of pixels, beside any strategy (docs/decisions/020)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float = 0.0
-    """Gain of the held-out blocks in the last third of the steps, its noise added, below which growth ends [dB]; the rest of
+    """Gain of the left-out blocks in the last third of the steps, its noise added, below which growth ends [dB]; the rest of
     the fit is then shorter in proportion. Not before a third of the time of growth, nor while views are half their size. 0:
     nothing is held out, and the fit takes the planned steps."""
     fraction: float = 0.03
@@ -66,7 +66,7 @@ class Measurement:
     count: int
     """Gaussians at that step."""
     held_out_psnr: float
-    """PSNR of the held-out blocks, the error floor included [dB]."""
+    """PSNR of the left-out blocks, the error floor included [dB]."""
     gain: float
     """Mean fall of the blocks' error since the measurement before, by growth and training together [dB]."""
     noise: float
@@ -194,7 +194,7 @@ class Stopping:
         lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
         if lately.upper_bound_below(c.min_gain_db, c.noise):
             return (
-                f"held-out pixels no longer improve ({lately.mean:+.3f} dB in the last {step - since:,} steps, noise "
+                f"left-out pixels no longer improve ({lately.mean:+.3f} dB in the last {step - since:,} steps, noise "
                 f"{lately.noise:.3f} dB)"
             )
         if step == self.marks[-1]:
@@ -223,7 +223,7 @@ class Stopping:
         measured = tensors.get("stopping.measured", torch.zeros(0, shape[1]))
         if measured.shape != shape:
             raise DataError(
-                f"the stored errors of the held-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"
+                f"the stored errors of the left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"
             )
         self.ended, self.why = plain["ended"], plain["why"]
         self.measurements = [Measurement(**m) for m in plain["measurements"]]

@@ -306,7 +306,7 @@ class Trainer:
         return Setting.row(dropout=self.dropout * self.progress(step), number=number, step=step, means_lr=means_lr, shift=shift)
 
     def is_due(self, step: int) -> bool:
-        """Return whether the set of Gaussians changes, or held-out blocks are measured, after a step."""
+        """Return whether the set of Gaussians changes, or left-out blocks are measured, after a step."""
         return self.stopping.due(step) or (self.stopping.ended is None and self.strategy.due(step))
 
     def _update(self) -> None:
@@ -323,7 +323,7 @@ class Trainer:
             self.set_views(stopping.whole)
             stopping.whole = self.views
             if self.steps < self.phases.planned:
-                self.messages.append(f"early stopping: held-out pixels no longer improve; {self.steps:,} steps in all")
+                self.messages.append(f"early stopping: left-out pixels no longer improve; {self.steps:,} steps in all")
             words = f"stopping: growth ended at step {step} with {len(self.table):,} Gaussians, because {stopping.why}"
             self.messages.append(Detail(f"{words}; all pixels are trained on from here"))
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
