@@ -132,11 +132,12 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
-def test_render_paths(run, tmp_path, path, pictures):
+def test_render_paths(run, tmp_path, path, pictures, capsys):
     """Every path gives its pictures and a film."""
     flags = ["--path", path, *(() if path == "views" else ("--frames", "4")), "--out", str(tmp_path), "--device", "cpu"]
     assert main(["render", str(run), *flags]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures and (tmp_path / "film.mp4").stat().st_size > 0
+    assert capsys.readouterr().out.count("VP9: plays in browsers and VLC; ") == 1
 
 
 def test_plot(run, tmp_path, capsys):
