@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,8 +32,8 @@ from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
-VP9 = "VP9: plays in browsers and VLC; H.264 for others: ffmpeg -i film.mp4 -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
-"""Note on a film in .mp4."""
+VP9 = "VP9: plays in browsers and VLC; H.264 for others: ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
+"""Note on a film in .mp4, of which {} is the path."""
 ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
 """Scores of the rendered alpha, with the words for each view's line."""
 
@@ -166,7 +167,7 @@ def render(
         done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)
     *files, last = done.files
     if last.suffix.lower() == ".mp4":
-        notes.append(VP9)
+        notes.append(VP9.format(shlex.quote(str(last))))
     notes += done.notes + ([f"six frames in {sheet_path(out)}"] if sheet else [])
     if last == out:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
