@@ -134,6 +134,8 @@ class Registry(Generic[T]):
         return cls
 
 
+_PREFIX = "_warpgs_"
+"""Begin of the names of modules that were loaded by their path."""
 LOADED: set[str] = set()
 """Names of the modules that users' own classes were loaded from."""
 
@@ -172,6 +174,13 @@ def own_code(classes: Iterable[type]) -> dict[str, str]:
 def _digest(cls: type) -> str:
     """Return the SHA-256 of the file of a class when first asked for, as it may be edited later; empty without one."""
     return module_digest(sys.modules.get(cls.__module__))
+
+
+def own_places(classes: Iterable[type]) -> list[str]:
+    """Return where `module_of` finds the modules of classes that are not of warpgs; a script that runs is left out."""
+    modules = {c.__module__ for c in classes if not _is_ours(c)} - {"__main__"}
+    files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
+    return sorted(str(place) for place in files.values() if place)
 
 
 def module_digest(module: ModuleType | None) -> str:
@@ -232,7 +241,7 @@ def _import_module(name: str) -> ModuleType:
 def _load_file(path: Path) -> ModuleType:
     """Import a file by its path, once, under a name of its own."""
     path = Path(os.path.realpath(path))  # Path.resolve raises a RuntimeError on links that lead round in circles
-    name = f"_warpgs_{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
+    name = f"{_PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, path)

@@ -92,6 +92,7 @@ REASONS = {
     "pipeline/runs/commands.py": {"render": "opens a writer of a film"},
     "pipeline/runs/folder.py": {"check_same": "copies a value"},
     "pipeline/runs/sampling_report.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
+    "plugins.py": {"module_digest": DIGEST},
     "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
     "poses/heic.py": {"main": PIPE},
     "poses/mapping.py": {"_lines": PIPE},

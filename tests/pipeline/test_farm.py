@@ -28,7 +28,8 @@ from warpgs.pipeline.farm.slurm import SlurmEngine
 from warpgs.pipeline.farm.work import run_job
 from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.train.loss import LOSS_TERMS
-from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.presets import PRESETS, preset_settings
+from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.listening import is_loopback, listeners
 from warpgs.runtime.subprocesses import run_python
@@ -264,6 +265,23 @@ def test_a_process_that_another_farm_left_behind_is_waited_for(scenes, results):
         engine = HereEngine(work_of)
         (status,) = run_farm([job], engine, poll=0)
     assert engine.begun == ["s0", "s0"] and (status.state, status.attempts) == ("done", 1)
+
+
+@pytest.mark.parametrize("decorator", ["", "@register('sprouting')\n"])
+def test_a_class_of_a_preset_file_is_found_by_another_process(scenes, tmp_path, monkeypatch, decorator):
+    """Its name alone does not lead there: it is that of a module without a place, or one of the user's choice."""
+    monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+    path = tmp_path / "mine.py"
+    head = "from warpgs import Strategy\nfrom warpgs.pipeline.train.strategies.base import register\n"
+    path.write_text(f"{head}{decorator}class Mine(Strategy):\n    pass\nmine = {{'strategy': Mine}}\n")
+    (job, _) = jobs_of(scenes, tmp_path)
+    text = job_text(replace(job, request=replace(job.request, config=preset_settings(f"{path}:mine")[0])))
+    for name in [n for n, m in sys.modules.items() if getattr(m, "__file__", None) == str(path)]:
+        del sys.modules[name]
+    kept = {n: c for n, c in STRATEGIES._classes.items() if c.__module__.startswith("warpgs.")}
+    monkeypatch.setattr(STRATEGIES, "_classes", kept)
+    found = job_of(text)
+    assert STRATEGIES.find(found.request.config.strategy).__name__ == "Mine" and job_text(found) == text
 
 
 def test_a_job_as_text_is_the_same_job(scenes, tmp_path):

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs import schema
+from warpgs.errors import UsageError
 from warpgs.io.readers import READERS
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
+from warpgs.plugins import module_of, own_places
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,7 @@ def job_text(job: FarmJob) -> str:
     request = {
         "scene": dataclasses.asdict(r.scene), "out": str(r.out.absolute()), "config": r.config.to_json(), "device": r.device,
         "lpips_weights": None if r.lpips_weights is None else str(r.lpips_weights.resolve()), "notes": r.notes,
+        "own_code": own_places(r.config.plugged_in()),
     }  # fmt: skip
     places = {"folder": str(job.folder.absolute()), "results": None if job.results is None else str(job.results.absolute())}
     return json.dumps({"name": job.name, **places, "request": request})
@@ -62,6 +65,11 @@ def job_of(text: str) -> FarmJob:
     scene, config = SceneRequest(**r["scene"]), r["config"]
     if scene.reader is not None:
         READERS.load(scene.reader)
+    for place in r["own_code"]:  # a class of a preset's file has a name that leads nowhere
+        try:
+            module_of(place)
+        except (ImportError, OSError) as e:
+            raise UsageError(f"your code {place} cannot be imported ({e}); put it where the farm's processes find it") from e
     STRATEGIES.load(config["strategy"])
     for term in config["loss_terms"]:
         LOSS_TERMS.load(term["name"])

@@ -143,8 +143,12 @@ class FitConfig:
 
     def own_code(self) -> dict[str, str]:
         """Return the SHA-256 of the source file of each class of the user's own, by its name."""
+        return own_code(self.plugged_in())
+
+    def plugged_in(self) -> list[type]:
+        """Return the classes of the strategy, loss terms and view modules; no strategy that this process has not loaded."""
         strategy = [find_strategy(self.strategy)] if STRATEGIES.knows(self.strategy) else []
-        return own_code([*strategy, *(type(part) for name in _PARTS for part in getattr(self, name))])
+        return [*strategy, *(type(part) for name in _PARTS for part in getattr(self, name))]
 
     def to_json(self) -> dict[str, Any]:
         """Return nested plain values, as stored in a run folder."""
