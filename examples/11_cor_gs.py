@@ -72,7 +72,7 @@ def random_cameras(views: list[TrainingView], noise: float, count: int, generato
 
     Each has the position of a training camera, with noise, and the mean orientation of that camera and its nearest neighbour.
     """
-    poses = torch.stack([v.camera.viewmat for v in views]).double().cpu()
+    poses = torch.stack([torch.as_tensor(v.camera.viewmat) for v in views]).double().cpu()
     rotations = poses[:, :3, :3]
     centers = -(rotations.mT @ poses[:, :3, 3:]).squeeze(-1)
     apart = torch.cdist(centers, centers).fill_diagonal_(torch.inf)
@@ -160,7 +160,8 @@ class CorGS(CloneSplit):
         term = weight * photometric_loss(first, second.detach(), None, SSIM_WEIGHT)
 
         found = self._image(twin, own_viewmat, K)
-        image, mask = (None if t is None else t.index_select(0, view)[0] for t in (self.images, self.masks))
+        image = self.images.index_select(0, view)[0]
+        mask = None if self.masks is None else self.masks.index_select(0, view)[0]
         loss = photometric_loss(found.rgb, image, mask, SSIM_WEIGHT)
         loss = loss + weight * photometric_loss(second, first.detach(), None, SSIM_WEIGHT)
         *self.gradients_of_twin, v_projected = torch.autograd.grad(
@@ -169,7 +170,9 @@ class CorGS(CloneSplit):
         if phase:
             size = (image.shape[1], image.shape[0])
             self.statistics_of_twin = self.twin_growth.statistics(v_projected, found.visible, size)
-        return term + torch.where(self.overflow[0] != 0, torch.nan, 0 * loss.detach())  # which ends the fit
+        ended: torch.Tensor = torch.where(self.overflow[0] != 0, torch.nan, 0 * loss.detach())  # which ends the fit
+        total: torch.Tensor = term + ended
+        return total
 
     def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
         """Update the second model where the step is taken, ``going`` [1]; ``settings`` [7] are not read."""
@@ -250,8 +253,8 @@ def main(arguments: list[str] | None = None) -> float:
             a.scene = Path(folder) / "scene"
             a.split = write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
         scene = warpgs.load_scene(a.scene)
-        configs = [base, dataclasses.replace(base, strategy=CorGS)]
-        results = [warpgs.fit(scene, config, split=a.split, verbose=False) for config in configs]
+        settings = {"split": a.split, "verbose": False}
+        results = [warpgs.fit(scene, base, **settings), warpgs.fit(scene, base, strategy=CorGS, **settings)]
 
     view, row = scene.view(results[0].test[0]), []
     for name, result in zip(("3DGS", "CoR-GS"), results):

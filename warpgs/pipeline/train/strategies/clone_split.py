@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Mapping
+from typing import Any
+
+import torch
 
 from warpgs import schema
 from warpgs.pipeline.model.table import Column, DensityUpdate
@@ -49,10 +52,10 @@ class CloneSplit(Strategy):
         if self.gradients.resets(step):
             self.gradients.reset_opacities()
 
-    def state(self):
+    def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Return no tensors [...], and whether opacities were reset."""
         return {}, self.gradients.state()
 
-    def load(self, tensors, plain):
+    def load(self, tensors: Mapping[str, torch.Tensor], plain: dict[str, Any]) -> None:
         """Load whether opacities were reset; ``tensors`` [...] are not read."""
         self.gradients.load(plain)
