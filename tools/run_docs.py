@@ -181,18 +181,23 @@ def _run(words: list[str], folder: Path, programs: Path | None, code: str = "") 
         return "\n    ".join([why, *output.read().splitlines()[-5:]]) if why else ""
 
 
-def run_block(block: Block, folder: Path, programs: Path | None) -> str:
-    """Run a block in a folder; return what is wrong, empty where nothing is."""
+def run_block(block: Block, folder: Path, programs: Path | None) -> tuple[str, Path]:
+    """Run a block in a folder; return what is wrong, empty where nothing is, and the folder that a shell ends in."""
     if block.python:
-        return _run([sys.executable, "-"], folder, programs, block.code)
-    return _run(["bash", "-e", "-c", block.code], folder, programs) if block.code else ""
+        return _run([sys.executable, "-"], folder, programs, block.code), folder
+    if not block.code:
+        return "", folder
+    with tempfile.TemporaryDirectory() as place:
+        file = Path(place) / "folder"
+        why = _run(["bash", "-e", "-c", f'{block.code}\npwd > "$0"', str(file)], folder, programs)
+        return why, folder if why else Path(file.read_text("utf-8").rstrip("\n"))
 
 
 def run_blocks(blocks: list[Block], folder: Path, programs: Path | None) -> list[str]:
-    """Run the blocks of a page in order; return a line for each that failed."""
+    """Run the blocks of a page in order, each in the folder where the one before ended; return a line for each that failed."""
     failed = []
     for block in blocks:
-        why = run_block(block, folder, programs)
+        why, folder = run_block(block, folder, programs)
         if why:
             failed.append(f"{block.page}, line {block.line}: {why}")
     return failed
