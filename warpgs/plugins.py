@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import ClassVar, Generic, Protocol, TypeVar
 
 from warpgs.errors import UsageError
+from warpgs.input_files import input_digest
 
 
 class Named(Protocol):
@@ -187,7 +188,7 @@ def module_digest(module: ModuleType | None) -> str:
     """Return the SHA-256 of the file of a module; empty without one."""
     path = getattr(module, "__file__", None)
     try:
-        return hashlib.sha256(Path(path).read_bytes()).hexdigest() if path else ""
+        return input_digest(path) if path else ""
     except OSError:  # a module of an archive, or one that is gone since
         return ""
 
