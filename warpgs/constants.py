@@ -99,7 +99,7 @@ class Rule:
         """Check types and ranges; those of ``near`` and ``far`` are checked where they are used.
 
         Raises:
-            UsageError: A cut-off is of another type, or outside its range.
+            UsageError: A cut-off is not a number, or is outside its range.
         """
         for name in ("alpha_cut", "alpha_max", "transmittance_stop", "near", "far", "low_pass", "square_sigma"):
             if not isinstance(getattr(self, name), Real):

@@ -125,7 +125,7 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
 
     Raises:
         SystemExit: A word is wrong, or help was asked for.
-        UsageError: There is no such flag.
+        UsageError: The flag is unknown.
     """
     import tyro
 

@@ -45,7 +45,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
 
     @wp.struct
     class CameraParts:
-        """What the gradients of the cameras need of each lane: entries of a lane stand `LANES` apart."""
+        """Values of each lane for the gradients of the cameras; the entries of one lane lie `LANES` apart."""
 
         position: lane_vec3
         turned: lane_mat33
