@@ -272,6 +272,13 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
         interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
         wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
         assert torch.equal(found, wanted), width
+    column = memory.view(1, 6, 10).transpose(0, 1)  # of images one pixel wide; its stride there is that of no row
+    for image in (column, column[..., :4]):
+        found = torch.zeros(6)
+        arguments = [interop.rows(image, wp.float32), interop.flat(memory, wp.float32), interop.flat(found, wp.float32)]
+        interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
+        wanted = 600 + image.shape[-1] + 1000 * image[:, 0, 1] + 1e6 * memory[:6]
+        assert torch.equal(found, wanted), image.shape
     empty = [interop.rows(part[..., :0], wp.float32), interop.rows(part[:0], wp.float32)]
     assert [v.array().shape for v in empty] == [(0, 0), (0, 3)]
 

@@ -103,6 +103,14 @@ class View(NamedTuple):
             _check_size(size)
         return wp.from_torch(tensor, dtype=self.dtype, requires_grad=False)
 
+    def row_stride(self) -> int:
+        """Return the number of entries from one row of the last axis to the next."""
+        tensor = self.tensor
+        for axis in range(-2, -tensor.ndim - 1, -1):
+            if tensor.shape[axis] > 1:  # the stride of an axis of one entry may be any number
+                return tensor.stride(axis)
+        return tensor.shape[-1]
+
 
 def view(tensor: torch.Tensor, dtype) -> View:
     """Return a contiguous tensor of any shape as a kernel argument of that element type."""
@@ -244,7 +252,7 @@ class _Recorded:
             if type(value) is View:
                 tensor = value.tensor
                 address, shape, before = tensor.data_ptr(), tensor.shape, known[i]
-                strided = value.axes == 2 and tensor.stride(-2)  # others are contiguous
+                strided = value.axes == 2 and value.row_stride()  # others are contiguous
                 if before is not None and before[0] == address and before[1] == shape and before[2] == strided:
                     continue
                 packed = command.params[i + 2]  # after the bounds and ``begin``
