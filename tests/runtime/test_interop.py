@@ -3,6 +3,7 @@
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -251,6 +252,58 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
     with ThreadPoolExecutor(2) as pool:
         for count, found in zip(counts, pool.map(launches, counts), strict=True):
             assert found == [[times] * count for times in (1, 2, 3)]
+
+
+def test_an_interrupt_waits_for_the_threads(monkeypatch):
+    """Else they would go on in memory that the caller frees, with arguments that the next launch writes."""
+    begun, working = threading.Event(), []
+
+    class Interrupted:
+        def __init__(self, work):
+            self.work = work
+
+        def result(self):
+            begun.set()
+            raise KeyboardInterrupt
+
+        def __getattr__(self, name):
+            return getattr(self.work, name)
+
+    def submit(run):
+        def late():
+            begun.wait(10)
+            run()
+
+        working.append(pool.submit(late))
+        return Interrupted(working[-1])
+
+    monkeypatch.setattr(interop, "_pool", lambda _: SimpleNamespace(submit=submit))
+    torch.set_num_threads(2)
+    visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
+    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):
+        try:
+            interop.launch(mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+        finally:
+            assert len(working) == 2 and all(work.done() for work in working)
+
+
+def test_a_launch_that_failed_is_recorded_anew(monkeypatch):
+    """Under the lock, as a first one: it may have to be compiled."""
+    locked, load = [], interop.load_module
+    arguments = [interop.view(torch.zeros(3, dtype=torch.int32), wp.int32) for _ in range(2)]
+
+    def fails_once(*given):
+        locked.append(interop._LOADING.locked())
+        if len(locked) == 1:
+            raise ResourceError("no memory")
+        return load(*given)
+
+    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
+    monkeypatch.setattr(interop, "load_module", fails_once)
+    with pytest.raises(ResourceError):
+        interop.launch(mark, 3, arguments, torch.device("cpu"))
+    interop.launch(mark, 3, arguments, torch.device("cpu"))
+    assert locked == [True, True]
 
 
 @wp.kernel(enable_backward=False)
