@@ -3,6 +3,7 @@
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -253,6 +254,58 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
             assert found == [[times] * count for times in (1, 2, 3)]
 
 
+def test_an_interrupt_waits_for_the_threads(monkeypatch):
+    """Else they would go on in memory that the caller frees, with arguments that the next launch writes."""
+    begun, working = threading.Event(), []
+
+    class Interrupted:
+        def __init__(self, work):
+            self.work = work
+
+        def result(self):
+            begun.set()
+            raise KeyboardInterrupt
+
+        def __getattr__(self, name):
+            return getattr(self.work, name)
+
+    def submit(run):
+        def late():
+            begun.wait(10)
+            run()
+
+        working.append(pool.submit(late))
+        return Interrupted(working[-1])
+
+    monkeypatch.setattr(interop, "_pool", lambda _: SimpleNamespace(submit=submit))
+    torch.set_num_threads(2)
+    visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
+    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):
+        try:
+            interop.launch(mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+        finally:
+            assert len(working) == 2 and all(work.done() for work in working)
+
+
+def test_a_launch_that_failed_is_recorded_anew(monkeypatch):
+    """Under the lock, as a first one: it may have to be compiled."""
+    locked, load = [], interop.load_module
+    arguments = [interop.view(torch.zeros(3, dtype=torch.int32), wp.int32) for _ in range(2)]
+
+    def fails_once(*given):
+        locked.append(interop._LOADING.locked())
+        if len(locked) == 1:
+            raise ResourceError("no memory")
+        return load(*given)
+
+    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
+    monkeypatch.setattr(interop, "load_module", fails_once)
+    with pytest.raises(ResourceError):
+        interop.launch(mark, 3, arguments, torch.device("cpu"))
+    interop.launch(mark, 3, arguments, torch.device("cpu"))
+    assert locked == [True, True]
+
+
 @wp.kernel(enable_backward=False)
 def tell_apart(
     begin: int, table: wp.array2d(dtype=wp.float32), numbers: wp.array(dtype=wp.float32), found: wp.array(dtype=wp.float32)
@@ -272,6 +325,13 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
         interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
         wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
         assert torch.equal(found, wanted), width
+    column = memory.view(1, 6, 10).transpose(0, 1)  # of images one pixel wide; its stride there is that of no row
+    for image in (column, column[..., :4]):
+        found = torch.zeros(6)
+        arguments = [interop.rows(image, wp.float32), interop.flat(memory, wp.float32), interop.flat(found, wp.float32)]
+        interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
+        wanted = 600 + image.shape[-1] + 1000 * image[:, 0, 1] + 1e6 * memory[:6]
+        assert torch.equal(found, wanted), image.shape
     empty = [interop.rows(part[..., :0], wp.float32), interop.rows(part[:0], wp.float32)]
     assert [v.array().shape for v in empty] == [(0, 0), (0, 3)]
 

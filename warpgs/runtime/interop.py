@@ -7,7 +7,7 @@ import ctypes
 import functools
 import threading
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple
 
 import torch
@@ -102,6 +102,14 @@ class View(NamedTuple):
         for size in tensor.shape:
             _check_size(size)
         return wp.from_torch(tensor, dtype=self.dtype, requires_grad=False)
+
+    def row_stride(self) -> int:
+        """Return the number of entries from one row of the last axis to the next."""
+        tensor = self.tensor
+        for axis in range(-2, -tensor.ndim - 1, -1):
+            if tensor.shape[axis] > 1:  # the stride of an axis of one entry may be any number
+                return tensor.stride(axis)
+        return tensor.shape[-1]
 
 
 def view(tensor: torch.Tensor, dtype) -> View:
@@ -226,11 +234,11 @@ class _Recorded:
         if self.command is None:
             load_module(self.kernel.module, self.device, self.block_dim)
             own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
-            self.command = wp.launch(
-                self.kernel, count, inputs=[0, *own], device=self.device, block_dim=self.block_dim, record_cmd=True
-            )
-            self.command.fwd_args = None  # else the first call's arrays would stay in memory
+            where = {"device": self.device, "block_dim": self.block_dim}
+            command = wp.launch(self.kernel, count, inputs=[0, *own], record_cmd=True, **where)
+            command.fwd_args = None  # else the first call's arrays would stay in memory
             self.known = [None] * len(inputs)
+            self.command = command  # last: after an interrupt there is none
         else:
             self._patch(count, inputs)
         return self.command
@@ -244,7 +252,7 @@ class _Recorded:
             if type(value) is View:
                 tensor = value.tensor
                 address, shape, before = tensor.data_ptr(), tensor.shape, known[i]
-                strided = value.axes == 2 and tensor.stride(-2)  # others are contiguous
+                strided = value.axes == 2 and value.row_stride()  # others are contiguous
                 if before is not None and before[0] == address and before[1] == shape and before[2] == strided:
                     continue
                 packed = command.params[i + 2]  # after the bounds and ``begin``
@@ -317,8 +325,9 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     recorded = _OF_THREAD.recorded.get(kernel)
     if recorded is None:
         with _LOADING:  # launches on a CPU are compiled for blocks of one thread
-            recorded = _OF_THREAD.recorded[kernel] = _Recorded(kernel, device, 1)
+            recorded = _Recorded(kernel, device, 1)
             first = recorded.patched(count, inputs)
+        _OF_THREAD.recorded[kernel] = recorded  # not before: one that failed has no command
     else:
         first = recorded.patched(count, inputs)
     threads = torch.get_num_threads()
@@ -339,8 +348,15 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
             bounds.shape[0] = bounds.size = end - begin.value
             command.launch()
 
-    for done in [_pool(threads).submit(run) for _ in range(min(threads, chunks))]:
-        done.result()
+    working: list[Future[None]] = []
+    try:
+        for _ in range(min(threads, chunks)):
+            working.append(_pool(threads).submit(run))
+        for work in working:
+            work.result()
+    except BaseException:  # an interrupt, too: the caller frees memory that the threads work in
+        wait(working)
+        raise
 
 
 @functools.cache
