@@ -161,7 +161,7 @@ def test_room_for_visible_gaussians_changes_no_list(device):
     seen, total = int((counts > 0).sum()), int(counts.sum())
     assert 300 < seen < 550
     sums = running_counts(counts.view(-1), wp.float32)
-    assert split_sum(int(sums[-1])) == (seen, total)
+    assert split_sum(int(sums[-1]), counts.numel()) == (seen, total)
     for room in (seen, seen + 1, 550, 600, seen - 1, 1):
         overflow = torch.zeros(1, dtype=torch.int32, device=device)
         memory = InstanceMemory(capacity=total + 9, overflow=overflow, visible=Visible(sums, room))
@@ -171,6 +171,14 @@ def test_room_for_visible_gaussians_changes_no_list(device):
             assert torch.equal(made.ranges, wanted.ranges) and int(made.total) == total
             assert torch.equal(made.gaussian_ids[:total], wanted.gaussian_ids) and torch.equal(made.slots[:total], wanted.slots)
             assert torch.equal(made.starts[counts.view(-1) > 0], wanted.starts[counts.view(-1) > 0])
+
+
+def test_running_sums_count_more_than_a_word_of_instances(device):
+    """Two numbers in one sum, against numbers counted apart, where the instances exceed 2^37."""
+    counts = torch.tensor([0, 2**31 - 1, 1, 0, 5] * 70, dtype=torch.int32, device=device)
+    seen, total = int((counts > 0).sum()), int(counts.sum(dtype=torch.int64))
+    assert total > 2**37
+    assert split_sum(int(running_counts(counts, wp.float32)[-1]), len(counts)) == (seen, total)
 
 
 @pytest.mark.cuda

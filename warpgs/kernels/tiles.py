@@ -24,10 +24,6 @@ LIST_BYTES = 20
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 """Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
-VISIBLE = 2**36
-"""Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
-MAX_VISIBLE = 2**63 // VISIBLE - 1
-"""Most visible Gaussians that such a sum can count."""
 MAX_INSTANCES = interop.MAX_SIZE // 2
 """Most instances: a radix sort needs one array of twice that size."""
 
@@ -152,14 +148,14 @@ def make_kernels(real, native: bool):
 
     @wp.kernel(enable_backward=False, module=module)
     def pack_counts(
-        begin: int, tile_counts: wp.array(dtype=int),
+        begin: int, tile_counts: wp.array(dtype=int), bits: int,
         # outputs
         packed: wp.array(dtype=wp.int64),
     ):  # fmt: skip
         i = begin + wp.tid()
         own = wp.int64(0)
         if i < tile_counts.shape[0] and tile_counts[i] > 0:
-            own = wp.int64(VISIBLE) + wp.int64(tile_counts[i])
+            own = (wp.int64(1) << wp.int64(bits)) + wp.int64(tile_counts[i])
         if wp.static(native):
             own = lanes.whole_sum(own)
         if i < tile_counts.shape[0] and i % per == 0:
@@ -168,7 +164,7 @@ def make_kernels(real, native: bool):
     @wp.kernel(enable_backward=False, module=module)
     def visible_keys(
         begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
-        limit: int,
+        bits: int, limit: int,
         # outputs
         keys: wp.array(dtype=real), ids: wp.array(dtype=int),
     ):  # fmt: skip
@@ -180,13 +176,13 @@ def make_kernels(real, native: bool):
             rank = lanes.running_sum(seen)
             after = lanes.broadcast(rank, 31) - rank
         if i < count:
-            passed = int(packed[i // per] / wp.int64(VISIBLE)) - after  # visible ones up to this one
+            passed = int(packed[i // per] >> wp.int64(bits)) - after  # visible ones up to this one
             j = passed - 1
             key = real(wp.inf)
             if seen == 1:
                 key = projected[i, 9]
             else:  # behind all visible ones, as far as there is room
-                j = int(packed[packed.shape[0] - 1] / wp.int64(VISIBLE)) + i - passed
+                j = int(packed[packed.shape[0] - 1] >> wp.int64(bits)) + i - passed
             if j < limit:
                 keys[j] = key
                 ids[j] = i
@@ -209,13 +205,13 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     """Raise ResourceError where the instances exceed the budget, or what kernels can number."""
     needed = total * BYTES_PER_INSTANCE
     # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
-    countable = total <= MAX_INSTANCES and visible <= MAX_VISIBLE
+    countable = total <= MAX_INSTANCES
     if countable and budget_bytes is None and needed < installed_bytes(device) // 20:
         return
     budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
     if countable and needed <= budget:
         return
-    limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances of {MAX_VISIBLE:,} Gaussians"
+    limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances"
     raise ResourceError(
         f"binning {visible:,} visible Gaussians into tiles makes {total:,} (Gaussian, tile) instances, "
         f"{total / max(visible, 1):.0f} of {tiles} tiles each on average, which needs {needed / 2**30:.2f} GiB; the limit is "
@@ -229,6 +225,8 @@ def running_counts(
 ) -> torch.Tensor:  # fmt: skip
     """Return running sums of tile counts and visible Gaussians in one, int64, shape [S]: `split_sum` takes the last apart.
 
+    A visible Gaussian adds its tile count and 2^`sum_bits`.
+
     Args:
         counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
         real: Scalar type of the Gaussians, of Warp.
@@ -239,13 +237,23 @@ def running_counts(
     sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
     packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
     kernel = make_kernels(real, native).pack_counts
-    interop.launch(kernel, threads, [interop.view(counts, wp.int32), interop.view(packed, wp.int64)], device)
+    interop.launch(kernel, threads, [interop.view(counts, wp.int32), sum_bits(count), interop.view(packed, wp.int64)], device)
     return torch.cumsum(packed, 0, out=packed)
 
 
-def split_sum(total: int) -> tuple[int, int]:
-    """Return the number of visible Gaussians and of instances in the last of the `running_counts`."""
-    return divmod(total, VISIBLE)
+def sum_bits(count: int) -> int:
+    """Return the low bits of a running sum that count instances; the others count up to ``count`` visible Gaussians."""
+    return 63 - count.bit_length()
+
+
+def sums_fit(count: int, tiles: int) -> bool:
+    """Return whether running sums can count the instances of ``count`` Gaussians in all ``tiles`` tiles of an image."""
+    return count * tiles < 2 ** sum_bits(count)
+
+
+def split_sum(total: int, count: int) -> tuple[int, int]:
+    """Return the number of visible Gaussians and of instances in the last of the `running_counts` of ``count`` Gaussians."""
+    return divmod(total, 2 ** sum_bits(count))
 
 
 def _depth_order(
@@ -266,19 +274,19 @@ def _depth_order(
         if memory.visible is not None:
             packed, visible = memory.visible
     else:
-        if count * tiles >= VISIBLE or count > MAX_VISIBLE:
+        if not sums_fit(count, tiles):
             many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
             _check_total(*reversed(many.tolist()), device, tiles, memory.budget)
         # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
         packed = running_counts(counts, real, memory.allocator)
-        visible, total = split_sum(int(packed[-1]))
+        visible, total = split_sum(int(packed[-1]), count)
         _check_total(total, visible, device, tiles, memory.budget)
     depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
     depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
     if packed is None:
         interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
     else:
-        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), visible, depths_view, order_view]
+        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), sum_bits(count), visible, depths_view, order_view]
         interop.launch(k.visible_keys, -(-count // 256) * 256 if native else count, inputs, device)
     interop.sort_pairs(depths_view, order_view, visible)
     return order, visible, total
@@ -328,7 +336,7 @@ def bin_tiles(
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
-            there are 2^31 tiles or 2^27 visible Gaussians or more.
+            there are 2^31 tiles or more.
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
