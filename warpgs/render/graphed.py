@@ -22,16 +22,8 @@ import warp as wp
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import (
-    BYTES_PER_INSTANCE,
-    InstanceMemory,
-    Tiles,
-    Visible,
-    grid,
-    running_counts,
-    split_sum,
-    sums_fit,
-)
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid
+from warpgs.kernels.tiles_order import running_counts, split_sum, sums_fit
 from warpgs.render.compose import composite_into
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
