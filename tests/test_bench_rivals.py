@@ -45,7 +45,7 @@ def test_the_page_pairs_each_method_with_its_base():
     rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
     table = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
     assert table[0].startswith("| method | fern: steps | fern: PSNR / SSIM | difference to a")
-    assert "| a | 3,000 | 20.10 ± 0.14 / 0.500 |  |" in table
+    assert "| a | 4,500 | 20.10 ± 0.14 / 0.500 |  |" in table
     low, high = (1.1 + sign * 0.1 * 25.4517 for sign in (-1, 1))  # Student's t for 97.5 % of one degree of freedom, two rows
     assert f"| b | 20 | 21.20 ± 0.28 / 0.500 | +1.10 [{low:+.2f}, {high:+.2f}] |" in table
     assert "| c | 7 | 19.00 / 0.500 (1 seed) | -1.00 |" in table

@@ -45,7 +45,7 @@ def budget_text(results: dict[str, dict]) -> str:
     """A table of the first machine, images and gradients by scene; a sentence on each machine."""
     parts = []
     for stem, result in results.items():
-        kept = "Every line is kept." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
+        kept = "All limits are met." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
         parts.append(f"{_machine(stem, result)} {kept} {_most(result['rows'])} All: `bench/results/budget_{stem}.json`.\n")
         if len(parts) > 1:
             continue

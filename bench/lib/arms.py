@@ -8,7 +8,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.by_views import MIN_STEPS
+from warpgs.pipeline.train.by_views import OPAQUE_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`; the degree follows from the number of views."""
@@ -41,7 +41,7 @@ RIVALS = (
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
     Arm("CoR-GS", COR_GS, (1500, 3000)),
     Arm("gsplat", GSPLAT, STEPS),
-    Arm("gsplat, 3,000 steps", f"{GSPLAT},steps=3000"),
+    Arm("gsplat, as many steps as `default`", f"{GSPLAT},steps={OPAQUE_STEPS}"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
     Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
 )
@@ -73,8 +73,8 @@ ARMS = {"rivals": RIVALS, "ladder": LADDER, "ablation": ABLATION}
 
 
 def steps_in(preset: str) -> int:
-    """Return the steps that a preset names; those of `default` for few views, the most it takes, where it names none."""
-    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else MIN_STEPS
+    """Return the steps that a preset names; those of `default` for few views where it names none."""
+    return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else OPAQUE_STEPS
 
 
 def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:

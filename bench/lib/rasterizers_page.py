@@ -96,7 +96,7 @@ def gradients_table(results: list[dict]) -> str:
                 ]
     head = ["scene", "cut-offs", "program", *(f"p99: {t}" for t in TENSORS), "median", "largest", "1 - cosine", "bias"]
     said = "Ours are lowest at every 99th percentile, or within 5 % of the lowest"
-    said += f", but for: {'; '.join(behind)}." if behind else "."
+    said += f", except: {'; '.join(behind)}." if behind else "."
     judge = max(results[0]["judge"].values())
     said += f" Our float64 pass is within {_e(judge)} (relative L2) of torch's derivative of a plain program."
     return markdown(head, body, LEFT) + f"\n{said}\n"

@@ -11,29 +11,35 @@ from tests.reference.blend import blend_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels import blend, tiles
+from warpgs.kernels import blend, tiles, tiles_order
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
 
 
 def test_budget_is_met_to_the_byte():
-    """As many instances as fit are allowed, one more is not; so are 2^30 - 1 of 2^27 - 1 Gaussians, and no more."""
+    """As many instances as fit are allowed, one more is not; so are 2^30 - 1, and no more."""
     cpu = torch.device("cpu")
     tiles._check_total(1000, 1, cpu, 1, 148_000)
     with pytest.raises(ResourceError, match=r"makes 1,001 .* 1001 of 7 tiles .* the limit is 0\.00 GiB"):
         tiles._check_total(1001, 1, cpu, 7, 148_000)
-    tiles._check_total(2**30 - 1, 2**27 - 1, cpu, 1, 2**60)
-    with pytest.raises(ResourceError, match="the limit is 1,073,741,823 instances of 134,217,727 Gaussians"):
+    tiles._check_total(2**30 - 1, 2**30 - 1, cpu, 1, 2**60)
+    with pytest.raises(ResourceError, match=r"the limit is 1,073,741,823 instances\. Many"):
         tiles._check_total(2**30, 1, cpu, 1, 2**60)
-    with pytest.raises(ResourceError, match="the limit is 1,073,741,823 instances of 134,217,727 Gaussians"):
+    with pytest.raises(ResourceError, match=r"the limit is 1,073,741,823 instances\. Many"):
         tiles._check_total(2**30, 1, cpu, 1, None)
     with pytest.raises(ResourceError, match=r"the limit is 1\.00 GiB"):
         tiles._check_total(2**30 - 1, 1, cpu, 1, 2**30)
-    with pytest.raises(ResourceError, match="the limit is 1,073,741,823 instances of 134,217,727 Gaussians"):
-        tiles._check_total(1, 2**27, cpu, 1, 2**60)
-    # one running sum in 63 bits holds both
-    assert tiles.VISIBLE > tiles.MAX_INSTANCES and (tiles.MAX_VISIBLE + 1) * tiles.VISIBLE <= 2**63
+
+
+def test_one_running_sum_holds_both_numbers():
+    """The largest sum of each number of Gaussians stays below 2^63, and every number of instances that is allowed fits."""
+    for count in (1, 2, 3, 4095, 4096, 2_794_625, 2**23, 2**31 - 1):
+        unit = 2 ** tiles_order.sum_bits(count)
+        assert unit > tiles.MAX_INSTANCES and count * unit + unit - 1 < 2**63
+        assert tiles_order.split_sum(count * unit + unit - 1, count) == (count, unit - 1)
+    assert tiles_order.sums_fit(2_794_625, 240 * 135)  # 3840 x 2160 px
+    assert tiles_order.sums_fit(2**23, 2**16 - 1) and not tiles_order.sums_fit(2**23, 2**16)
 
 
 def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
@@ -54,11 +60,9 @@ def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
     assert not asked
 
 
-@pytest.mark.parametrize(
-    ("spare_sum", "spare_count", "apart"), [(1, 0, False), (0, 0, True), (1, -1, True)], ids=["fits", "sum", "count"]
-)
-def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, spare_sum, spare_count, apart):
-    """Pairs are counted apart from as many (Gaussian, tile) pairs on as a sum can hold, and beyond as many Gaussians."""
+@pytest.mark.parametrize("fits", [True, False])
+def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, fits):
+    """Instances are counted apart from as many (Gaussian, tile) pairs on as a sum can hold."""
     projected, counts = torch.zeros(2, 5, 12), torch.ones(2, 5, dtype=torch.int32)  # 10 Gaussians, 6 tiles
 
     def stop(word):
@@ -67,11 +71,10 @@ def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, spare_sum,
 
         return work
 
-    monkeypatch.setattr(tiles, "VISIBLE", 60 + spare_sum)
-    monkeypatch.setattr(tiles, "MAX_VISIBLE", 10 + spare_count)
+    monkeypatch.setattr(tiles, "sums_fit", lambda count, per_camera: fits and (count, per_camera) == (10, 6))
     monkeypatch.setattr(tiles, "_check_total", stop("apart"))
     monkeypatch.setattr(tiles.interop, "launch", stop("together"))
-    with pytest.raises(InterruptedError, match="apart" if apart else "together"):
+    with pytest.raises(InterruptedError, match="together" if fits else "apart"):
         tiles.bin_tiles(projected, counts, width=48, height=30, rule=EXACT)
 
 

@@ -30,7 +30,7 @@ def test_long_lists_come_first(count):
     begins = torch.randint(2**20, (count,), generator=generator, dtype=torch.int32)
     ranges = torch.stack([begins, begins + lengths], 1).to(CUDA)
     order = torch.full((count + 16 * 1024,), -1, dtype=torch.int32, device=CUDA)
-    inputs = [ints(ranges), count, ints(order)]
+    inputs = [ints(ranges), count, ints(torch.empty_like(order)), ints(order)]
     interop.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
     found = order.cpu()
     assert bool((found[count:] == -1).all())

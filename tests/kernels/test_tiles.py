@@ -11,7 +11,10 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import InstanceMemory, Visible, bin_tiles, running_counts, split_sum
+from warpgs.kernels.tiles import InstanceMemory, Visible, bin_tiles
+from warpgs.kernels.tiles_emit import EACH, make_find_ranges
+from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries
+from warpgs.runtime import interop
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
@@ -161,16 +164,66 @@ def test_room_for_visible_gaussians_changes_no_list(device):
     seen, total = int((counts > 0).sum()), int(counts.sum())
     assert 300 < seen < 550
     sums = running_counts(counts.view(-1), wp.float32)
-    assert split_sum(int(sums[-1])) == (seen, total)
-    for room in (seen, seen + 1, 550, 600, seen - 1, 1):
+    assert split_sum(int(sums[-1]), counts.numel()) == (seen, total)
+    for room, spare in ((seen, 9), (seen + 1, 3000), (550, 0), (600, 9), (seen - 1, 9), (1, 9)):
         overflow = torch.zeros(1, dtype=torch.int32, device=device)
-        memory = InstanceMemory(capacity=total + 9, overflow=overflow, visible=Visible(sums, room))
+        memory = InstanceMemory(capacity=total + spare, overflow=overflow, visible=Visible(sums, room))
         made = bin_tiles(projected, counts, width=64, height=48, rule=EXACT, memory=memory)
         assert made.visible == room and int(made.total) <= total
+        assert bool((made.tile_ids[int(made.total) :] == len(made.ranges)).all())  # the rest is no tile's
         if room >= seen:
             assert torch.equal(made.ranges, wanted.ranges) and int(made.total) == total
             assert torch.equal(made.gaussian_ids[:total], wanted.gaussian_ids) and torch.equal(made.slots[:total], wanted.slots)
             assert torch.equal(made.starts[counts.view(-1) > 0], wanted.starts[counts.view(-1) > 0])
+
+
+def test_running_sums_count_more_than_a_word_of_instances(device):
+    """Two numbers in one sum, against numbers counted apart, where the instances exceed 2^37."""
+    counts = torch.tensor([0, 2**31 - 1, 1, 0, 5] * 70, dtype=torch.int32, device=device)
+    seen, total = int((counts > 0).sum()), int(counts.sum(dtype=torch.int64))
+    assert total > 2**37
+    assert split_sum(int(running_counts(counts, wp.float32)[-1]), len(counts)) == (seen, total)
+
+
+@pytest.mark.parametrize("slotted", [True, False])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 127, 1030])
+def test_ranges_by_four_instances_a_thread(device, count, slotted):
+    """Ranges and Gaussian numbers of sorted keys, against a search; the last keys are no tile's."""
+    generator, no_tile = torch.Generator().manual_seed(count), 60
+    keys = torch.randint(no_tile + 5, (count,), generator=generator).clamp(max=no_tile).sort().values.int().to(device)
+    slots, owners = (torch.randperm(count, generator=generator).int().to(device) for _ in range(2))
+    tiles = torch.arange(no_tile, dtype=torch.int32, device=device)
+    begin, end = torch.searchsorted(keys, tiles).int(), torch.searchsorted(keys, tiles, right=True).int()
+    for native in (True, False):
+        each = EACH if native else 1
+        ids, ranges = torch.full((count,), -1, dtype=torch.int32, device=device), torch.zeros_like(tiles)[:, None].repeat(1, 2)
+        ints = [interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges)]
+        interop.launch(make_find_ranges(slotted, native), -(-count // each), [*ints[:3], count, no_tile, *ints[3:]], device)
+        empty = begin == end
+        assert torch.equal(ranges[~empty], torch.stack([begin, end], 1)[~empty]) and not ranges[empty].any()
+        inside = keys < no_tile
+        assert torch.equal(ids[inside], owners[slots.long()][inside] if slotted else torch.full_like(ids, -1)[inside])
+        assert not ids[~inside].any()
+
+
+@pytest.mark.parametrize("count", [1, 31, 128, 129, 1024, 1025, 5000])
+def test_visible_ones_come_first_and_in_order(device, count):
+    """Keys and numbers of the visible Gaussians, then of the others as far as there is room."""
+    generator = torch.Generator().manual_seed(count)
+    counts = (torch.randint(3, (count,), generator=generator).int() * 7).to(device)
+    projected = torch.rand(count, 12, generator=generator).to(device)
+    kernels, native = make_kernels(wp.float32, counts.is_cuda), counts.is_cuda
+    sums = running_counts(counts, wp.float32)
+    seen = int((counts > 0).sum())
+    order = torch.cat([torch.nonzero(counts > 0)[:, 0], torch.nonzero(counts == 0)[:, 0]])
+    wanted = torch.where(counts[order] > 0, projected[order, 9], torch.inf)
+    for limit in (count, seen, seen // 2):
+        keys, ids = torch.zeros(count, device=device), torch.full((count,), -1, dtype=torch.int32, device=device)
+        inputs = [interop.view(projected, wp.float32), interop.view(counts, wp.int32), interop.view(sums, wp.int64)]
+        inputs += [sum_bits(count), limit, interop.view(keys, wp.float32), interop.view(ids, wp.int32)]
+        interop.launch(kernels.visible_keys, sum_entries(count, native)[1], inputs, device)
+        assert torch.equal(keys[:limit], wanted[:limit]) and torch.equal(ids[:limit].long(), order[:limit])
+        assert not keys[limit:].any() and bool((ids[limit:] == -1).all())
 
 
 @pytest.mark.cuda

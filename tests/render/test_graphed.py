@@ -125,6 +125,15 @@ def test_calls_that_cannot_be_captured_are_not(recorder, monkeypatch):
     assert [recorder.render(own, None, SETTINGS) for _ in range(5)] == [None] * 5 and Counted.made == 0
 
 
+def test_calls_of_large_scenes_are_captured(surroundings):
+    """2.8M Gaussians at 3840 x 2160 px; not where a running sum might overflow."""
+    given = batch()
+    own = given._replace(**{n: torch.empty(2_794_625, *t.shape[1:], device="meta") for n, t in zip(given._fields[:5], given)})
+    large = dataclasses.replace(SETTINGS, width=3840, height=2160, window=(0, 0, 3840, 2160))
+    assert call_key(own, None, large) is not None
+    assert call_key(own, None, dataclasses.replace(large, window=(0, 0, 2**18, 2**18))) is None
+
+
 def test_options_beyond_the_image_are_not_captured():
     """Each of them by itself excludes a capture."""
     assert RasterizeOptions(background=torch.ones(3), sh_degree=1).repeatable()

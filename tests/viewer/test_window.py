@@ -1,6 +1,7 @@
 """The viewer on a run: what it sends, renders and saves, without a browser; and beside a fit."""
 
 import base64
+import contextlib
 import dataclasses
 import json
 import os
@@ -20,6 +21,7 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch
 from warpgs.viewer.content import content_of_file, content_of_run, views_of
+from warpgs.viewer.html import middle_first
 from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
 from warpgs.viewer.panel import COARSE, FINE
 from warpgs.viewer.saved import CROP, MAX_KEYFRAMES, PATH, keyframe
@@ -138,6 +140,23 @@ def test_what_is_saved_is_rendered_and_exported(window, tmp_path):
     shown = convert_gaussians(window.shown(), n, "scene", "file").means
     panel._crop.value = False
     assert torch.equal(warpgs.read_ply(tmp_path / "a.ply").means, shown)
+
+
+def test_the_first_view_is_that_of_the_page(window):
+    """The middle training camera, as in scene.html; Reset leads a browser back, with the field of view."""
+    model, server = window.content.model, window.server
+    middle = middle_first([model.scene_cameras[n] for n in model.train])[0]
+    assert middle is not model.scene_cameras[model.train[0]]
+    np.testing.assert_array_equal(server.initial_camera.position, middle.center)
+    client = SimpleNamespace(atomic=contextlib.nullcontext, camera=SimpleNamespace())
+    window.step_into(model.train[0], client)
+    assert not np.allclose(client.camera.position, middle.center)
+    buttons = {getattr(h, "label", None): h for h in server.gui._gui_input_handle_from_uuid.values()}
+    (back,) = buttons["Reset"]._impl.update_cb
+    client.camera.fov = 0.1
+    back(SimpleNamespace(client=client))
+    for name in ("position", "look_at", "fov"):
+        np.testing.assert_allclose(getattr(client.camera, name), getattr(server.initial_camera, name), atol=1e-6)
 
 
 def test_a_browser_gets_the_image_that_it_asks_for(window):

@@ -107,7 +107,7 @@ def make_kernels(tile_size: int):
     Blending = make_struct(wp.float32)
 
     @wp.func_native(source("blend_order.cu", THREADS=THREADS))
-    def order_body(ranges: wp.array(dtype=int), count: int, order: wp.array(dtype=int)): ...
+    def order_body(ranges: wp.array(dtype=int), count: int, places: wp.array(dtype=int), order: wp.array(dtype=int)): ...
 
     @wp.func_native(_source("contributions", tile_size, COLORS))
     def contributions_body(
@@ -122,10 +122,10 @@ def make_kernels(tile_size: int):
     @wp.kernel(**options)
     def order_tiles(
         begin: int, ranges: wp.array(dtype=int), count: int,
-        # outputs
-        order: wp.array(dtype=int),
+        # outputs; the first is scratch
+        places: wp.array(dtype=int), order: wp.array(dtype=int),
     ):  # fmt: skip
-        order_body(ranges, count, order)
+        order_body(ranges, count, places, order)
 
     @wp.kernel(**options)
     def contributions(
@@ -258,8 +258,8 @@ def forward(
     rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
     states = allocator.saved((rows, state * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
-    order = allocator.workspace((count,), torch.int32, device)
-    interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(order)], device, block_dim=THREADS)
+    places, order = (allocator.workspace((count,), torch.int32, device) for _ in range(2))
+    interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(places, order)], device, block_dim=THREADS)
     inputs = [
         settings.struct(tiles.size, wp.float32), chunk, *_floats(projected),
         *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),

@@ -1,8 +1,6 @@
 """Binning of projected Gaussians into tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
 
-import functools
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import torch
@@ -11,9 +9,9 @@ import warp as wp
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.errors import ResourceError
 from warpgs.kernels import tiles_emit_cpu
-from warpgs.kernels.native import make_functions as make_native
 from warpgs.kernels.project_cpu import LANES
-from warpgs.kernels.tiles_emit import make_emit, make_find_ranges
+from warpgs.kernels.tiles_emit import EACH, make_emit, make_find_ranges
+from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries, sums_fit
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
@@ -24,10 +22,6 @@ LIST_BYTES = 20
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 """Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
-VISIBLE = 2**36
-"""Number that a visible Gaussian adds to a running sum of tile counts, so that one sum counts both."""
-MAX_VISIBLE = 2**63 // VISIBLE - 1
-"""Most visible Gaussians that such a sum can count."""
 MAX_INSTANCES = interop.MAX_SIZE // 2
 """Most instances: a radix sort needs one array of twice that size."""
 
@@ -131,121 +125,23 @@ def step_bytes(sizes: StepSizes) -> Needs:
     return {BINNING: ranges + sorting + lists, LOSS: waiting, BLENDING: ranges + kept, SAMPLING: ranges + lists}
 
 
-@functools.cache
-def make_kernels(real, native: bool):
-    """Make the kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for a warp's 32 items."""
-    lanes, per = make_native() if native else None, wp.constant(32 if native else 1)
-    module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
-
-    @wp.kernel(enable_backward=False, module=module)
-    def depth_keys(
-        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
-        # outputs
-        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        ids[i] = i
-        if tile_counts[i] > 0:
-            keys[i] = projected[i, 9]
-        else:
-            keys[i] = real(wp.inf)
-
-    @wp.kernel(enable_backward=False, module=module)
-    def pack_counts(
-        begin: int, tile_counts: wp.array(dtype=int),
-        # outputs
-        packed: wp.array(dtype=wp.int64),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        own = wp.int64(0)
-        if i < tile_counts.shape[0] and tile_counts[i] > 0:
-            own = wp.int64(VISIBLE) + wp.int64(tile_counts[i])
-        if wp.static(native):
-            own = lanes.whole_sum(own)
-        if i < tile_counts.shape[0] and i % per == 0:
-            packed[i // per] = own
-
-    @wp.kernel(enable_backward=False, module=module)
-    def visible_keys(
-        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
-        limit: int,
-        # outputs
-        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        count = tile_counts.shape[0]
-        seen = wp.where(i < count and tile_counts[i] > 0, 1, 0)
-        after = int(0)  # the visible ones that the sum has behind this one
-        if wp.static(native):
-            rank = lanes.running_sum(seen)
-            after = lanes.broadcast(rank, 31) - rank
-        if i < count:
-            passed = int(packed[i // per] / wp.int64(VISIBLE)) - after  # visible ones up to this one
-            j = passed - 1
-            key = real(wp.inf)
-            if seen == 1:
-                key = projected[i, 9]
-            else:  # behind all visible ones, as far as there is room
-                j = int(packed[packed.shape[0] - 1] / wp.int64(VISIBLE)) + i - passed
-            if j < limit:
-                keys[j] = key
-                ids[j] = i
-
-    @wp.kernel(enable_backward=False, module=module)
-    def ordered_counts(
-        begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
-        # outputs
-        counts: wp.array(dtype=wp.int64),
-    ):  # fmt: skip
-        j = begin + wp.tid()
-        counts[j] = wp.int64(tile_counts[order[j]])
-
-    return SimpleNamespace(
-        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts
-    )  # fmt: skip
-
-
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
     """Raise ResourceError where the instances exceed the budget, or what kernels can number."""
     needed = total * BYTES_PER_INSTANCE
     # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
-    countable = total <= MAX_INSTANCES and visible <= MAX_VISIBLE
+    countable = total <= MAX_INSTANCES
     if countable and budget_bytes is None and needed < installed_bytes(device) // 20:
         return
     budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
     if countable and needed <= budget:
         return
-    limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances of {MAX_VISIBLE:,} Gaussians"
+    limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances"
     raise ResourceError(
         f"binning {visible:,} visible Gaussians into tiles makes {total:,} (Gaussian, tile) instances, "
         f"{total / max(visible, 1):.0f} of {tiles} tiles each on average, which needs {needed / 2**30:.2f} GiB; the limit is "
         f"{limit}. Many Gaussians are probably far too large: check their scales, or render smaller images, fewer cameras "
         "at once, or raise the memory budget."
     )
-
-
-def running_counts(
-    counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
-) -> torch.Tensor:  # fmt: skip
-    """Return running sums of tile counts and visible Gaussians in one, int64, shape [S]: `split_sum` takes the last apart.
-
-    Args:
-        counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
-        real: Scalar type of the Gaussians, of Warp.
-        allocator: Provider of the sums' memory, which is workspace.
-        out: Sums of as many counts, shape [S], whose memory is taken instead; None for new memory.
-    """
-    device, count, native = counts.device, len(counts), counts.is_cuda
-    sums, threads = (-(-count // 32), -(-count // 256) * 256) if native else (count, count)
-    packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
-    kernel = make_kernels(real, native).pack_counts
-    interop.launch(kernel, threads, [interop.view(counts, wp.int32), interop.view(packed, wp.int64)], device)
-    return torch.cumsum(packed, 0, out=packed)
-
-
-def split_sum(total: int) -> tuple[int, int]:
-    """Return the number of visible Gaussians and of instances in the last of the `running_counts`."""
-    return divmod(total, VISIBLE)
 
 
 def _depth_order(
@@ -266,20 +162,21 @@ def _depth_order(
         if memory.visible is not None:
             packed, visible = memory.visible
     else:
-        if count * tiles >= VISIBLE or count > MAX_VISIBLE:
+        if not sums_fit(count, tiles):
             many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
             _check_total(*reversed(many.tolist()), device, tiles, memory.budget)
         # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
         packed = running_counts(counts, real, memory.allocator)
-        visible, total = split_sum(int(packed[-1]))
+        visible, total = split_sum(int(packed[-1]), count)
         _check_total(total, visible, device, tiles, memory.budget)
     depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
     depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
     if packed is None:
         interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
     else:
-        inputs = [projected_view, counts_view, interop.view(packed, wp.int64), visible, depths_view, order_view]
-        interop.launch(k.visible_keys, -(-count // 256) * 256 if native else count, inputs, device)
+        sums_view, bits = interop.view(packed, wp.int64), sum_bits(count)
+        inputs = [projected_view, counts_view, sums_view, bits, visible, depths_view, order_view]
+        interop.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
     interop.sort_pairs(depths_view, order_view, visible)
     return order, visible, total
 
@@ -303,7 +200,8 @@ def _sort_by_tile(
     keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
     interop.sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
     inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
-    interop.launch(make_find_ranges(slotted), total, inputs, keys.device)
+    native = keys.is_cuda
+    interop.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)
     return ids
 
 
@@ -328,7 +226,7 @@ def bin_tiles(
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
-            there are 2^31 tiles or 2^27 visible Gaussians or more.
+            there are 2^31 tiles or more.
         TypeError: A scalar type is neither float32 nor float64.
         ValueError: A shape disagrees.
     """
@@ -346,7 +244,7 @@ def bin_tiles(
         ends = _slot_ends(order, counts, visible, make_kernels(real, native).ordered_counts, allocator)
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
         owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
-        if memory.capacity is not None:
+        if memory.capacity is not None and not native:  # the kernel of CUDA writes what is left of the capacity
             keys[:total].fill_(no_tile)
         overflow = starts if memory.capacity is None else memory.overflow
         inputs = [

@@ -7,32 +7,58 @@ import warp as wp
 from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 
+EACH = 4
+"""Items that a thread of short kernels takes on CUDA: to load one alone, it would wait longer than it works."""
+
 
 @functools.cache
-def make_find_ranges(slotted: bool):
-    """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`."""
+def make_find_ranges(slotted: bool, native: bool):
+    """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`.
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.ranges.{int(slotted)}")
+    A thread takes `EACH` instances on CUDA (``native``), else one. They lie far apart, so that neighbours of a warp read
+    neighbours.
+    """
+    each = wp.constant(EACH if native else 1)
+    ints = wp.types.vector(each, wp.int32)
+    module = f"warpgs.kernels.tiles.ranges.{int(slotted)}.{int(native)}"
+
+    @wp.kernel(enable_backward=False, module=module)
     def find_ranges(
         begin: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int), count: int,
         no_tile: int,
         # outputs; ranges zero on entry
         ids: wp.array(dtype=int), ranges: wp.array2d(dtype=int),
     ):  # fmt: skip
-        i = begin + wp.tid()
-        tile = keys[i]
-        slot = slots[i]  # loaded before its tile is known, like the neighbours: the waits overlap
-        before = keys[wp.max(i - 1, 0)]
-        after = keys[wp.min(i + 1, count - 1)]
-        if tile == no_tile:
-            ids[i] = 0
-            return
+        first = begin + wp.tid()
+        apart = (count + each - 1) // each
+        tile = ints()
+        before = ints()
+        after = ints()
+        owner = ints()
+        # all is loaded before anything is used or stored: the waits overlap
+        for k in range(wp.static(each)):
+            i = wp.min(first + k * apart, count - 1)
+            tile[k] = keys[i]
+            before[k] = keys[wp.max(i - 1, 0)]
+            after[k] = keys[wp.min(i + 1, count - 1)]
+            if wp.static(slotted):
+                owner[k] = slots[i]
         if wp.static(slotted):
-            ids[i] = owners[slot]
-        if i == 0 or before != tile:
-            ranges[tile, 0] = i
-        if i == count - 1 or after != tile:
-            ranges[tile, 1] = i + 1
+            for k in range(wp.static(each)):
+                if tile[k] != no_tile:
+                    owner[k] = owners[owner[k]]
+        for k in range(wp.static(each)):
+            i = first + k * apart
+            if i < count:
+                if tile[k] == no_tile:
+                    ids[i] = 0
+                else:
+                    if wp.static(slotted):
+                        ids[i] = owner[k]
+                    if i == 0 or before[k] != tile[k]:
+                        ranges[tile[k], 0] = i
+                    if i == count - 1 or after[k] != tile[k]:
+                        ranges[tile[k], 1] = i + 1
 
     return find_ranges
 
@@ -59,7 +85,8 @@ def make_write(slotted: bool):
 def make_emit(real, slotted: bool):
     """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `tiles_emit_cpu`).
 
-    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes.
+    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. What is left of the capacity is marked
+    as no tile's.
 
     Args:
         real: wp.float32 or wp.float64.
@@ -153,5 +180,10 @@ def make_emit(real, slotted: bool):
         while slot < end:
             write(slot, no_tile, i, keys, slots, owners)
             slot += 1
+        if j < count:  # what is left of the capacity is no tile's
+            slot = j + int(wp.min(ends[count - 1], wp.int64(capacity)))
+            while slot < capacity:
+                keys[slot] = no_tile
+                slot += count
 
     return emit

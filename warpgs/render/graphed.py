@@ -22,16 +22,8 @@ import warp as wp
 from warpgs.kernels import blend, project
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import (
-    BYTES_PER_INSTANCE,
-    VISIBLE,
-    InstanceMemory,
-    Tiles,
-    Visible,
-    grid,
-    running_counts,
-    split_sum,
-)
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid
+from warpgs.kernels.tiles_order import running_counts, split_sum, sums_fit
 from warpgs.render.compose import composite_into
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
@@ -139,7 +131,7 @@ class GraphedRasterizer:
             images = _blended(projected, backgrounds, self, projection[1], images, block)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
-        self.needed = Capacity(*split_sum(int(self._total[0])))
+        self.needed = Capacity(*split_sum(int(self._total[0]), projection[1].numel()))
         if not self.needed.within(self.capacity):
             return None
         self.rendered += 1
@@ -349,7 +341,7 @@ def call_key(
     """
     means, viewmats = inputs.means, inputs.viewmats
     projected, tiles = len(means) * len(viewmats), math.prod(grid(*settings.window[2:], settings.tile_size))
-    small = 0 < projected <= MAX_PROJECTED and projected * tiles < VISIBLE  # the sums hold every count
+    small = 0 < projected <= MAX_PROJECTED and sums_fit(projected, tiles)
     fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
         return None

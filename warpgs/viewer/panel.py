@@ -36,6 +36,9 @@ class Shown(Protocol):
     def step_into(self, name: str, client: Any) -> None:
         """Move a browser's camera to one of the model."""
 
+    def reset(self, client: Any) -> None:
+        """Move a browser's camera back to where pages start."""
+
     def camera_of(self, client: Any, side: int | None = None) -> Camera:
         """Return a browser's camera."""
 
@@ -113,6 +116,8 @@ class Panel:
                     self.window.step_into(names[chooser.value], event.client)
 
             chooser.on_update(guarded(step))
+        reset = self.server.gui.add_button("Reset", hint="back to where the page started")
+        reset.on_click(guarded(lambda event: self.window.reset(event.client)))
 
     def _add_sampling(self) -> None:
         """Offer the fit's own image of where fine Gaussians were placed."""

@@ -15,7 +15,7 @@ from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.callbacks import guarded, said
 from warpgs.viewer.camera_conventions import camera_at, camera_before, distance_ahead, fov_y, wxyz_of
 from warpgs.viewer.content import Content
-from warpgs.viewer.html import place_first_camera, plain_background
+from warpgs.viewer.html import middle_first, place_first_camera, plain_background
 from warpgs.viewer.maps import GAUSSIANS, Maps
 from warpgs.viewer.packing import packed
 from warpgs.viewer.panel import ALL, FINE, Panel
@@ -65,10 +65,10 @@ class Window:
         self._thread.start()
 
     def _first_camera(self) -> Camera:
-        """Return the first training camera, or one before a model without cameras."""
+        """Return the middle training camera, or one before a model without cameras."""
         model = self.content.model
-        names = [*model.train, *model.scene_cameras]
-        return model.scene_cameras[names[0]] if names else camera_before(model.gaussians())
+        cameras = middle_first([model.scene_cameras[n] for n in model.train] or list(model.scene_cameras.values()))
+        return cameras[0] if cameras else camera_before(model.gaussians())
 
     def show(self, content: Content) -> None:
         """Show another state of the model, with the same cameras."""
@@ -126,7 +126,14 @@ class Window:
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
         """Move a browser's camera, or by default all, to a camera of the model, with its field of view."""
-        camera = self.content.model.scene_cameras[name]
+        self._move(self.content.model.scene_cameras[name], client)
+
+    def reset(self, client: viser.ClientHandle | None) -> None:
+        """Move a browser's camera, or by default all, back to where pages start."""
+        self._move(self.first, client)
+
+    def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
+        """Move a browser's camera, or all, to a camera, with its field of view."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = distance_ahead(camera, self.content.model.gaussians())
         for c in [client] if client is not None else list(self.server.get_clients().values()):

@@ -31,9 +31,9 @@ from warpgs.kernels import (
     ssim_cpu,
     ssim_cuda,
     step_buffers,
-    tiles,
     tiles_emit,
     tiles_emit_cpu,
+    tiles_order,
 )
 from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
@@ -55,9 +55,9 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     """
     real = wp.float32
     common = [
-        (tiles.make_kernels(real, cuda).pack_counts, THREADS),
+        (tiles_order.make_kernels(real, cuda).pack_counts, THREADS),
         *(((tiles_emit if cuda else tiles_emit_cpu).make_emit(real, slotted), THREADS) for slotted in (True, False)),
-        *((tiles_emit.make_find_ranges(slotted), THREADS) for slotted in (True, False)),
+        *((tiles_emit.make_find_ranges(slotted, cuda), THREADS) for slotted in (True, False)),
         (knn.make_kernels(real).search, THREADS), (dropout.make_kernel(), THREADS),
         (camera_reach.make_kernel(), THREADS), (opacity_decay.make_kernel(), THREADS),
         (step_buffers.make_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),

@@ -1,0 +1,90 @@
+"""Held-out errors by the number of training views that saw a pixel, under two settings and over seeds, with a picture.
+
+--picture draws the parts of held-out views with the largest error that no training view saw, from the fits of the first seed;
+their renders lie in --work. Rows that --out holds are kept when the command is given again.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import sys
+from pathlib import Path
+
+from bench.lib.arguments import parse
+from bench.lib.coverage_fits import measure, picture, renders_of
+from bench.lib.one_fit import Fit, compile_all, plan
+from bench.lib.pool import measure_all
+from bench.lib.scenes import made, row_of, shrunk
+from bench.lib.tables import markdown, mean_sd
+from warpgs.errors import WarpgsError
+from warpgs.files import write_bytes
+from warpgs.pipeline.runs.request import choose_device
+
+WHAT = "scores of held-out views by the number of training views that saw each pixel, as warpgs eval --by-coverage gives them"
+BEFORE = "default:method.hier=true,optimizer.opacities_decay=0,loss.smooth_weight=0,steps=3000"
+"""Settings of `default` before decisions 023 and 024, for up to four opaque views."""
+COLUMNS = {"share_of_pixels": "pixels [%]", "share_of_error": "error [%]", "psnr": "PSNR [dB]"}
+"""Columns of the table."""
+
+
+def line(row: dict) -> str:
+    """Return a result in words."""
+    unseen = row["classes"].get("0", {"share_of_pixels": 0, "share_of_error": 0})
+    return (
+        f"{row['psnr']:.2f} dB  SSIM {row['ssim']:.3f}  {row['gaussians']:,} Gaussians; unseen: "
+        f"{100 * unseen['share_of_pixels']:.0f} % of the pixels, {100 * unseen['share_of_error']:.0f} % of the error"
+    )
+
+
+def table(rows: list[dict]) -> str:
+    """Return means over seeds by row, preset and class as a Markdown table."""
+    lines, good = [], [r for r in rows if "error" not in r]
+    for row, preset in dict.fromkeys((r["row"], r["preset"]) for r in good):
+        own = [r["classes"] for r in good if (r["row"], r["preset"]) == (row, preset)]
+        for seen in dict.fromkeys(c for classes in own for c in classes):
+            values = [c[seen] for c in own if seen in c]
+            cells = [mean_sd([(1 if k == "psnr" else 100) * v[k] for v in values], 1 + (k == "psnr")) for k in COLUMNS]
+            lines.append([row, preset, seen, len(values), *cells])
+    return markdown(["row", "preset", "seen by", "fits", *COLUMNS.values()], lines)
+
+
+def draw(path: Path, work: Path, fits: list[Fit], presets: list[str]) -> None:
+    """Write the picture of all rows whose two fits are there."""
+    pairs = {}
+    for row in dict.fromkeys(f.row for f in fits):
+        first = {f.preset: renders_of(work, f) for f in reversed(fits) if f.row == row}
+        if all(first[p].is_file() for p in presets[:2]):
+            pairs[row] = (first[presets[0]], first[presets[1]])
+    if pairs:
+        write_bytes(path, picture(pairs))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print the table and draw the picture; return the exit code."""
+    a = parse(
+        __doc__, arguments, {"data": Path}, ("out", "work"), rows=["fern:3", "horns:3"], presets=[BEFORE, "default"], seeds=3,
+        jobs=1, seconds=math.inf, shrink=1, device="auto", work=Path, out=Path, picture=Path,
+    )  # fmt: skip
+    device = choose_device(a.device)[0]
+    try:
+        rows = {name: shrunk(row_of(name), a.shrink) for name in a.rows}
+        a.work.mkdir(parents=True, exist_ok=True)
+        folders = {name: made(a.data, row, a.work) for name, row in rows.items()}
+        fits = [
+            fit for seed in range(a.seeds) for name, row in rows.items() for preset in a.presets
+            for fit in plan(name, preset, seed, folders[name], (row.split, row.downscale), 0, str(device))
+        ]  # fmt: skip
+        first = functools.partial(compile_all, ("default",), str(device))
+        found = measure_all(functools.partial(measure, a.work), fits, first, a, WHAT, device, line)
+    except WarpgsError as e:
+        print(f"bench.fits.coverage: {e}", file=sys.stderr)
+        return e.exit_code
+    print(table(found))
+    if a.picture:
+        draw(a.picture, a.work, fits, a.presets)
+    return int(any("error" in row for row in found))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

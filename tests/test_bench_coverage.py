@@ -1,0 +1,44 @@
+"""The study on coverage finds the unseen parts with the largest error, and draws them beside the photograph."""
+
+import io
+
+import numpy as np
+from PIL import Image
+
+from bench.lib.coverage_fits import measure, picture, renders_of, worst_parts
+from bench.lib.one_fit import plan
+from warpgs.synthetic.demo import split_spec, write_demo
+
+
+def views(bright: tuple[int, int, int], unseen: tuple[int, int, int]) -> dict:
+    """Return two gray views [30, 48], with a bright square in the render and an unseen one: view, top and left of each."""
+    photo = np.full((2, 30, 48, 3), 90, np.uint8)
+    render, mask = photo.copy(), np.zeros(photo.shape[:3], bool)
+    for array, (i, top, left), value in ((render, bright, 250), (mask, unseen, True)):
+        array[i, top : top + 10, left : left + 16] = value
+    return {"name": np.array(["a.png", "b.png"]), "photo": photo, "render": render, "unseen": mask}
+
+
+def test_the_worst_part_is_unseen_in_both_and_wrong_in_one():
+    """An error that a training view saw does not count, nor one that is unseen in one fit alone."""
+    before, after = views((1, 12, 20), (1, 12, 20)), views((0, 0, 0), (1, 12, 20))
+    assert worst_parts(before, after, 1) == [[1, 20, 12, 16, 10]]
+    after["unseen"][:] = False
+    after["unseen"][0, :5, :5] = before["unseen"][0, :5, :5] = True
+    assert worst_parts(before, after, 2)[0] == [0, 0, 0, 16, 10]
+
+
+def test_a_fit_leaves_its_views_and_the_picture_shows_them(tmp_path):
+    """One row of four cells for each crop; shares of all classes sum to 1."""
+    spec, folder = split_spec(8), str(tmp_path / "scene")
+    write_demo(tmp_path / "scene", views=8, width=64, height=48)
+    files = []
+    for preset in ("default:steps=4,method.hier=true", "default:steps=4"):
+        (fit,) = plan("demo@x", preset, 0, folder, (spec, 1), 0, "cpu")
+        row = measure(tmp_path, fit)
+        files.append(renders_of(tmp_path, fit))
+        assert abs(sum(c["share_of_pixels"] for c in row["classes"].values()) - 1) < 1e-9 and row["steps"] == 4
+    kept = np.load(files[1])
+    assert kept["photo"].shape == kept["render"].shape == (*kept["unseen"].shape, 3) and len(set(files)) == 2
+    with Image.open(io.BytesIO(picture({"demo": (files[0], files[1])}, 1))) as made:
+        assert made.format == "JPEG" and made.width > 4 * made.height / 2
