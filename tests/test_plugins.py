@@ -7,6 +7,7 @@ import pytest
 
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
+from warpgs.pipeline.runs.folder import check_same
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
@@ -134,6 +135,16 @@ def test_a_stored_configuration_imports_nothing(own):
         with pytest.raises(UsageError, match="a class of your own"):
             FitConfig.from_json({**plain, **changes})
     assert not own.with_suffix(".ran").exists() and "own_strategy" not in sys.modules
+
+
+def test_a_run_continues_with_the_code_that_it_began_with(tmp_path):
+    """An edited file, and one that only one of both knows, is named."""
+    same = {key: {} for key in ("fingerprint", "train", "test", "device", "scene")} | {"config": FitConfig().to_json()}
+    check_same(same | {"own_code": {"mine": "a"}}, same | {"own_code": {"mine": "a"}}, tmp_path)
+    check_same(same | {"own_code": {}}, same, tmp_path)  # of a version that did not record it
+    for now, then in (({"mine": "a"}, {"mine": "b"}), ({"mine": "a"}, {}), ({}, {"mine": "a"})):
+        with pytest.raises(UsageError, match="the code of mine was edited since the run in"):
+            check_same(same | {"own_code": now}, same | {"own_code": then}, tmp_path)
 
 
 def test_settings_of_ones_own_travel_through_json(registry, monkeypatch):

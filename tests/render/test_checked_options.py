@@ -1,11 +1,13 @@
 """Options and rules of wrong types or ranges: an error where they are made, which names the field."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 
-from warpgs import RasterizeOptions, Rule
+from tests.gaussians import camera, cloud
+from warpgs import RasterizeOptions, Rule, rasterize
 from warpgs.errors import UsageError
 from warpgs.render.options import SWITCHES, WHOLE_NUMBERS
 
@@ -43,5 +45,31 @@ def test_options_check_their_types():
             with pytest.raises(UsageError, match=f"{name} must be a whole number, not {value!r}"):
                 RasterizeOptions(**{name: value})
         RasterizeOptions(**{name: np.int64(8)})
-    with pytest.raises(UsageError, match="sh_degree must be at least 0, not -1"):
-        RasterizeOptions(sh_degree=-1)
+    for name in ("sh_degree", "memory_budget", "capacity"):
+        with pytest.raises(UsageError, match=f"{name} must be at least 0, not -1"):
+            RasterizeOptions(**{name: -1})
+    for name in ("tile_size", "heaviest"):
+        with pytest.raises(UsageError, match=f"{name} must be a whole number, not None"):
+            RasterizeOptions(**{name: None})
+    for name in ("near", "far"):
+        for value in ("1", True, [1.0]):
+            with pytest.raises(UsageError, match=re.escape(f"{name} must be a number, not {value!r}")):
+                RasterizeOptions(**{name: value})
+    for value in ((0, 0, 16), (0.0, 0, 16, 16), "0 0 16 16", 16):
+        with pytest.raises(UsageError, match=re.escape(f"window must be four whole numbers, not {value!r}")):
+            RasterizeOptions(window=value)
+    RasterizeOptions(near=np.float32(1), far=2, window=[np.int64(0), 0, 16, 16])
+
+
+def test_a_capacity_beyond_what_can_be_numbered_is_refused():
+    """With its bound, before memory is asked for."""
+    g = cloud(1)
+    with pytest.raises(UsageError, match="capacity must be at most 1,073,741,823, not 1,073,741,824"):
+        rasterize(g, camera(37, 30), RasterizeOptions(capacity=2**30))
+
+
+def test_a_background_is_numbers():
+    """Words of the command line are not."""
+    for value in ("white", ["a", "b", "c"], None.__class__):
+        with pytest.raises(TypeError, match=r"background must be numbers, shape \[3\] or \[C, 3\], not"):
+            rasterize(cloud(1), camera(37, 30), RasterizeOptions(background=value))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 import torch
@@ -19,7 +20,11 @@ SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "ab
 """Options that are True or False."""
 
 WHOLE_NUMBERS = ("sh_degree", "tile_size", "heaviest", "memory_budget", "capacity", "max_instances")
-"""Options that are whole numbers, or None for their default."""
+"""Options that are whole numbers; None for the default, but of the tile size and the heaviest."""
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
 
 
 @document_fields
@@ -92,20 +97,29 @@ class RasterizeOptions:
     Choose False where other threads wait for the whole device, as torch.cuda.synchronize does."""
 
     def __post_init__(self) -> None:
-        """Check the types of switches and whole numbers; ranges are checked in `rasterize`.
+        """Check the types of switches and numbers; other ranges are checked in `rasterize`.
 
         Raises:
-            UsageError: An option is of another type, or a degree is none that is stored.
+            UsageError: An option is of another type, or negative.
         """
         for name in SWITCHES:
             if not isinstance(getattr(self, name), (bool, np.bool_)):
                 raise UsageError(f"{name} must be True or False, not {getattr(self, name)!r}")
         for name in WHOLE_NUMBERS:
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer, type(None))):
+            if not (_is_whole(value) or (value is None and name not in ("tile_size", "heaviest"))):
                 raise UsageError(f"{name} must be a whole number, not {value!r}")
-        if self.sh_degree is not None and self.sh_degree < 0:
-            raise UsageError(f"sh_degree must be at least 0, not {self.sh_degree}")
+        for name in ("sh_degree", "memory_budget", "capacity"):
+            if (getattr(self, name) or 0) < 0:
+                raise UsageError(f"{name} must be at least 0, not {getattr(self, name)}")
+        for name in ("near", "far"):
+            value = getattr(self, name)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, Real)):
+                raise UsageError(f"{name} must be a number, not {value!r}")
+        if self.window is not None and not (
+            isinstance(self.window, (tuple, list)) and len(self.window) == 4 and all(map(_is_whole, self.window))
+        ):
+            raise UsageError(f"window must be four whole numbers, not {self.window!r}")
 
     def repeatable(self) -> bool:
         """Return whether calls with these options may be captured as CUDA graphs."""
@@ -119,7 +133,7 @@ class RasterizeOptions:
             self.pixels,
         )
         extra = self.contributions or self.median_depth or self.heaviest or self.absgrad or self.error_bound
-        return self.record and self.deterministic and not extra and all(o is None for o in (*others, self.pixels))
+        return self.record and self.deterministic and not extra and all(o is None for o in others)
 
 
 def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> RenderSettings:

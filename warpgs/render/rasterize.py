@@ -16,7 +16,7 @@ from warpgs.kernels.blend_records import WIDTHS
 from warpgs.kernels.cameras.base import check_camera
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import InstanceMemory
+from warpgs.kernels.tiles import MAX_INSTANCES, InstanceMemory
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
@@ -81,6 +81,8 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError("max_instances must be at least 1 and does not go with a capacity")
     if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
         raise UsageError("pixels do not go with window, contributions and capacity: leave those out")
+    if options.capacity is not None and options.capacity > MAX_INSTANCES:
+        raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
     if options.error_bound and options.capacity is not None:
         raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
     return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
@@ -202,10 +204,15 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     """Return channels [..., D] with their background: one, a batch of them, or None for zeros; ``name`` is its option's.
 
     Raises:
+        TypeError: The background is not numbers.
         ValueError: The shape of the background is another.
     """
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
-    values: torch.Tensor = like.new_zeros(channels) if background is None else torch.as_tensor(background).to(like)
+    try:
+        values = like.new_zeros(channels) if background is None else torch.as_tensor(background)
+    except (RuntimeError, TypeError, ValueError) as e:
+        raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
+    values = values.to(like)
     if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
         raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
     return _Layer(colors, values.expand(len(like), channels) if values.ndim == 1 else values)
