@@ -1,5 +1,6 @@
 """What training views saw of a render, against rays cast through a scene of known shapes; scores split by it."""
 
+import dataclasses
 import json
 import math
 
@@ -9,7 +10,7 @@ import torch
 
 from tests.scenes import photos, ring, three_gaussians
 from warpgs.geometry import look_at
-from warpgs.pipeline.metrics.coverage_map import MAX_COUNT, DepthView, coverage_map, depth_views
+from warpgs.pipeline.metrics.coverage_map import MAX_COUNT, DepthView, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.metrics.coverage_scores import BINS, classes_of, photo_errors, score_by_coverage
 from warpgs.pipeline.metrics.evaluate import score
 from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
@@ -39,6 +40,21 @@ def truly_sees(viewer: Camera, points: np.ndarray) -> np.ndarray:
     t, _ = raycast.cast(still_life(), viewer.center, away / length[:, None])
     inside = (uv >= 0).all(1) & (uv < [viewer.width, viewer.height]).all(1) & (p[:, 2] > 0)
     return inside & (t > 0.999 * length)
+
+
+def test_the_fraction_outside_all_photographs():
+    """Nothing at a photograph's own camera, half beside it; pixels without a surface count where they are asked about."""
+    (camera,) = camera_path(1, 64, 48)
+    depth = torch.full((48, 64), 2.0)
+    wide = dataclasses.replace(camera, width=128, K=camera.K + np.array([[0, 0, 32.0], [0, 0, 0], [0, 0, 0]]))
+    assert fraction_outside(depth, camera, [camera]) == 0
+    assert fraction_outside(torch.full((48, 128), 2.0), wide, [camera]) == 0.5
+    behind = dataclasses.replace(camera, viewmat=np.diag([1, -1, -1, 1.0]) @ camera.viewmat)
+    assert fraction_outside(depth, camera, [behind]) == 1 and fraction_outside(depth, camera, [behind, camera]) == 0
+    depth = torch.zeros(48, 128)
+    assert fraction_outside(depth, wide, [camera]) == 0
+    depth[:, 32:96] = 2.0
+    assert fraction_outside(depth, wide, [camera]) == 0.5 and fraction_outside(depth, wide, [camera], empty=False) == 0
 
 
 def test_counts_are_those_of_cast_rays():

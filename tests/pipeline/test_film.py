@@ -17,7 +17,7 @@ from warpgs.geometry import look_at
 from warpgs.pipeline.films.film import render_film
 from warpgs.pipeline.films.frame_check import FrameCheck
 from warpgs.pipeline.films.keyframes import read_keyframes
-from warpgs.pipeline.films.plan import FilmSettings, plan_film
+from warpgs.pipeline.films.plan import FilmPlan, FilmSettings, plan_film
 from warpgs.pipeline.films.rig import rig_of
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.scene import Normalization
@@ -141,7 +141,39 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     check = FrameCheck(0.0)
     for i in range(40):
         check.look(np.ones((4, 4, 3)), np.full((4, 4), i % 3))
-    assert "numbers 0, 3, 6, 9, 12 and 9 more" in check.notes("")[0]
+    assert "numbers 0, 3, 6, 9, 12 and 9 more" in check.notes("", "")[0]
+
+
+@pytest.mark.parametrize(
+    ("path", "settings", "advice"),
+    [
+        ("auto", {}, None),
+        ("interpolate", {}, None),
+        ("auto", {"size": (160, 32)}, "keep the shape and the field of view of the photographs"),
+        ("spiral", {"fov_y": 1.0}, "keep the shape and the field of view of the photographs"),
+        ("own", {}, "move the cameras nearer to those of the photographs"),
+    ],
+)
+def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, advice):
+    """A film that is wider than the photographs, or leaves them, says so and what to do; others have no such note."""
+    if path == "own":
+        first = model.cameras()["0.png"]
+        aside = [dataclasses.replace(first, viewmat=first.viewmat @ _moved(x)) for x in (0.0, -0.6)]
+        plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "", [])
+    else:
+        plan = plan_film(model, path, FilmSettings(frames=2, **settings))
+    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings()).notes if "no photograph saw" in n]
+    assert len(notes) == (advice is not None)
+    if advice:
+        frames = "1 of 2 frames show over 10% that no photograph saw, numbers 1" if path == "own" else "2 of 2 frames"
+        assert notes[0].startswith(frames) and notes[0].endswith(f"expect smears there; {advice}")
+
+
+def _moved(x: float) -> np.ndarray:
+    """A rigid motion to one side [u]."""
+    motion = np.eye(4)
+    motion[0, 3] = x
+    return motion
 
 
 def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):

@@ -69,7 +69,7 @@ def upright(rig: Rig, camera: Camera) -> Camera:
 
 
 def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np.ndarray]:
-    """Return poses of two turns that open and close again while moving back and in again, all looking at the rig's centre."""
+    """Return poses of two turns that open and close again among the cameras, all looking at the rig's centre."""
     center = np.mean([c.center for c in cameras], axis=0)
     forward = rig.center - center
     depth = math.sqrt((forward * forward).sum())
@@ -81,8 +81,9 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
     spans = [max(0.7 * float(np.abs(matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
     poses = []
     for t in np.arange(frames) / frames:
-        angle, radius, push = 4 * np.pi * t, np.sin(np.pi * t), -0.15 * depth * np.sin(np.pi * t) ** 2
-        eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up) + push * forward
+        # neither nearer, where Gaussians look like needles, nor farther, where the image ends in what no photograph saw
+        angle, radius = 4 * np.pi * t, np.sin(np.pi * t)
+        eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up)
         poses.append(look_at(eye, rig.center, up))
     return poses
 
@@ -117,7 +118,7 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
     Args:
         kind: ``turntable``: a level circle at the cameras' distance and elevation, or a swing through their range and back
             where they stand on one side; in a room a turn on the spot. ``spiral``: two turns that rise and fall; of cameras
-            that look to one side, two turns that open and close again while moving in and out.
+            that look to one side, two turns that open and close again.
         rig: How the training cameras stand.
         cameras: Training cameras, at least one.
         frames: Number of cameras.

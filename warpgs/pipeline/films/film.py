@@ -16,7 +16,7 @@ from warpgs.errors import UsageError
 from warpgs.files import make_folder, write_bytes
 from warpgs.pipeline.films.frame_check import FrameCheck
 from warpgs.pipeline.films.plan import FilmPlan, FilmSettings, plan_film
-from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views
+from warpgs.pipeline.metrics.coverage_map import MIN_ALPHA, DepthView, coverage_map, depth_views, fraction_outside
 from warpgs.pipeline.metrics.coverage_scores import classes_of
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.render.options import RasterizeOptions
@@ -26,7 +26,7 @@ from warpgs.report.film import SUFFIXES, write_film
 from warpgs.report.images import frame_sheet, png, straight_alpha
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
-from warpgs.scene import Camera, Render, View
+from warpgs.scene import Camera, View
 
 FILM = "film.mp4"
 SHEET = "sheet.png"
@@ -43,9 +43,9 @@ def _training_depths(model: FittedModel, views: bool | Sequence[View], options: 
     return depth_views(model.gaussians(), cameras, options, masks)
 
 
-def _covered(image: np.ndarray, render: Render, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
+def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
     """Return the PNG of an image [H, W, 3] that marks regions seen by no training view, and by one."""
-    seen = coverage_map(torch.where(render.alpha >= MIN_ALPHA, render.depth, 0), camera, training)
+    seen = coverage_map(depth, camera, training)
     classes = classes_of(seen, cut_out)
     return png(coverage_image(image, classes["0"], classes["1"]))
 
@@ -84,17 +84,41 @@ def sheet_path(out: Path) -> Path:
     return out.with_name(f"{out.stem}-{SHEET}") if out.suffix.lower() in SUFFIXES else out / SHEET
 
 
-def _renders(
-    model: FittedModel, plan: FilmPlan, options: RasterizeOptions, tell: Callable[[str], object] | None
-) -> Iterator[tuple[np.ndarray, Render]]:
-    """Render the frames of a plan; gives the image [H, W, 3] of each, and its render."""
-    gaussians = model.gaussians()
+def _frames(
+    model: FittedModel, plan: FilmPlan, files: Sequence[Path], settings: FilmSettings, coverage: bool | Sequence[View],
+    check: FrameCheck, tell: Callable[[str], object] | None,
+) -> Iterator[np.ndarray]:  # fmt: skip
+    """Render the frames of a plan, look at each, and write its images; gives each image [H, W, 3].
+
+    Args:
+        model: The model.
+        plan: The frames.
+        files: File of each frame's image; none to write no images.
+        settings: Settings of the film.
+        coverage: As in `render_path`; the images lie in a subfolder beside ``files``.
+        check: Looks at the frames.
+        tell: Takes a line on each frame before it is rendered.
+    """
+    gaussians, options = model.gaussians(), model.options()
+    if settings.background is not None:
+        options = dataclasses.replace(options, background=gaussians.means.new_tensor(settings.background))
+    straight = model.transparent and settings.background is None
+    photographs = [model.cameras()[n] for n in model.train]
+    training = _training_depths(model, coverage, options) if coverage else None
+    cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
     for i, (_, camera) in enumerate(plan.cameras):
         if tell is not None:
             tell(f"rendering: {i + 1} of {len(plan.cameras)} frames")
         with torch.no_grad():
             r = rasterize(gaussians, camera, options)
-        yield r.rgb.cpu().numpy(), r
+        image, alpha = r.rgb.cpu().numpy(), r.alpha.cpu().numpy()
+        surface = torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
+        check.look(image, alpha, fraction_outside(surface, camera, photographs, not model.transparent))
+        if files:
+            write_bytes(files[i], png(straight_alpha(image, alpha, model.background) if straight else image))
+        if training is not None:
+            write_bytes(files[i].parent / COVERAGE / files[i].name, _covered(image, surface, camera, training, cut_out))
+        yield image
 
 
 def _older_images(folder: Path, files: list[Path]) -> list[str]:
@@ -131,25 +155,13 @@ def render_film(
     """
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
-    options = model.options()
-    if settings.background is not None:
-        options = dataclasses.replace(options, background=model.gaussians().means.new_tensor(settings.background))
-    check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)
-    training = _training_depths(model, coverage, options) if coverage else None
-    cut_out = isinstance(coverage, Sequence) and any(v.alpha is not None for v in coverage)
-    in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
     left = [] if alone else _older_images(folder, files)
+    check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)
+    in_sheet = {i * count // SHEET_FRAMES for i in range(SHEET_FRAMES)} if sheet else set()
 
     def images() -> Iterator[np.ndarray]:
-        for i, (image, r) in enumerate(_renders(model, plan, options, tell)):
-            alpha = r.alpha.cpu().numpy()
-            check.look(image, alpha)
-            if files:
-                straight = model.transparent and settings.background is None
-                write_bytes(files[i], png(straight_alpha(image, alpha, model.background) if straight else image))
-            if training is not None:
-                write_bytes(out / COVERAGE / files[i].name, _covered(image, r, plan.cameras[i][1], training, cut_out))
+        for i, image in enumerate(_frames(model, plan, files, settings, coverage, check, tell)):
             if i in in_sheet:
                 chosen.append(image)
             yield image
@@ -157,7 +169,7 @@ def render_film(
             tell(f"writing {film.name}")
 
     with hold_folder(folder, *([] if alone else [COVERAGE])) as notes:
-        if training is not None:
+        if coverage:
             make_folder(out / COVERAGE)
         if one_size:
             write_film(film, images(), settings.fps)
@@ -165,7 +177,8 @@ def render_film(
             collections.deque(images(), maxlen=0)
         if sheet:
             write_bytes(sheet_path(out), png(frame_sheet(chosen)))
-    return RenderedPath([*files, film] if one_size else files, [*notes, *plan.notes, *check.notes(plan.remedy), *left])
+    notes = [*notes, *plan.notes, *check.notes(plan.remedy, plan.nearer), *left]
+    return RenderedPath([*files, film] if one_size else files, notes)
 
 
 def render_path(

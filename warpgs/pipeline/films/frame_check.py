@@ -1,4 +1,4 @@
-"""Frames of a film that show nothing, noticed while they are rendered."""
+"""Frames of a film that show nothing, or what no photograph saw, noticed while they are rendered."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ MIN_COVERAGE = 0.002
 """Mean alpha below which any frame shows nearly nothing."""
 BLACK = 1 / 255
 """Mean of the brightest channel below which a frame is black."""
+
+OUTSIDE = 0.1
+"""Fraction of a frame that lies outside all photographs above which it gets a note."""
 
 
 def _ranges(numbers: list[int]) -> str:
@@ -38,24 +41,29 @@ class FrameCheck:
     """Numbers of the frames that show nearly nothing."""
     black: list[int] = field(default_factory=list)
     """Numbers of the other frames that are black."""
+    outside: list[int] = field(default_factory=list)
+    """Numbers of the other frames of which more than `OUTSIDE` lies outside all photographs."""
     count: int = 0
     """Number of frames looked at."""
 
-    def look(self, image: np.ndarray, alpha: np.ndarray) -> None:
-        """Look at the next frame, image [H, W, 3] and alpha [H, W] in [0, 1]."""
+    def look(self, image: np.ndarray, alpha: np.ndarray, outside: float = 0.0) -> None:
+        """Look at the next frame: image [H, W, 3] and alpha [H, W] in [0, 1], and its fraction outside all photographs."""
         if float(alpha.mean(dtype=np.float64)) < max(EMPTY * self.coverage, MIN_COVERAGE):
             self.empty.append(self.count)
         elif float(image.max(2).mean(dtype=np.float64)) < BLACK:
             self.black.append(self.count)
+        elif outside > OUTSIDE:
+            self.outside.append(self.count)
         self.count += 1
 
-    def notes(self, remedy: str) -> list[str]:
-        """Return a line for the user on each fault, with what to do."""
+    def notes(self, remedy: str, nearer: str) -> list[str]:
+        """Return a line for the user on each fault, with what to do; ``nearer`` for frames that show other places too."""
         return [
             f"{len(numbers)} of {self.count} frames {words}, numbers {_ranges(numbers)}: {advice}"
             for numbers, words, advice in (
                 (self.empty, "show nearly nothing", f"the path leaves the captured area; {remedy}"),
                 (self.black, "are black", f"the camera is inside geometry, or the scene is unlit; {remedy}"),
+                (self.outside, f"show over {OUTSIDE:.0%} that no photograph saw", f"expect smears there; {nearer}"),
             )
             if numbers
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,6 +31,10 @@ VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 MIN_FRAMES_PER_VIEW = 4
 """Frames from one training view to the next; where a film has fewer, it passes through some of the views only."""
 MAX_FRAMES = 1_000_000
+WIDER = 1.02
+"""Field of a film's image above which it is wider than the photographs, as a fraction of theirs."""
+EMPTY_VIEW = "the model shows nothing there: `warpgs eval` scores each view"
+"""Advice for training views that show nothing."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,8 @@ class FilmPlan:
     """Advice for frames that show nothing."""
     notes: list[str]
     """Lines for the user on the choices made."""
+    nearer: str = "move the cameras nearer to those of the photographs"
+    """Advice for frames that show places outside the photographs."""
 
 
 @torch.no_grad()
@@ -153,26 +160,40 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
             raise UsageError("--path views gives one image for each view; leave out --frames and --seconds")
         names = image_names(scene)
         shown = [(names[n], framed(c, settings.size, settings.fov_y)) for n, c in scene.items()]
-        return FilmPlan(shown, coverage, "the model shows nothing there: `warpgs eval` scores each view", [])
+        return FilmPlan(shown, coverage, EMPTY_VIEW, [], _nearer([c for _, c in shown], train, "--coverage marks these places"))
     rig = rig_of(train, depth)
     if path.lower().endswith(".json"):
         cameras, words = _keyframes(model, Path(path), rig, train[0], settings)
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
-        return FilmPlan(_numbered(cameras), coverage, remedy, [words])
+        nearer = _nearer(cameras, train, "move the keyframes nearer to the photographs' cameras")
+        return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
     notes = [f"{len(train)} training cameras look {rig.describe()}"]
     if rig.turned:
         notes.append("the photographs lie on their side; the film is upright, by the plane of the cameras")
     kind = path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)
-        remedy = "the model shows nothing there: `warpgs eval` scores each view"
+        remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
     else:
         cameras = camera_path(kind, rig, train, settings.count(SECONDS))
         there_and_back = " there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
         words = f"path {kind}{there_and_back}"
-        remedy = "--path interpolate stays at the training views"
+        remedy = nearer = "--path interpolate stays at the training views"
     cameras = [framed(c, settings.size, settings.fov_y) for c in cameras]
-    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words])
+    return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))
+
+
+def _nearer(cameras: Sequence[Camera], train: Sequence[Camera], path: str) -> str:
+    """Return advice for frames that show places outside the photographs: their shape where the film is wider, else ``path``."""
+    (wide, high), photo = _field(cameras[0]), [_field(c) for c in train]
+    if min(wide, high) > WIDER * min(map(min, photo)) or max(wide, high) > WIDER * max(map(max, photo)):
+        return "keep the shape and the field of view of the photographs"
+    return path
+
+
+def _field(camera: Camera) -> tuple[float, float]:
+    """Return width and height of what a camera sees, as fractions of the depth."""
+    return camera.width / float(camera.K[0, 0]), camera.height / float(camera.K[1, 1])
 
 
 def _numbered(cameras: list[Camera]) -> list[tuple[str, Camera]]:

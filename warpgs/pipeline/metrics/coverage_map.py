@@ -21,6 +21,8 @@ MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface, and so has a depth."""
 MAX_COUNT = 255
 """Largest count of views that is stored."""
+GRID = 32
+"""Points along the longer side of an image that `fraction_outside` looks at."""
 MAX_PIXELS = 2**26
 """Most pixels of all depth maps that are held at a time, 256 MiB; with more the maps are rendered smaller."""
 
@@ -183,3 +185,36 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
         counts += difference <= tolerance
         least = torch.minimum(least, difference)
     return Coverage(counts.clamp_max(MAX_COUNT).to(torch.uint8), least, depth <= 0)
+
+
+def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
+    """Return the fraction of a render's pixels that show a point outside the images of all photographs, in steps of a grid.
+
+    Unlike `coverage_map` it renders nothing, and counts points that another surface hides as seen.
+
+    Args:
+        depth: z-depth of the render [u], 0 where there is no surface, shape [H, W].
+        camera: Camera of the render, a pinhole; arrays of numpy.
+        photographs: Cameras of the photographs; for one with a lens, the pinhole of the same K stands.
+        empty: Whether pixels without a surface count, as at the median depth of the others.
+
+    Raises:
+        UsageError: A camera is orthographic.
+    """
+    small = _resized(camera, min(1.0, GRID / max(camera.width, camera.height)))
+    rows, columns = (
+        ((torch.arange(few, device=depth.device) + 0.5) * (many / few)).long()
+        for few, many in ((small.height, camera.height), (small.width, camera.width))
+    )
+    points = depth[rows][:, columns].cpu()
+    shown = points > 0
+    if not shown.any():
+        return 0.0
+    outside = torch.ones_like(shown) if empty else shown
+    points = torch.where(shown, points, points[shown].median())
+    for other in sorted(photographs, key=lambda c: float(np.linalg.norm(c.center - camera.center))):
+        u, v, z = _seen_from(points, small, pinhole_of(other))
+        outside = outside & ~((z > NEAR) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height))
+        if not outside.any():  # mostly after the nearest few
+            break
+    return float(outside.float().mean())
