@@ -1,8 +1,9 @@
 """Two checkouts in turn on one machine: wall time, start, and held-out PSNR of the whole command `warpgs fit`.
 
-OLD and NEW are folders of the two checkouts; each keeps a kernel cache of its own, filled by a short fit before the first
-round. SCENES are folders, or FOLDER@SPLIT where they are split in different ways. The order of the checkouts changes from round
-to round. Everything from the start of the process to its end counts as wall time.
+OLD and NEW are folders of the two checkouts; each has a kernel cache of its own, filled before the first round. SCENES are
+folders, or FOLDER@SPLIT where they are split in different ways. With several sets of --cores as many scenes run at the same
+time. The order of the checkouts changes from round to round. Everything from the start of the process to its end counts as
+wall time.
 """
 
 from __future__ import annotations
@@ -15,7 +16,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from queue import SimpleQueue
 
 import torch
 
@@ -41,6 +44,12 @@ def environment(checkout: Path, cache: Path, cores: str) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": str(checkout), "WARP_CACHE_PATH": str(cache)} | count
 
 
+def compile_kernels(checkout: Path, env: dict[str, str]) -> None:
+    """Compile all kernels of a fit in a checkout's cache."""
+    words = [sys.executable, "-m", "warpgs", "doctor", "--warm"]
+    subprocess.run(words, cwd=checkout, env=env, capture_output=True, check=True)
+
+
 def timed(words: list[str], checkout: Path, env: dict[str, str], out: Path) -> dict:
     """Run a fit and return its wall time [s] and what its metrics.json tells.
 
@@ -54,6 +63,7 @@ def timed(words: list[str], checkout: Path, env: dict[str, str], out: Path) -> d
         raise RuntimeError(f"{shlex.join(words)} in {checkout} ended with {done.returncode}:\n{done.stderr[-2000:]}")
     m = json.loads((out / "metrics.json").read_text("utf-8"))
     seconds = {k: m["seconds"][k] for k in ("setup", "training", "total")}
+    seconds["compiling"] = m["seconds"].get("compiling", 0.0)
     return {"wall": wall, **seconds, "steps": m["steps"], "psnr": m["test"]["psnr"], "gaussians": m["gaussians"]}
 
 
@@ -84,26 +94,40 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the rounds, print and keep the times; return 0."""
     a = parse(
         __doc__, arguments, {"old": Path, "new": Path, "scenes": [str]}, need=("out",), split="llff:3", downscale=0, rounds=5,
-        cores="0,1", device="cpu", old_flags="", new_flags="", out=Path,
+        cores=["0,1"], device="cpu", old_flags="", new_flags="", out=Path,
     )  # fmt: skip
     rows: list[dict] = []
-    with tempfile.TemporaryDirectory() as work:
-        for turn in range(a.rounds + 1):  # the first fills the kernel caches and is not kept
-            for place in a.scenes if turn else a.scenes[:1]:
-                folder, _, split = place.partition("@")
+    commits = {side: result_file.commit_of(getattr(a, side)) for side in SIDES}
+    free: SimpleQueue[str] = SimpleQueue()
+    for cores in a.cores:
+        free.put(cores)
+    with tempfile.TemporaryDirectory() as work, ThreadPoolExecutor(len(a.cores)) as pool:
+        caches = {side: Path(work, f"cache_{side}") for side in SIDES}
+
+        def pair(turn: int, place: str) -> list[dict]:
+            """Fit a scene with both checkouts, one after the other on the same cores."""
+            folder, _, split = place.partition("@")
+            split, cores, found = split or a.split, free.get(), []
+            try:
                 for side in SIDES if turn % 2 else SIDES[::-1]:
-                    checkout, out = getattr(a, side).resolve(), Path(work, f"{side}{turn}_{len(rows)}")
-                    flags = f"{getattr(a, f'{side}_flags')}{'' if turn else ' --steps 20'}"
-                    scene = str(Path(folder).resolve())
-                    words = command(scene, split or a.split, a.downscale, a.device, flags, out, a.cores)
-                    row = timed(words, checkout, environment(checkout, Path(work, f"cache_{side}"), a.cores), out)
-                    if turn:
-                        name = f"{Path(folder).name} {split or a.split}"
-                        rows.append({"scene": name, "side": side, "round": turn} | row)
-                        print(f"round {turn} {name} {side}: {row['wall']:.1f} s, {row['psnr']:.2f} dB", flush=True)
-                if turn:
-                    commits = {side: result_file.commit_of(getattr(a, side)) for side in SIDES}
-                    result_file.keep(a.out, WHAT, torch.device(a.device), rows, commits=commits)
+                    checkout, out = getattr(a, side).resolve(), Path(tempfile.mkdtemp(dir=work), "run")
+                    flags, scene = getattr(a, f"{side}_flags"), str(Path(folder).resolve())
+                    words = command(scene, split, a.downscale, a.device, flags, out, cores)
+                    row = timed(words, checkout, environment(checkout, caches[side], cores), out)
+                    name = f"{Path(folder).name} {split}"
+                    found.append({"scene": name, "side": side, "round": turn} | row)
+                    print(f"round {turn} {name} {side}: {row['wall']:.1f} s, {row['psnr']:.2f} dB", flush=True)
+            finally:
+                free.put(cores)
+            return found
+
+        for side in SIDES:
+            checkout = getattr(a, side).resolve()
+            compile_kernels(checkout, environment(checkout, caches[side], ""))
+        for turn in range(1, a.rounds + 1):
+            for done in as_completed([pool.submit(pair, turn, place) for place in a.scenes]):
+                rows += done.result()
+                result_file.keep(a.out, WHAT, torch.device(a.device), rows, commits=commits)
     print(summary(rows))
     return 0
 
