@@ -68,10 +68,11 @@ def project_tensors(
         interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
     ]  # fmt: skip
     if _threads_each(means):
-        kernel, tasks, cost = project_cuda.make_forward(real, *settings.variant()), cameras * count, 5
+        kernel, cost = project_cuda.make_forward(real, *settings.variant()), 5
+        tasks = -(-cameras * count // BLOCK) * BLOCK
     else:
         kernel, tasks, cost = project_cpu.make_forward(real, *settings.variant()), cameras * -(-count // LANES), 5 * LANES
-    interop.launch(kernel, tasks, arguments, means.device, cost=cost)
+    interop.launch(kernel, tasks, arguments, means.device, cost=cost, block_dim=BLOCK)
     return projected, tile_counts
 
 

@@ -16,7 +16,9 @@ from warpgs.kernels.project_inputs import PROJECTED_SIZE
 def make_forward(
     real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
 ):  # fmt: skip
-    """Make the forward kernel.
+    """Make the forward kernel. It writes the colours last, which read the most.
+
+    In float32 the Gaussians that touch a tile are dealt to the first threads of each block for that.
 
     Args:
         real: wp.float32, whose rows and coefficients are moved 16 bytes at a time, or wp.float64.
@@ -31,6 +33,7 @@ def make_forward(
     basis = sh.make_functions(real, bases).basis
     vec3 = m.vec3
     color_of = make_color(bases).color if native else None
+    compact = make_native().compact if native else None
     vec12 = wp.types.vector(PROJECTED_SIZE, real)
 
     @wp.func
@@ -47,12 +50,10 @@ def make_forward(
         i: int, n: int, view: m.mat44, K: m.mat33, lens: wp.array(dtype=real),
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
         logit_opacities: wp.array(dtype=real), opacity_factors: wp.array(dtype=real),
-        coefficients: wp.array2d(dtype=m.vec3),
-        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int,
-        tile_size: int, sh_count: int,
+        width: int, height: int, origin_x: int, origin_y: int, window_width: int, window_height: int, tile_size: int,
         near: real, far: real, low_pass: real, alpha_cut: real, square_sigma: real, projected: wp.array2d(dtype=real),
     ):  # fmt: skip
-        """Project Gaussian n; return the number of tiles it touches. Where that is 0 it is culled, and nothing is written."""
+        """Write row i without its colour; return the number of tiles touched. Where that is 0 nothing is written."""
         e = m.ellipse(
             means[n], quats[n], log_scales[n], view, K, lens, real(width), real(height), near, low_pass
         )  # fmt: skip
@@ -82,7 +83,25 @@ def make_forward(
         if tiles == 0:
             return 0
 
-        # last, since it reads the most
+        result = vec12()
+        result[0] = e.pixel[0]
+        result[1] = e.pixel[1]
+        result[2] = factor[0]
+        result[3] = factor[1]
+        result[4] = factor[2]
+        result[5] = opacity
+        result[9] = m.depth_of(e.position)
+        result[10] = half[0]
+        result[11] = half[1]
+        store(projected, i, result)
+        return tiles
+
+    @wp.func
+    def color_one(
+        i: int, n: int, view: m.mat44, means: wp.array(dtype=m.vec3), coefficients: wp.array2d(dtype=m.vec3), sh_count: int,
+        projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+    ):  # fmt: skip
+        """Write the colour of row i; where it is not finite, Gaussian n is culled after all."""
         d = m.direction(means[n], view)
         y = basis(vec3(d[0], d[1], d[2]))
         color = vec3(real(0.5), real(0.5), real(0.5))
@@ -96,24 +115,15 @@ def make_forward(
                 if k < sh_count:
                     color += y[k] * coefficients[n, k]
                     largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
-        if not (m.finite3(color) and largest <= real(LARGEST_COEFFICIENT)):  # the maximum passes a NaN by, the colour has it
-            return 0
-        result = vec12()
-        result[0] = e.pixel[0]
-        result[1] = e.pixel[1]
-        result[2] = factor[0]
-        result[3] = factor[1]
-        result[4] = factor[2]
-        result[5] = opacity
-        for channel in range(3):
-            result[6 + channel] = wp.max(color[channel], real(0.0))
-        result[9] = m.depth_of(e.position)
-        result[10] = half[0]
-        result[11] = half[1]
-        store(projected, i, result)
-        return tiles
+        if m.finite3(color) and largest <= real(LARGEST_COEFFICIENT):  # the maximum passes a NaN by, the colour has it
+            for channel in range(3):
+                projected[i, 6 + channel] = wp.max(color[channel], real(0.0))
+        else:
+            tile_counts[i] = 0
+            store(projected, i, vec12())
 
-    @wp.kernel(enable_backward=False, module=module)
+    # a loop over a grid's strides would hold the arguments in half as many registers again
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def forward(
         begin: int,
         means: wp.array(dtype=m.vec3), quats: wp.array(dtype=m.vec4), log_scales: wp.array(dtype=m.vec3),
@@ -128,17 +138,27 @@ def make_forward(
     ):  # fmt: skip
         i = begin + wp.tid()
         count = means.shape[0]
-        camera = i // count
-        n = i - camera * count
-        tiles = project_one(
-            i, n, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
-            logit_opacities, opacity_factors, coefficients,
-            width, height, origin_x, origin_y, window_width, window_height, tile_size, sh_count,
-            near, far, low_pass, alpha_cut, square_sigma, projected,
-        )  # fmt: skip
-        tile_counts[i] = tiles
-        if tiles == 0:
-            store(projected, i, vec12())
+        seen = int(0)
+        if i < viewmats.shape[0] * count:
+            camera = i // count
+            tiles = project_one(
+                i, i - camera * count, viewmats[camera], Ks[camera], lenses[camera], means, quats, log_scales,
+                logit_opacities, opacity_factors,
+                width, height, origin_x, origin_y, window_width, window_height, tile_size,
+                near, far, low_pass, alpha_cut, square_sigma, projected,
+            )  # fmt: skip
+            tile_counts[i] = tiles
+            if tiles == 0:
+                store(projected, i, vec12())
+            else:
+                seen = 1
+        if wp.static(native):
+            i = compact(i, seen)
+        elif seen == 0:
+            i = -1
+        if i >= 0:
+            view = viewmats[i // count]
+            color_one(i, i % count, view, means, coefficients, sh_count, projected, tile_counts)
 
     return forward
 

@@ -22,7 +22,7 @@ def make_find_ranges(slotted: bool, native: bool):
     ints = wp.types.vector(each, wp.int32)
     module = f"warpgs.kernels.tiles.ranges.{int(slotted)}.{int(native)}"
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def find_ranges(
         begin: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int), count: int,
         no_tile: int,
@@ -109,7 +109,9 @@ def make_emit(real, slotted: bool):
             projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
         )
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}")
+    module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}"
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def emit(
         begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         ends: wp.array(dtype=wp.int64), count: int, per_camera: int,

@@ -32,7 +32,7 @@ def make_kernels(real, native: bool):
     ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)
     module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def depth_keys(
         begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
         # outputs
@@ -45,7 +45,7 @@ def make_kernels(real, native: bool):
         else:
             keys[i] = real(wp.inf)
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def pack_counts(
         begin: int, tile_counts: wp.array(dtype=int), bits: int,
         # outputs
@@ -66,7 +66,7 @@ def make_kernels(real, native: bool):
         if thread % width == 0 and first <= last:
             packed[entry] = own
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def visible_keys(
         begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
         bits: int, limit: int,
@@ -109,7 +109,7 @@ def make_kernels(real, native: bool):
                 ids[j] = i
             passed += (whole >> (8 * k)) & 255
 
-    @wp.kernel(enable_backward=False, module=module)
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def ordered_counts(
         begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         # outputs

@@ -79,7 +79,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
     blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
     own = [
-        (project_cuda.make_forward(wp.float32, CAMERA_MODEL), THREADS),
+        (project_cuda.make_forward(wp.float32, CAMERA_MODEL), BLOCK),
         (project_cuda.make_backward(wp.float32, CAMERA_MODEL), BLOCK),
     ]
     own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
