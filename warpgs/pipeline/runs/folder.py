@@ -169,8 +169,8 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         if now != then:
             if key == "own_code":
                 raise UsageError(
-                    f"--resume: the code of {', '.join(now or then or {})} was edited since the run in {out} began, or its version "
-                    "is not recorded; restore that file, or give a new --out"
+                    f"--resume: the code of {', '.join(now or then or {})} was edited since the run in {out} began, or its "
+                    "version is not recorded; restore that file, or give a new --out"
                 )
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
