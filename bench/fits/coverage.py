@@ -22,8 +22,8 @@ from warpgs.files import write_bytes
 from warpgs.pipeline.runs.request import choose_device
 
 WHAT = "scores of held-out views by the number of training views that saw each pixel, as warpgs eval --by-coverage gives them"
-BEFORE = "default:method.hier=true,optimizer.opacities_decay=0,loss.smooth_weight=0,steps=3000"
-"""Settings of `default` before decisions 023 and 024, for up to four opaque views."""
+BEFORE = "default:method.hier=true,optimizer.opacities_decay=0,loss.smooth_weight=0,init.extrapolate=false,steps=3000"
+"""Settings of `default` before decisions 023, 024 and 026, for up to four opaque views."""
 COLUMNS = {"share_of_pixels": "pixels [%]", "share_of_error": "error [%]", "psnr": "PSNR [dB]"}
 """Columns of the table."""
 

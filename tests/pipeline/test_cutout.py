@@ -13,7 +13,8 @@ from warpgs.kernels.step_buffers import SHIFT
 from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model import init
 from warpgs.pipeline.model.hull import carve, hull_points, in_empty_region, silhouettes
-from warpgs.pipeline.model.init import InitConfig, initial_points, random_points
+from warpgs.pipeline.model.init import InitConfig, initial_points
+from warpgs.pipeline.model.random_points import random_points
 from warpgs.pipeline.runs.failed_step import failed_step, findings
 from warpgs.pipeline.train.background import over, random_shift
 from warpgs.pipeline.train.config import FitConfig

@@ -153,31 +153,31 @@ def test_start_from_confirmed_depth(source):
     """From photographs alone to points on the surfaces, the same every time, with a line per view."""
     views, depths = still_life()
     config = InitConfig(source=source, flow="dis", fill_px=0)
-    cloud, how, _ = initial_points(views, None, config, np.random.default_rng(0))
+    cloud, how, *_ = initial_points(views, None, config, np.random.default_rng(0))
     assert len(cloud) > 1000 and f"by {source}" in how and how.count(" % of pixels") == 3
     pixels, z = project_points(views[1].camera, cloud.points)
     seen = in_image(views[1].camera, cloud.points)
     at = np.floor(pixels[seen]).astype(int)
     ratio = z[seen] / depths[1][at[:, 1], at[:, 0]]
     assert (np.abs(ratio - 1) < 0.03).mean() > 0.6
-    again, _, _ = initial_points(views, None, config, np.random.default_rng(0))
+    again, *_ = initial_points(views, None, config, np.random.default_rng(0))
     assert np.array_equal(cloud.points, again.points)
 
 
 def test_fallbacks_are_said(tmp_path):
     """A single view, flow that knows nothing, and views that see nothing in common: random points, and why."""
     views, _ = still_life()
-    cloud, how, _ = initial_points(views[:1], None, InitConfig(source="sweep", random_count=300), np.random.default_rng(0))
+    cloud, how, *_ = initial_points(views[:1], None, InitConfig(source="sweep", random_count=300), np.random.default_rng(0))
     assert len(cloud) == 300 and "instead of --init.source sweep: a single view" in how
     write_flo(tmp_path / "000-to-001.flo", np.full((120, 160, 2), np.nan, np.float32))
     config = InitConfig(source="flow", flow=str(tmp_path), random_count=300)
-    cloud, how, _ = initial_points(views, None, config, np.random.default_rng(0))
+    cloud, how, *_ = initial_points(views, None, config, np.random.default_rng(0))
     assert len(cloud) == 300 and "only 0 points survived" in how and "no flow to 002.png" in how and "overlap?" in how
     away = [photos(2)[0]]
     turned = np.diag([-1.0, 1, -1, 1]) @ away[0].camera.viewmat
     noise = np.random.default_rng(0).uniform(size=(32, 40, 3)).astype(np.float32)
     away.append(View("back.png", Camera(turned, away[0].camera.K, 40, 32), noise))
-    cloud, how, _ = initial_points(away, None, InitConfig(source="sweep", random_count=300), np.random.default_rng(0))
+    cloud, how, *_ = initial_points(away, None, InitConfig(source="sweep", random_count=300), np.random.default_rng(0))
     assert len(cloud) == 300 and "no depth agrees with back.png" in how
 
 

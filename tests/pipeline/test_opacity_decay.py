@@ -11,7 +11,7 @@ import torch
 
 from tests.tolerances import OPACITY_DECAY
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.by_views import SPARSE_VIEWS, settings_by_views
+from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, SPARSE_VIEWS, settings_by_views
 from warpgs.pipeline.train.opacity_decay import LEAST_LOGIT, decay_opacities
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
@@ -47,7 +47,8 @@ def test_a_step_that_is_not_taken_changes_nothing():
 
 
 @pytest.mark.parametrize(
-    ("views", "alpha", "few"), [(2, None, True), (SPARSE_VIEWS, None, True), (SPARSE_VIEWS + 1, None, False), (3, 1.0, False)]
+    ("views", "alpha", "few"),
+    [(EXTRAPOLATED_VIEWS + 1, None, True), (SPARSE_VIEWS, None, True), (SPARSE_VIEWS + 1, None, False), (3, 1.0, False)],
 )
 def test_few_opaque_views_have_one_layer_and_decay(views, alpha, few):
     """The choice is named; what is given holds."""

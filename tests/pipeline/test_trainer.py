@@ -18,7 +18,8 @@ from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.geometry import look_at
 from warpgs.kernels.knn import morton_codes
 from warpgs.pipeline.metrics.region import counted_region
-from warpgs.pipeline.model.init import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
+from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.pipeline.model.random_points import empty_votes, nearest, random_points
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
@@ -200,7 +201,7 @@ def test_start_falls_back_to_random_and_says_so():
     """Too few points: a random start inside what the cameras see, named; asked for points: an error with a way out."""
     views = photos(4)
     few = PointCloud(np.zeros((3, 3)), np.zeros((3, 3), np.float32))
-    cloud, how, _ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
+    cloud, how, *_ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
     assert len(cloud) == 500 and "500 random points" in how and "only 3 points" in how
     again, *_ = initial_points(views, few, InitConfig(random_count=500), np.random.default_rng(0))
     assert np.array_equal(cloud.points, again.points)

@@ -28,6 +28,11 @@ MIN_KNOWN = 10
 """Known points that a view must hold to bound its depths."""
 
 
+def joined(clouds: Sequence[PointCloud]) -> PointCloud:
+    """Return the points of several clouds as one, without tracks."""
+    return PointCloud(np.concatenate([c.points for c in clouds]), np.concatenate([c.colors for c in clouds]))
+
+
 def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) -> tuple[float, float]:
     """Return the range of depths [u] to search in a view, from known points [N, 3], or ``default`` where it holds too few."""
     _, z = geometry.project_points(view.camera, known)
@@ -185,8 +190,7 @@ def coarse_points(
         filled, _ = _elsewhere(points, widths, *(np.concatenate(a) for a in zip(*filled_in)), fill_px)
     more = f"{len(added):,} from the reconstruction, " if len(added) else ""
     notes.append(f"{len(cloud):,} points from {pixels:,} pixels by {source}, {more}{len(filled):,} filled in")
-    parts = (cloud, added, filled)
-    return PointCloud(np.concatenate([c.points for c in parts]), np.concatenate([c.colors for c in parts])), notes
+    return joined((cloud, added, filled)), notes
 
 
 def _elsewhere(

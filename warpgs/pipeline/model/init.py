@@ -1,4 +1,4 @@
-"""The first Gaussians: from depths that views confirm, from the reconstruction's points, or at random where cameras look."""
+"""The first Gaussians: from depths that views confirm, from the reconstruction's points, or at random."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from warpgs.colors import base_coefficients
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
-from warpgs.pipeline.metrics.region import fitted_region
-from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds
+from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds, joined
+from warpgs.pipeline.model.extrapolation import EXTRAPOLATED_OPACITY, extrapolated_points
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
+from warpgs.pipeline.model.random_points import camera_depths, random_points
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
 from warpgs.priors.flow import RANGES, flow_between
 from warpgs.priors.given_depth import any_given, with_given_depth
@@ -28,16 +29,6 @@ from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
 SOURCES = ("auto", "sweep", "flow", "points", "hull", "random")
 MIN_POINTS = 100
 """Fewest sparse points to start from: fewer leave most of the image empty, and a random start is better."""
-OBJECTS = ("foreground", "object")
-"""Names of the regions of an object (`fitted_region`): on black, and cut out."""
-MIN_MATCHES = 10
-"""Fewest matched points of a view from which its random points take their depths."""
-NEIGHBORS = 5
-"""Matched points that a random pixel takes its depth from."""
-PAIRS = 2**20
-"""Distances that are held at a time while neighbours are searched."""
-DEPTH_SPREAD = 0.1
-"""Standard deviation of the logarithm of depth around a matched point."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +54,10 @@ class InitConfig:
     """sweep, flow: width of the cells in which consistent points become one [px]; 0 keeps one for every pixel."""
     fill_px: float = 16.0
     """sweep, flow: width of the cells of points where no depth is consistent [px]; 0 leaves those places empty."""
+    extrapolate: bool | None = False
+    """sweep, flow: add extrapolated points where no view looks, beyond the images and behind edges of depth
+    (docs/decisions/026-extrapolated-points.md). Then opacity decay spares Gaussians that a step does not use. None: by the
+    number of views."""
     flow: str = "dis"
     """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
@@ -106,110 +101,8 @@ class Start(NamedTuple):
     """Source of the points, for the user."""
     depths: list[ViewDepth] | None = None
     """Geometrically consistent depth of each view; None where none was computed."""
-
-
-def camera_depths(views: list[View]) -> tuple[float, float]:
-    """Return near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
-
-    Cameras in one place with one direction have no such point; then it is one unit, which the scene's scale was chosen for.
-    """
-    focus = geometry.focus_point([v.camera for v in views])
-    distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
-    distance = distance if distance > 1e-3 else 1.0
-    return 0.1 * distance, 10 * distance
-
-
-def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
-    """Return the rows of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
-    known, asked = torch.from_numpy(points), torch.from_numpy(queries)
-    found = []
-    # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
-    for rows in asked.split(max(1, PAIRS // max(1, len(known)))):
-        squares = sum((rows[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
-        found.append(squares.topk(count, largest=False).indices)
-    return torch.cat(found).numpy()
-
-
-class _Depths:
-    """Random depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
-
-    def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
-        seen = geometry.in_image(view.camera, matched.points)
-        pixels, self.known = geometry.project_points(view.camera, matched.points)
-        self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
-        self.has_matches = len(self.known) >= MIN_MATCHES
-
-    def sample(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
-        """Return depths [u] of the first ``wanted`` pixels, shape [wanted].
-
-        Random numbers are sampled for all pixels [N, 2], so that a depth does not depend on how many are wanted.
-        """
-        count = len(pixels)
-        if not self.has_matches:
-            near, far = self.bounds
-            return 1 / generator.uniform(1 / far, 1 / near, size=count)[:wanted]
-        which, spread = generator.integers(NEIGHBORS, size=count), generator.normal(0, DEPTH_SPREAD, count)
-        ids = nearest(self.pixels, pixels[:wanted], NEIGHBORS)
-        return self.known[ids[np.arange(wanted), which[:wanted]]] * np.exp(spread[:wanted])
-
-
-def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
-    """Count the views that see each point [N, 3] over the empty background, int [N]: 0 within the visual hull."""
-    votes = np.zeros(len(points), int)
-    for view, (region, name) in zip(views, regions):
-        if name not in OBJECTS:
-            continue
-        seen, rows, columns, _ = geometry.seen_pixels(view.camera, points)
-        votes[seen] += ~region[rows, columns]
-    return votes
-
-
-def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
-    """Return points behind random pixels of the training views with the pixels' colours, and a sentence on how they were made.
-
-    A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
-    spread by a tenth (docs/decisions/003-random-start.md); any other view samples inverse depths uniformly, and keeps points
-    that a second view sees where there are any. Where views show an object on black, or know their opacity, points start on the
-    object, and those that fewest views see before what is empty come first, so that none lies there.
-
-    Raises:
-        DataError: Masks leave no pixel of any training view.
-    """
-    regions = [fitted_region(v) for v in views]
-    matched = triangulate_matches(views)
-    bounds = camera_depths(views)
-    sources = [_Depths(v, matched, bounds) for v in views]
-    points, colors = [], []
-    for i, (view, source) in enumerate(zip(views, sources)):
-        wanted = (i + 1) * count // len(views) - i * count // len(views)
-        free = np.ones(view.image.shape[:2], bool) if regions[i][0] is None else regions[i][0]
-        rows, columns = np.nonzero(free)
-        if len(rows) == 0:
-            continue
-        chosen = generator.integers(len(rows), size=8 * wanted)
-        rows, columns = rows[chosen], columns[chosen]
-        pixels = np.stack([columns, rows], 1) + 0.5
-        elsewhere = not source.has_matches and len(views) > 1
-        # where none is better than another, the first are taken, and the others need no depth
-        useful = len(pixels) if elsewhere or any(name in OBJECTS for _, name in regions) else wanted
-        candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
-        worse = empty_votes(views, regions, candidates)
-        if elsewhere:
-            worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
-        order = np.argsort(worse, kind="stable")
-        candidates, rows, columns = candidates[order], rows[order], columns[order]
-        points.append(candidates[:wanted])
-        colors.append(view.image[rows[:wanted], columns[:wanted]])
-    if not points:
-        raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
-    with_matches = sum(s.has_matches for s in sources)
-    how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
-    objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
-    if objects:
-        how += f", on the object that {objects} views show on black"
-    if cut_out:
-        how += f", where {cut_out} views are opaque"
-    return PointCloud(np.concatenate(points), np.concatenate(colors)), how
+    extrapolated: int = 0
+    """Number of points, the last ones, that are extrapolated where no view looks."""
 
 
 def consistent_depths(
@@ -254,7 +147,10 @@ def consistent_points(
             views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=source, known=points
         )
         if len(cloud) >= MIN_POINTS:
-            return Start(cloud, "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1]))), depths)
+            extrapolated = extrapolated_points(views, depths) if config.extrapolate else NOTHING
+            notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks" if len(extrapolated) else ""
+            how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
+            return Start(joined((cloud, extrapolated)), how, depths, len(extrapolated))
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
     cloud, how = random_points(views, config.random_count, generator)
     return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
@@ -351,7 +247,8 @@ def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
         return start
     keep = np.sort(generator.permutation(count)[:most])
     how = f"{start.how}\n{most:,} of these {count:,} points, sampled at random: --max-gaussians is {most:,}"
-    return start._replace(cloud=PointCloud(start.cloud.points[keep], start.cloud.colors[keep]), how=how)
+    cloud = PointCloud(start.cloud.points[keep], start.cloud.colors[keep])
+    return start._replace(cloud=cloud, how=how, extrapolated=int((keep >= count - start.extrapolated).sum()))
 
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
@@ -361,7 +258,9 @@ def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
 
 
-def initial_gaussians(cloud: PointCloud, config: InitConfig, sh_degree: int, extent: float, device: torch.device) -> Gaussians:
+def initial_gaussians(
+    cloud: PointCloud, config: InitConfig, sh_degree: int, extent: float, device: torch.device, extrapolated: int = 0
+) -> Gaussians:
     """Return one isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
 
     Args:
@@ -370,6 +269,7 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, sh_degree: int, ext
         sh_degree: Degree of the spherical harmonics, 0 to 4.
         extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
         device: Device of the tensors, float32.
+        extrapolated: Number of points, the last ones, that start with `EXTRAPOLATED_OPACITY`.
 
     Returns:
         The Gaussians.
@@ -384,10 +284,12 @@ def initial_gaussians(cloud: PointCloud, config: InitConfig, sh_degree: int, ext
     sh[:, 0] = base_coefficients(colors)
     quats = points.new_zeros(count, 4)
     quats[:, 0] = 1
+    logits = points.new_full((count,), geometry.logit(config.opacity))
+    logits[count - extrapolated :] = geometry.logit(EXTRAPOLATED_OPACITY)
     return Gaussians(
         means=points,
         quats=quats,
         log_scales=scales.log().to(points.dtype)[:, None].repeat(1, 3),
-        logit_opacities=points.new_full((count,), geometry.logit(config.opacity)),
+        logit_opacities=logits,
         sh=sh,
     )

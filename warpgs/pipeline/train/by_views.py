@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from warpgs.pipeline.model.init import sweeps
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
@@ -32,6 +33,9 @@ SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
 """Weight of the roughness of rendered depth up to so many opaque views, in fits of at least so many steps; else there is no
 such term: it was not measured with alpha, costs decibels with 9 views, and does not pay in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
+EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
+"""Opaque views up to which a fit of at least `SMOOTH_STEPS` steps starts with extrapolated points where no view looks, and the
+decay of opacities with them; neither was measured elsewhere (docs/decisions/026-extrapolated-points.md)."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
@@ -81,8 +85,6 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
     opaque = all(v.alpha is None for v in train)
     few = views <= SPARSE_VIEWS and opaque
-    if optimizer.opacities_decay is None:
-        optimizer = dataclasses.replace(optimizer, opacities_decay=OPACITIES_DECAY if few else 0.0)
     method = config.method
     if method.hier is None:
         method = dataclasses.replace(method, hier=not few)
@@ -111,6 +113,13 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if limit and views > SPARSE_VIEWS:
         rates = {n: float(f"{CPU_RATES * rate:.3g}") for n, rate in rates.items()}
     optimizer = dataclasses.replace(optimizer, **{n: rate for n, rate in rates.items() if getattr(optimizer, n) is None})
+    init = config.init
+    if init.extrapolate is None:
+        extrapolate = opaque and 2 <= views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS and sweeps(init, views)
+        init = dataclasses.replace(init, extrapolate=extrapolate)
+    if optimizer.opacities_decay is None:
+        decay = EXTRAPOLATED_DECAY if init.extrapolate else OPACITIES_DECAY
+        optimizer = dataclasses.replace(optimizer, opacities_decay=decay if few else 0.0)
     loss = config.loss
     if loss.smooth_weight is None:
         smooth = opaque and views <= SMOOTH_VIEWS and steps >= SMOOTH_STEPS
@@ -124,6 +133,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
         f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
         f"smooth_weight {loss.smooth_weight:g}": config.loss.smooth_weight,
+        f"{'extrapolated' if init.extrapolate else 'no'} points where no view looks": config.init.extrapolate,
         "two layers" if method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
@@ -133,6 +143,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if limit:
         notes.append(limit)
     chosen_parts = {
-        "steps": steps, "sh_degree": degree, "half_resolution": half, "optimizer": optimizer, "method": method, "loss": loss,
+        "steps": steps, "sh_degree": degree, "half_resolution": half, "init": init, "optimizer": optimizer, "method": method,
+        "loss": loss,
     }  # fmt: skip
     return dataclasses.replace(config, **chosen_parts), notes

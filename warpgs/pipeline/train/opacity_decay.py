@@ -14,16 +14,17 @@ LEAST_LOGIT = -15.0
 
 
 @torch.no_grad()
-def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor) -> None:
+def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, used: torch.Tensor | None = None) -> None:
     """Take a fraction of every opacity, in place; it may be part of a captured step.
 
     Args:
         logits: Logits of opacities, float32, shape [N].
         fraction: Fraction of an opacity that is taken, in [0, 1); 0 changes nothing.
         going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
+        used: Gaussians whose opacities change, bool, shape [N]; None for all.
     """
     kept = 1 - fraction
     if kept == 1:  # also a fraction below the rounding of float64
         return
     new = torch.where(logits > LEAST_LOGIT, opacity_decay(logits, kept), logits)
-    logits.copy_(torch.where(going, new, logits))
+    logits.copy_(torch.where(going if used is None else going & used, new, logits))

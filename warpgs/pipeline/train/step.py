@@ -57,6 +57,8 @@ class StepPlan:
     """Limits that the step holds every Gaussian to."""
     opacity_decay: float = 0.0
     """Fraction of every opacity that the step takes."""
+    spares_unused: bool = False
+    """True to take none of a Gaussian that the step does not use."""
 
 
 class StepBuffers:
@@ -278,10 +280,7 @@ def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views:
     """Return the sum of the loss terms, the terms of view modules (``of_views`` [] each) and the strategy's term, shape []."""
     values = [*term_values(plan.terms, inputs), *of_views]
     extra = strategy.regularisation(plan.phase, inputs.gaussians)
-    total = values[0]
-    for value in values[1:] if extra is None else [*values[1:], extra]:
-        total = total + value
-    return total
+    return sum(values[1:] if extra is None else [*values[1:], extra], values[0])
 
 
 @torch.no_grad()
@@ -289,10 +288,11 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
     """Update all parameters and columns; nothing changes where ``stop`` [1] is not 0, int32."""
     table, strategy = learned.table, learned.strategy
     count, split = len(table.params), 3 * len(table.params)
-    own, of_views = found.gradients[:count], found.gradients[count:]
-    table.adam_step(dict(zip(table.params, own)), found.lrs[:split], stop, strategy.lr_factors(plan.phase))
+    own, of_views = dict(zip(table.params, found.gradients)), found.gradients[count:]
+    table.adam_step(own, found.lrs[:split], stop, strategy.lr_factors(plan.phase))
     learned.views.table.adam_step(dict(zip(learned.views.table.params, of_views)), found.lrs[split:], stop)
-    decay_opacities(table.params["logit_opacities"].detach(), plan.opacity_decay, found.going)
+    used = own["logit_opacities"] != 0 if plan.spares_unused else None
+    decay_opacities(table.params["logit_opacities"].detach(), plan.opacity_decay, found.going, used)
     strategy.after_step(plan.phase, found.settings, found.going)
     plan.limits.hold(table.params, learned.cameras, found.going)
     for name, value in found.statistics.items():

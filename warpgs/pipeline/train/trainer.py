@@ -14,7 +14,7 @@ import torch
 from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
 from warpgs.kernels.step_buffers import NOT_FINITE, Setting
 from warpgs.pipeline.metrics.psnr import psnr_of
-from warpgs.pipeline.model.init import initial_gaussians, scene_extent
+from warpgs.pipeline.model.init import Start, initial_gaussians, scene_extent
 from warpgs.pipeline.model.scale_limits import TrainingCameras, scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.background import random_shift
@@ -98,16 +98,17 @@ class Trainer:
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
-        self._make_parts(train, cloud, scene_extent(cameras, cloud))
+        self._make_parts(train, made.start, scene_extent(cameras, cloud))
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
         self._begin(with_learned(views, self.learned.views))
 
-    def _make_parts(self, train: list[View], cloud: PointCloud, extent: float) -> None:
+    def _make_parts(self, train: list[View], start: Start, extent: float) -> None:
         """Make the Gaussians, the strategy, the parameters of view modules, and the taker of steps; extent in scene units."""
         c, device = self.config, self.device
         assert c.steps is not None and c.sh_degree is not None  # `settings_by_views` has chosen
-        self.table = Table.of_gaussians(initial_gaussians(cloud, c.init, c.sh_degree, extent, device), {})
+        first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
+        self.table = Table.of_gaussians(first, {})
         self.context = StrategyContext(
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
@@ -168,7 +169,7 @@ class Trainer:
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
         decay = c.optimizer.opacities_decay
         assert decay is not None  # `settings_by_views` has chosen
-        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay)
+        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay, bool(c.init.extrapolate))
 
     def next_view(self) -> int:
         """Return the number of the next view. The order is random; each view comes once before any comes again."""
