@@ -34,8 +34,8 @@ SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
 such term: it was not measured with alpha, costs decibels with 9 views, and does not pay in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
 MIN_GAIN_DB = 0.1
-"""Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: these are too
-few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
+"""Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: they are
+too few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
