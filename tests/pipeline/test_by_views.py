@@ -10,6 +10,8 @@ import pytest
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.by_views import ONE_LAYER, settings_by_views
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.stopping import StoppingConfig
 
 
 @pytest.mark.parametrize("device", ["cpu", "cuda"])
@@ -50,6 +52,23 @@ def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
         for hier in (False, True)
     )
     assert abs(ONE_LAYER * one.steps - two.steps) < 2 and one.steps < two.steps
+
+
+def test_nothing_is_held_out_where_the_time_of_a_cpu_limits_the_steps():
+    """All degrees of the harmonics are in use when growth begins, as with held-out blocks; a gain that is given holds."""
+
+    def chosen(views, device, config=PRESETS["default"]):
+        train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=None)] * views
+        return settings_by_views(config, train, device)[0]
+
+    for views in (3, 12):
+        limited, whole = chosen(views, "cpu"), chosen(views, "cuda")
+        assert limited.stopping.min_gain_db == 0 and whole.stopping.min_gain_db == 0.1
+        assert limited.steps < whole.steps and whole.sh_every == 500
+        assert limited.sh_degree * limited.sh_every <= plan_phases(limited.phases, limited.steps).refine
+    assert chosen(12, "cpu", dataclasses.replace(PRESETS["default"], steps=100)).stopping.min_gain_db == 0.1
+    given = dataclasses.replace(PRESETS["default"], stopping=StoppingConfig(min_gain_db=0.2))
+    assert chosen(12, "cpu", given).stopping.min_gain_db == 0.2 and chosen(12, "cpu", given).sh_every == 500
 
 
 def test_a_fit_on_a_cpu_has_smaller_images_unless_told():

@@ -10,6 +10,7 @@ import math
 
 from warpgs.pipeline.model.init import sweeps
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
@@ -36,6 +37,9 @@ such term: it was not measured with alpha, costs decibels with 9 views, and does
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Opaque views up to which a fit of at least `SMOOTH_STEPS` steps starts with extrapolated points where no view looks, and the
 decay of opacities with them; neither was measured elsewhere (docs/decisions/026-extrapolated-points.md)."""
+MIN_GAIN_DB = 0.1
+"""Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: they are
+too few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
 CPU_PIXELS = 1e6
 """Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
@@ -65,6 +69,25 @@ def cpu_seconds(views: int) -> float:
 def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
     """Return how many pixels so many steps render; views have ``pixels``, and a quarter of them in steps at half size."""
     return steps * pixels * (1 - 0.75 * half_resolution)
+
+
+def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
+    """Return the steps that fit into the time of a CPU, and a sentence for the user; all of them, and none, where they do.
+
+    Args:
+        wanted: Steps of the fit without a limit.
+        views: Number of training views.
+        pixels: Pixels that those steps render, weighed by the time that each takes.
+    """
+    seconds, most = pixels / CPU_PIXELS, cpu_seconds(views)
+    if seconds <= most:
+        return wanted, ""
+    steps = max(1, int(wanted * most / seconds))
+    lost = LOST_DB * math.log2(wanted / steps)
+    return steps, (
+        f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
+        f"--no-cpu-limit takes all, about {seconds / 60:.0f} min, and gains {lost:.1f} dB or more"
+    )
 
 
 def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
@@ -98,17 +121,9 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if wanted is None:
         wanted = min(steps_by_views(views, opaque), config.max_steps)
     steps = wanted
-    if config.steps is None:
-        pixels = max(v.camera.width * v.camera.height for v in train)
-        seconds = pixels_of_steps(config.batch * wanted, half, pixels) / CPU_PIXELS * (1.0 if method.hier else ONE_LAYER)
-        if device == "cpu" and config.cpu_limit and seconds > cpu_seconds(views):
-            most = cpu_seconds(views)
-            steps = max(1, int(wanted * most / seconds))
-            lost = LOST_DB * math.log2(wanted / steps)
-            limit = (
-                f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
-                f"--no-cpu-limit takes all, about {seconds / 60:.0f} min, and gains {lost:.1f} dB or more"
-            )
+    if config.steps is None and config.cpu_limit and device == "cpu":
+        pixels = config.batch * max(v.camera.width * v.camera.height for v in train)
+        steps, limit = steps_on_cpu(wanted, views, pixels_of_steps(wanted, half, pixels) * (1.0 if method.hier else ONE_LAYER))
     rates = {"means_lr": MEANS_LR, "sh_lr": SH_LR}
     if limit and views > SPARSE_VIEWS:
         rates = {n: float(f"{CPU_RATES * rate:.3g}") for n, rate in rates.items()}
@@ -120,6 +135,11 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if optimizer.opacities_decay is None:
         decay = EXTRAPOLATED_DECAY if init.extrapolate else OPACITIES_DECAY
         optimizer = dataclasses.replace(optimizer, opacities_decay=decay if few else 0.0)
+    stopping, sh_every = config.stopping, config.sh_every
+    if stopping.min_gain_db is None:
+        stopping = dataclasses.replace(stopping, min_gain_db=0.0 if limit else MIN_GAIN_DB)
+        if limit and degree:  # as with held-out blocks, all degrees are in use when growth begins
+            sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
     loss = config.loss
     if loss.smooth_weight is None:
         smooth = opaque and views <= SMOOTH_VIEWS and steps >= SMOOTH_STEPS
@@ -134,6 +154,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
         f"smooth_weight {loss.smooth_weight:g}": config.loss.smooth_weight,
         f"{'extrapolated' if init.extrapolate else 'no'} points where no view looks": config.init.extrapolate,
+        "held-out blocks" if stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,
         "two layers" if method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
@@ -145,5 +166,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     chosen_parts = {
         "steps": steps, "sh_degree": degree, "half_resolution": half, "init": init, "optimizer": optimizer, "method": method,
         "loss": loss,
+        "steps": steps, "sh_degree": degree, "half_resolution": half, "optimizer": optimizer, "method": method, "loss": loss,
+        "stopping": stopping, "sh_every": sh_every,
     }  # fmt: skip
     return dataclasses.replace(config, **chosen_parts), notes

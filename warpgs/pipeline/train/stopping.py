@@ -36,10 +36,10 @@ LATELY = 1.5
 class StoppingConfig:
     """Settings of early stopping."""
 
-    min_gain_db: float = 0.0
+    min_gain_db: float | None = 0.0
     """Gain of the left-out blocks in the last third of the steps, its noise added, below which growth ends [dB]; the rest of
     the fit is then shorter in proportion. Not before a third of the time of growth, nor while views are half their size. 0:
-    nothing is held out, and the fit takes the planned steps."""
+    nothing is held out, and the fit takes the planned steps. None: 0.1, or 0 where the time of a CPU limits the steps."""
     fraction: float = 0.03
     """Fraction of the pixels that is held out until growth ends."""
     measurements: int = 12
@@ -53,8 +53,9 @@ class StoppingConfig:
         if self.measurements < 1:
             raise UsageError(f"stopping measurements must be at least 1, not {self.measurements}")
         for name in ("noise", "min_gain_db"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"stopping {name.replace('_', '-')} must be 0 or more and finite, not {getattr(self, name)}")
+            value = getattr(self, name)
+            if value is not None and not 0 <= value < math.inf:
+                raise UsageError(f"stopping {name.replace('_', '-')} must be 0 or more and finite, not {value}")
 
 
 @dataclass(frozen=True)
@@ -119,6 +120,7 @@ class Stopping:
             strategy: Density strategy.
             half_resolution: Fraction of the planned steps, from the first, in which views are half their size.
         """
+        assert self.config.min_gain_db is not None  # `settings_by_views` has chosen
         if self.config.min_gain_db == 0:
             return []
         planned, (begins, ends, times) = context.phases.planned, strategy.growth()
@@ -190,6 +192,7 @@ class Stopping:
     def _reason(self, step: int, errors: torch.Tensor) -> str:
         """Return why growth ends after a step with these errors of the blocks [B]; nothing where it goes on."""
         c = self.config
+        assert c.min_gain_db is not None
         since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))
         lately = Gain(math.inf, 0.0) if earlier is None or self._is_early(step) else gain(earlier, errors)
         if lately.upper_bound_below(c.min_gain_db, c.noise):
