@@ -11,6 +11,7 @@ from warpgs.constants import Rule
 from warpgs.kernels import blend_cpu, blend_cuda
 from warpgs.kernels.blend_records import COLORS, VALUES
 from warpgs.kernels.blend_settings import BlendSettings
+from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
@@ -32,25 +33,49 @@ def step_bytes(sizes: StepSizes) -> Needs:
     }  # fmt: skip
 
 
-@functools.cache
-def make_segments(real, values: int = VALUES):
-    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably; ``values`` of a gradient."""
-    reals = wp.types.vector(values, real)
-    count = wp.constant(values)
+SUMMED = 16
+"""Gaussians whose gradients a task sums."""
 
-    @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}.{values}")
+
+@functools.cache
+def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
+    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        values: Values of a gradient.
+        width: Values of a projected Gaussian, of which those without gradient come last.
+    """
+    reals = wp.types.vector(values, real)
+    record = wp.types.vector(width, real)
+    lane_reals = wp.types.vector(SUMMED * values, real)
+    count = wp.constant(values)
+    lanes = wp.constant(SUMMED)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def sum_gradients(
-        begin: int, v_slots: wp.array2d(dtype=real), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        # outputs, zero on entry
-        v_projected: wp.array2d(dtype=real),
+        begin: int, v_slots: wp.array(dtype=reals), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        # outputs
+        v_projected: wp.array(dtype=record),
     ):  # fmt: skip
-        i = begin + wp.tid()
-        total = reals()
-        for slot in range(starts[i], starts[i] + counts[i]):
-            for k in range(count):
-                total[k] += v_slots[slot, k]
-        for k in range(count):
-            v_projected[i, k] = total[k]
+        first = (begin + wp.tid()) * lanes
+        used = wp.min(lanes, starts.shape[0] - first)
+        totals = lane_reals()
+        for lane in range(lanes):  # the first slots in a loop of their own, so that many loads are under way at once
+            if lane < used and counts[first + lane] > 0:
+                v = v_slots[starts[first + lane]]
+                for k in range(wp.static(values)):
+                    totals[lane * count + k] = v[k]
+        for lane in range(used):
+            i = first + lane
+            total = record()
+            for k in range(wp.static(values)):
+                total[k] = totals[lane * count + k]
+            for slot in range(starts[i] + 1, starts[i] + counts[i]):
+                v = v_slots[slot]
+                for k in range(wp.static(values)):
+                    total[k] += v[k]
+            v_projected[i] = total
 
     @wp.kernel(enable_backward=False, module=f"warpgs.kernels.blend.{real.__name__}.{values}")
     def gather_weights(
@@ -141,7 +166,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     v_rgb, v_alpha, v_depth = v_images
     real, device, channels = interop.real_of(projected), projected.device, backgrounds.shape[1]
     values = VALUES + channels - COLORS + 2 * settings.absgrad
-    v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
+    v_projected = allocator.output(projected.shape, projected.dtype, device)
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     deep = v_alpha is not None or v_depth is not None
     upstream = [interop.span(v_rgb, real), v_rgb.stride(-2)]
@@ -158,10 +183,11 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     kernels = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep)
     _launch(kernels.backward, len(tiles.ranges), inputs, device)
     inputs = [
-        interop.view(v_slots, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
-        interop.rows(v_projected, real),
+        interop.rows(v_slots, wp.types.vector(values, real)), interop.view(tiles.starts, wp.int32),
+        interop.view(tiles.counts, wp.int32), interop.rows(v_projected, record),
     ]  # fmt: skip
-    interop.launch(make_segments(real, values).sum_gradients, len(tiles.counts), inputs, device, cost=5)
+    tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients
+    interop.launch(kernel, tasks, inputs, device, cost=5 * SUMMED)
     return v_projected
 
 

@@ -84,13 +84,18 @@ def make_batches(real, tile_size: int, channels: int):
         whole_tiles: wp.int32, b: wp.ref[Batch],
     ):  # fmt: skip
         """Load the Gaussians of ``count`` instances, from the last on backwards."""
-        for j in range(count):
-            b.x[j & bits] = projected[gaussian_ids[last - j]][0]  # apart, so that many loads are under way at once
+        j = int(0)
+        while j < count:  # a loop of its own, so that many loads are under way at once
+            i = gaussian_ids[wp.max(last - j, 0)]
+            if i < 0:
+                break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+            b.x[j & bits] = projected[i][0]
+            j += 1
         j = int(0)
         while j < count:
             i = gaussian_ids[wp.max(last - j, 0)]
             if i < 0:
-                break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+                break  # never
             b.y[j & bits] = projected[i][1]
             b.u11[j & bits] = projected[i][2]
             b.u12[j & bits] = projected[i][3]

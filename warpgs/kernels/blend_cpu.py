@@ -163,15 +163,20 @@ def make_forward(real, tile_size: int, channels: int):
         first = ranges[tile, 0]
         while first < last:
             count = wp.min(batch, last - first)
-            for j in range(count):
-                mx[j] = projected[gaussian_ids[first + j]][0]  # in a loop of its own, so that many loads are under way at once
+            j = int(0)
+            while j < count:  # a loop of its own, so that many loads are under way at once
+                i = gaussian_ids[wp.max(first + j, 0)]
+                if i < 0:
+                    break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+                mx[j & bits] = projected[i][0]
+                j += 1
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
             while j < count:
                 i = gaussian_ids[wp.max(first + j, 0)]
                 if i < 0:
-                    break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+                    break  # never
                 my[j] = projected[i][1]
                 u11[j] = projected[i][2]
                 u12[j] = projected[i][3]
