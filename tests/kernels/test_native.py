@@ -23,20 +23,22 @@ def ints(tensor: torch.Tensor) -> interop.View:
 
 @pytest.mark.parametrize("count", [1, 31, 1000, 1025, 8192, 8193, 20_000])
 def test_long_lists_come_first(count):
-    """Each tile once, by the number of binary digits of its length, and nothing behind the last; lists lie anywhere."""
+    """Each tile once, in the row of its length's leading zeros, and nothing behind the last; lists lie anywhere."""
     generator = torch.Generator().manual_seed(count)
     lengths = torch.exp2(21 * torch.rand(count, generator=generator)).int() - 1
     lengths[::7] = 0
     begins = torch.randint(2**20, (count,), generator=generator, dtype=torch.int32)
     ranges = torch.stack([begins, begins + lengths], 1).to(CUDA)
-    order = torch.full((count + 16 * 1024,), -1, dtype=torch.int32, device=CUDA)
-    inputs = [ints(ranges), count, ints(torch.empty_like(order)), ints(order)]
-    interop.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
-    found = order.cpu()
-    assert bool((found[count:] == -1).all())
-    assert torch.equal(found[:count].sort().values, torch.arange(count, dtype=torch.int32))
-    digits = torch.ceil(torch.log2(lengths[found[:count].long()].double() + 1))
-    assert bool((digits[1:] <= digits[:-1]).all())
+    order = torch.full((blend_cuda.RANKS, count), -1, dtype=torch.int32, device=CUDA)
+    counts = torch.zeros(blend_cuda.RANKS, dtype=torch.int32, device=CUDA)
+    threads = -(-count // blend_cuda.ORDER_THREADS) * blend_cuda.ORDER_THREADS
+    inputs = [ints(ranges), count, ints(counts), ints(order)]
+    interop.launch(blend_cuda.make_kernels(16).order_tiles, threads, inputs, CUDA, block_dim=blend_cuda.ORDER_THREADS)
+    ranks = 32 - torch.ceil(torch.log2(lengths.double() + 1)).int()
+    for rank, found in enumerate(order.cpu()):
+        wanted = torch.nonzero(ranks == rank)[:, 0].int()
+        assert int(counts[rank]) == len(wanted) and bool((found[len(wanted) :] == -1).all())
+        assert torch.equal(found[: len(wanted)].sort().values, wanted)
 
 
 @functools.cache
