@@ -158,7 +158,7 @@ class GraphedRasterizer:
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
-        overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the sums tell before
+        overflow = allocator.workspace((1,), torch.int32, self.device)  # not read: the sums tell before
         memory = InstanceMemory(
             None, self.capacity.instances, overflow, allocator, Visible(self._sums, self.capacity.visible)
         )  # fmt: skip
