@@ -8,8 +8,10 @@ import pytest
 import torch
 import warp as wp
 
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT
 from warpgs.kernels import blend_cuda, native
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime import interop
 from warpgs.runtime.cuda_source import source
 
@@ -130,7 +132,29 @@ def test_no_block_that_draws_is_left_out(longest, corner):
 
 def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
     """Both passes take the chunk from the same function."""
-    assert [blend_cuda.chunk_of(tiles, order) for tiles in (4096, 4097) for order in (True, False)] == [64, 128, 128, 128]
+    sizes = (4096, 4097, 16384, 16385)
+    assert [blend_cuda.chunk_of(tiles, True) for tiles in sizes] == [64, 128, 128, 256]
+    assert [blend_cuda.chunk_of(tiles, False) for tiles in sizes] == [128, 128, 128, 256]
+
+
+def test_gradients_agree_for_every_chunk(monkeypatch):
+    """Lists that are longer than the largest chunk, begun anywhere; images have the same bits, gradients differ by rounding."""
+    gaussians = leaves(cloud(3000, torch.float32, CUDA))
+    cam = camera(48, 33, None, torch.float32, CUDA)
+    with torch.no_grad():
+        gaussians.logit_opacities.sub_(4)  # or the first few hide the others
+        gaussians.log_scales.add_(1.5)
+    found = []
+    for chunk in blend_cuda.CHUNKS:
+        monkeypatch.setattr(blend_cuda, "chunk_of", lambda tiles, order, chunk=chunk: chunk)
+        r = rasterize(gaussians, cam, RasterizeOptions(record=False))
+        assert int(r.tile_counts.sum()) > 2 * 256 * 9
+        loss = (r.rgb**2).sum() + (0.1 * r.depth).sum()
+        found.append((r.rgb.detach(), torch.autograd.grad(loss, list(gaussians.tensors().values()))))
+    for image, gradients in found[1:]:
+        assert torch.equal(image, found[0][0])
+        for own, wanted in zip(gradients, found[0][1]):
+            assert float((own - wanted).norm()) <= 1e-5 * float(wanted.norm())
 
 
 def test_devices_and_streams_without_a_number():

@@ -20,12 +20,12 @@ from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.cuda_source import source
 from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
-CHUNKS = (64, 128)
-"""Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
-warps, the second in larger ones, to load the pixels less often. The forward pass saves the state of every pixel at each
+CHUNKS = (64, 128, 256)
+"""Instances that one warp of the backward pass takes: the first number in small images, to have enough warps, the next ones in
+larger images, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each
 multiple of this, so that several warps can share a long list. Multiples of 32."""
-MAX_SMALL_TILES = 4096
-"""Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
+MAX_TILES = (4096, 16384)
+"""Tiles up to which the first and the second of these numbers are taken (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of that state with three channels: transmittance, colour and depth sum so far. One more for each further channel."""
 WARPS = 2
@@ -186,7 +186,7 @@ def make_backward(
     name += ".absgrad" * absgrad
     options = {"enable_backward": False, "grid_stride": False, "module": name}
     # many chunks want many warps at a time more than they want registers, unless channels fill these
-    small = chunk == CHUNKS[1] and not (with_depth or absgrad) and channels == COLORS
+    small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
     registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 
     @wp.kernel(**registers, **options)
@@ -226,8 +226,9 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk: the larger number, which takes less memory, also where order is given up for memory."""
-    return CHUNKS[int(tiles > MAX_SMALL_TILES or not deterministic)]
+    """Return the instances per chunk; not the smallest, which takes the most memory, where order is given up for memory."""
+    larger = sum(tiles > most for most in MAX_TILES)
+    return CHUNKS[larger if deterministic else max(larger, 1)]
 
 
 def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
