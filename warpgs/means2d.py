@@ -24,12 +24,19 @@ class ProjectedMeans(torch.Tensor):
         raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")
 
 
-def count_passes(projected: torch.Tensor) -> None:
-    """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`."""
-    if projected.requires_grad:
-        passes: list[bool] = []
-        setattr(projected, PASSED, passes)
-        projected.register_hook(lambda gradient: passes.append(True))
+def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> None:
+    """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`.
+
+    ``passes`` is a list that gets an entry for each pass, where the nodes of autograd see to that; None has a hook do it, whose
+    call takes longer.
+    """
+    if not projected.requires_grad:
+        return
+    if passes is None:
+        own: list[bool] = []
+        passes = own
+        projected.register_hook(lambda gradient: own.append(True))
+    setattr(projected, PASSED, passes)
 
 
 def projected_means(projected: torch.Tensor, absgrad: bool) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """What the buffers of a render with gradients cost on CUDA, as the kernels declare them, and when they live.
 
 One camera, three channels, gradients in the five tensors. Upstream gradients and the Gaussians themselves are inputs, and do
-not count. A sort takes memory from Warp's pool beside these, about as much as its own keys and values.
+not count, nor does alpha, which nobody keeps. A sort takes memory from Warp's pool before these are at their peak.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 from warpgs.kernels.blend_cuda import STATE, STRIDE, chunk_of
 from warpgs.kernels.tiles import grid
+from warpgs.render.graphed import CAPACITY_FACTOR, SPARE
 
 REAL = 4
 """Bytes of a number."""
+PAIRS = 4 * REAL
+"""Bytes of an instance in the lists: tile and slot, each in a sort buffer of twice the size."""
 TILE = 16
 
 
@@ -47,20 +50,23 @@ MOMENTS = (BLEND, PROJECT)
 
 
 def buffers(n: Counts, deterministic: bool = True) -> dict[str, tuple[int, tuple[str, ...]]]:
-    """Return bytes, and the moments at which they are held, of each buffer by name."""
-    chunk = chunk_of(n.tiles, deterministic)
-    states = (n.instances // chunk + 1) * STATE * TILE * TILE * REAL
-    lists = 8 * n.tiles + 8 * n.visible + REAL * n.gaussians + 4 * REAL * n.instances
+    """Return bytes, and the moments at which they are held, of each buffer by name; atomic calls are not recorded."""
+    state = STATE * TILE * TILE * REAL // chunk_of(n.tiles, deterministic)
+    slot = STRIDE * REAL if deterministic else 0
+    spare = (CAPACITY_FACTOR - 1) * n.instances + SPARE, (CAPACITY_FACTOR - 1) * n.visible + SPARE
     return {
         "projected Gaussians and counts": ((STRIDE + 1) * REAL * n.gaussians, MOMENTS),
-        "lists of instances": (lists, (BLEND,)),
-        "image, alpha, depth": (5 * REAL * n.pixels, (BLEND,)),
-        "transmittance, weight and end of each pixel": (3 * REAL * n.pixels, (BLEND,)),
-        "state of each pixel every few instances": (states, (BLEND,)),
-        "gradient of each instance": (STRIDE * REAL * n.instances if deterministic else 0, (BLEND,)),
+        "lists of instances": (8 * n.tiles + 8 * n.visible + REAL * n.gaussians + PAIRS * n.instances, (BLEND,)),
+        "image": (3 * REAL * n.pixels, MOMENTS),
+        "depth, transmittance, weight and end of each pixel": (4 * REAL * n.pixels, (BLEND,)),
+        "state of each pixel every few instances": (state * n.instances, (BLEND,)),
+        "gradient of each instance": (slot * n.instances, (BLEND,)),
+        "spare capacity of a recorded call": (
+            int(spare[0] * (PAIRS + state + slot) + spare[1] * 8) if deterministic else 0, (BLEND,)
+        ),
         "gradients of projected Gaussians": (STRIDE * REAL * n.gaussians, MOMENTS),
         "gradients of the five tensors": ((11 + 3 * n.coefficients) * REAL * n.gaussians, (PROJECT,)),
-    }
+    }  # fmt: skip
 
 
 def at_most(n: Counts, deterministic: bool = True) -> int:

@@ -8,8 +8,10 @@ import pytest
 import torch
 import warp as wp
 
+from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT
 from warpgs.kernels import blend_cuda, native
+from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.runtime import interop
 from warpgs.runtime.cuda_source import source
 
@@ -23,20 +25,22 @@ def ints(tensor: torch.Tensor) -> interop.View:
 
 @pytest.mark.parametrize("count", [1, 31, 1000, 1025, 8192, 8193, 20_000])
 def test_long_lists_come_first(count):
-    """Each tile once, by the number of binary digits of its length, and nothing behind the last; lists lie anywhere."""
+    """Each tile once, in the row of its length's leading zeros, and nothing behind the last; lists lie anywhere."""
     generator = torch.Generator().manual_seed(count)
     lengths = torch.exp2(21 * torch.rand(count, generator=generator)).int() - 1
     lengths[::7] = 0
     begins = torch.randint(2**20, (count,), generator=generator, dtype=torch.int32)
     ranges = torch.stack([begins, begins + lengths], 1).to(CUDA)
-    order = torch.full((count + 16 * 1024,), -1, dtype=torch.int32, device=CUDA)
-    inputs = [ints(ranges), count, ints(torch.empty_like(order)), ints(order)]
-    interop.launch(blend_cuda.make_kernels(16).order_tiles, blend_cuda.THREADS, inputs, CUDA, block_dim=blend_cuda.THREADS)
-    found = order.cpu()
-    assert bool((found[count:] == -1).all())
-    assert torch.equal(found[:count].sort().values, torch.arange(count, dtype=torch.int32))
-    digits = torch.ceil(torch.log2(lengths[found[:count].long()].double() + 1))
-    assert bool((digits[1:] <= digits[:-1]).all())
+    order = torch.full((blend_cuda.RANKS, count), -1, dtype=torch.int32, device=CUDA)
+    counts = torch.zeros(blend_cuda.RANKS, dtype=torch.int32, device=CUDA)
+    threads = -(-count // blend_cuda.ORDER_THREADS) * blend_cuda.ORDER_THREADS
+    inputs = [ints(ranges), count, ints(counts), ints(order)]
+    interop.launch(blend_cuda.make_kernels(16).order_tiles, threads, inputs, CUDA, block_dim=blend_cuda.ORDER_THREADS)
+    ranks = 32 - torch.ceil(torch.log2(lengths.double() + 1)).int()
+    for rank, found in enumerate(order.cpu()):
+        wanted = torch.nonzero(ranks == rank)[:, 0].int()
+        assert int(counts[rank]) == len(wanted) and bool((found[len(wanted) :] == -1).all())
+        assert torch.equal(found[: len(wanted)].sort().values, wanted)
 
 
 @functools.cache
@@ -128,7 +132,29 @@ def test_no_block_that_draws_is_left_out(longest, corner):
 
 def test_chunks_are_the_larger_ones_in_large_pictures_and_without_an_order():
     """Both passes take the chunk from the same function."""
-    assert [blend_cuda.chunk_of(tiles, order) for tiles in (4096, 4097) for order in (True, False)] == [64, 128, 128, 128]
+    sizes = (4096, 4097, 16384, 16385)
+    assert [blend_cuda.chunk_of(tiles, True) for tiles in sizes] == [64, 128, 128, 256]
+    assert [blend_cuda.chunk_of(tiles, False) for tiles in sizes] == [128, 128, 128, 256]
+
+
+def test_gradients_agree_for_every_chunk(monkeypatch):
+    """Lists that are longer than the largest chunk, begun anywhere; images have the same bits, gradients differ by rounding."""
+    gaussians = leaves(cloud(3000, torch.float32, CUDA))
+    cam = camera(48, 33, None, torch.float32, CUDA)
+    with torch.no_grad():
+        gaussians.logit_opacities.sub_(4)  # or the first few hide the others
+        gaussians.log_scales.add_(1.5)
+    found = []
+    for chunk in blend_cuda.CHUNKS:
+        monkeypatch.setattr(blend_cuda, "chunk_of", lambda tiles, order, chunk=chunk: chunk)
+        r = rasterize(gaussians, cam, RasterizeOptions(record=False))
+        assert int(r.tile_counts.sum()) > 2 * 256 * 9
+        loss = (r.rgb**2).sum() + (0.1 * r.depth).sum()
+        found.append((r.rgb.detach(), torch.autograd.grad(loss, list(gaussians.tensors().values()))))
+    for image, gradients in found[1:]:
+        assert torch.equal(image, found[0][0])
+        for own, wanted in zip(gradients, found[0][1]):
+            assert float((own - wanted).norm()) <= 1e-5 * float(wanted.norm())
 
 
 def test_devices_and_streams_without_a_number():

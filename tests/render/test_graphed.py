@@ -11,7 +11,9 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
+from warpgs.errors import UsageError
 from warpgs.kernels.project_inputs import ProjectInputs
+from warpgs.means2d import projected_means
 from warpgs.render import graphed
 from warpgs.render.compose import inputs_of
 from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
@@ -245,6 +247,23 @@ def test_a_rasterizer_is_freed_when_nobody_holds_it(surroundings):
         assert gone() is None and bool(g.means.grad.any())
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("loss", ["image", "projected", "up to projected"])
+def test_backward_passes_are_counted(surroundings, loss):
+    """Projected means read after a pass are refused; those read before hold its gradients."""
+    g, own = leaves(cloud(50)), Recorder(NoGraphPool(CPU))
+    cam = camera(70, 50, 1, torch.float32)
+    first_graphed(own, g, cam)
+    settings = RenderSettings(70, 50, (0, 0, 70, 50), g.sh_degree, RULES["exact"], 16)
+    for early in (True, False):
+        images, projected, _ = own.render(inputs_of(g, cam), None, settings)
+        means2d = projected_means(projected, False) if early else None
+        y = projected[..., :2].sum() if loss == "projected" else images[0].sum()
+        torch.autograd.grad(y, projected if loss == "up to projected" else g.means)
+        assert means2d is None or bool(means2d.grad.any())
+        with pytest.raises(UsageError, match=r"read render\.means2d before the backward pass"):
+            projected_means(projected, False)
 
 
 def test_after_a_failed_capture_calls_run_without_graphs(recorder):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 SPEED = {
     "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX",
-    "MAX_SMALL_TILES", "WARPS", "STRIP", "ABREAST", "MAX_GRAPHS", "MIN_REPLAYS", "FREE_CAPTURES", "SMALL_BYTES",
+    "MAX_TILES", "WARPS", "STRIP", "ABREAST", "MAX_GRAPHS", "MIN_REPLAYS", "FREE_CAPTURES", "SMALL_BYTES",
 }  # fmt: skip
 """Sizes of portions of work, and numbers of graphs; every value that divides as its comment says gives the same numbers."""
 

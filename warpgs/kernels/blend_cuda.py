@@ -20,12 +20,12 @@ from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.cuda_source import source
 from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
-CHUNKS = (64, 128)
-"""Instances that one warp of the backward pass takes: the first number in images of up to MAX_SMALL_TILES tiles, to have enough
-warps, the second in larger ones, to load the pixels less often. The forward pass saves the state of every pixel at each
+CHUNKS = (64, 128, 256)
+"""Instances that one warp of the backward pass takes: the first number in small images, to have enough warps, the next ones in
+larger images, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each
 multiple of this, so that several warps can share a long list. Multiples of 32."""
-MAX_SMALL_TILES = 4096
-"""Tiles beyond which the larger chunk is the faster one (docs/decisions/005-cuda-blending.md)."""
+MAX_TILES = (4096, 16384)
+"""Tiles up to which the first and the second of these numbers are taken (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of that state with three channels: transmittance, colour and depth sum so far. One more for each further channel."""
 WARPS = 2
@@ -33,8 +33,10 @@ WARPS = 2
 LARGE_GAUSSIAN = 8
 """Tiles per visible Gaussian from which on a warp of the forward pass takes two blocks of pixels instead of one: it loads and
 tests half as many instances, while few of them touch one block alone (docs/decisions/005-cuda-blending.md)."""
-THREADS = 1024
-"""Threads of the one block that puts tiles in order."""
+RANKS = 33
+"""Ranks of tiles by the number of binary digits of their list's length, 0 to 32."""
+ORDER_THREADS = 256
+"""Threads of a block of the kernel that puts tiles in order."""
 STRIDE = 12
 """Floats from one instance's sums to the next with three channels: as many as a projected Gaussian has, so that rows are
 16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
@@ -71,8 +73,9 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
 
     @wp.func_native(_source("forward", tile_size, channels, SAVE=str(save).lower(), PER=per))
     def forward_body(
-        item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
-        ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
+        order: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
+        backgrounds: wp.array(dtype=float),
         rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
@@ -82,15 +85,16 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
 
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def forward(
-        begin: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), order: wp.array(dtype=int),
-        ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), backgrounds: wp.array(dtype=float),
+        begin: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
+        order: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
+        backgrounds: wp.array(dtype=float),
         # outputs
         rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
     ):  # fmt: skip
         forward_body(
-            wp.tid() // 32, settings, chunk, projected, order, ranges, gaussian_ids, backgrounds,
+            wp.tid() // 32, settings, chunk, projected, counts, order, ranges, gaussian_ids, backgrounds,
             rgb, alpha_out, depth, transmittances, weights, ends, states,
         )  # fmt: skip
 
@@ -106,8 +110,10 @@ def make_kernels(tile_size: int):
     """
     Blending = make_struct(wp.float32)
 
-    @wp.func_native(source("blend_order.cu", THREADS=THREADS))
-    def order_body(ranges: wp.array(dtype=int), count: int, places: wp.array(dtype=int), order: wp.array(dtype=int)): ...
+    @wp.func_native(source("blend_order.cu", RANKS=RANKS))
+    def order_body(
+        tile: int, ranges: wp.array(dtype=int), count: int, counts: wp.array(dtype=int), order: wp.array(dtype=int)
+    ): ...  # fmt: skip
 
     @wp.func_native(_source("contributions", tile_size, COLORS))
     def contributions_body(
@@ -122,10 +128,10 @@ def make_kernels(tile_size: int):
     @wp.kernel(**options)
     def order_tiles(
         begin: int, ranges: wp.array(dtype=int), count: int,
-        # outputs; the first is scratch
-        places: wp.array(dtype=int), order: wp.array(dtype=int),
+        # outputs; counts are zero on entry
+        counts: wp.array(dtype=int), order: wp.array(dtype=int),
     ):  # fmt: skip
-        order_body(ranges, count, places, order)
+        order_body(begin + wp.tid(), ranges, count, counts, order)
 
     @wp.kernel(**options)
     def contributions(
@@ -180,7 +186,7 @@ def make_backward(
     name += ".absgrad" * absgrad
     options = {"enable_backward": False, "grid_stride": False, "module": name}
     # many chunks want many warps at a time more than they want registers, unless channels fill these
-    small = chunk == CHUNKS[1] and not (with_depth or absgrad) and channels == COLORS
+    small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
     registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 
     @wp.kernel(**registers, **options)
@@ -220,8 +226,9 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk: the larger number, which takes less memory, also where order is given up for memory."""
-    return CHUNKS[int(tiles > MAX_SMALL_TILES or not deterministic)]
+    """Return the instances per chunk; not the smallest, which takes the most memory, where order is given up for memory."""
+    larger = sum(tiles > most for most in MAX_TILES)
+    return CHUNKS[larger if deterministic else max(larger, 1)]
 
 
 def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
@@ -258,11 +265,14 @@ def forward(
     rows, state = tiles.slots.shape[0] // chunk + 1 if save else 0, STATE + channels - COLORS
     states = allocator.saved((rows, state * pixels), torch.float32, device)
     k, count = make_kernels(tiles.size), tiles.ranges.shape[0]
-    places, order = (allocator.workspace((count,), torch.int32, device) for _ in range(2))
-    interop.launch(k.order_tiles, THREADS, [*_ints(tiles.ranges), count, *_ints(places, order)], device, block_dim=THREADS)
+    counts = allocator.workspace((RANKS,), torch.int32, device).zero_()
+    order = allocator.workspace((RANKS, count), torch.int32, device)
+    threads = -(-count // ORDER_THREADS) * ORDER_THREADS
+    inputs = [*_ints(tiles.ranges), count, *_ints(counts, order)]
+    interop.launch(k.order_tiles, threads, inputs, device, block_dim=ORDER_THREADS)
     inputs = [
         settings.struct(tiles.size, wp.float32), chunk, *_floats(projected),
-        *_ints(order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
+        *_ints(counts, order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
         interop.rows(rgb, wp.float32), *_floats(alpha, depth, transmittances, weights), *_ints(ends),
         interop.view(states, wp.float32),
     ]  # fmt: skip

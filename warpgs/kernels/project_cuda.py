@@ -189,8 +189,8 @@ def make_backward(
     clear_rows = make_native().clear_rows if native else None
     color_backward = make_color(bases).color_backward if native else None
 
-    # four blocks to a multiprocessor
-    registers = {"cuda_max_registers": 128} if native else {}
+    # three blocks to a multiprocessor: as many registers as it wants
+    registers = {"cuda_max_registers": 168, "grid_stride": False} if native else {}
     variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
     module = f"warpgs.kernels.project.backward.cuda.{real.__name__}.{camera_model}{variant}"
 

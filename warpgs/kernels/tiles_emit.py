@@ -111,7 +111,8 @@ def make_emit(real, slotted: bool):
 
     module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}"
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    # five blocks to a multiprocessor
+    @wp.kernel(enable_backward=False, grid_stride=False, cuda_max_registers=48, module=module)
     def emit(
         begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
         ends: wp.array(dtype=wp.int64), count: int, per_camera: int,

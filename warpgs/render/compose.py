@@ -56,13 +56,13 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
     Raises:
         ValueError: It is neither one for all nor one for each.
     """
-    tensor, cameras = as_batch(array, like, axes), len(like)
+    tensor, cameras = as_batch(array, like, axes), like.shape[0]
     own = list(tensor.shape[1:])
-    if tensor.ndim != axes + 1 or len(tensor) not in (1, cameras):
+    if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
         raise ValueError(
             f"camera.{name} must have shape {own} or {[cameras, *own]}, as many as camera.viewmat, not {list(array.shape)}"
         )
-    return tensor if len(tensor) == cameras else tensor.expand(cameras, *own).contiguous()
+    return tensor if tensor.shape[0] == cameras else tensor.expand(cameras, *own).contiguous()
 
 
 def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
@@ -82,7 +82,7 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
     viewmats = as_batch(camera.viewmat, means)
     Ks = _for_each("K", camera.K, viewmats)
     if camera.distortion is None:
-        distortion = nothing((len(viewmats), 0), means.dtype, means.device)
+        distortion = nothing((viewmats.shape[0], 0), means.dtype, means.device)
     else:
         distortion = _for_each("distortion", camera.distortion, viewmats, 1)
     factors = checked_factors(means, opacity_factors)

@@ -24,6 +24,7 @@ from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid
 from warpgs.kernels.tiles_order import running_counts, split_sum, sums_fit
+from warpgs.means2d import count_passes
 from warpgs.render.compose import composite_into
 from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
@@ -127,8 +128,10 @@ class GraphedRasterizer:
         images, block = self._forward_blend(*projection, backgrounds.detach())
         projected = projection[0]
         if self.gradients:
-            projected = _projected(self, cameras, projection, *inputs[:7])
-            images = _blended(projected, backgrounds, self, projection[1], images, block)
+            passes: list[bool] = []  # backward passes: both nodes add to it
+            projected = _projected(self, cameras, projection, passes, *inputs[:7])
+            images = _blended(projected, backgrounds, self, projection[1], images, block, passes)
+            count_passes(projected, passes)
         if self._total_ready is not None:
             self._total_ready.synchronize()  # not before: the device goes on meanwhile
         self.needed = Capacity(*split_sum(int(self._total[0]), projection[1].numel()))
@@ -155,7 +158,7 @@ class GraphedRasterizer:
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
-        overflow = allocator.workspace((1,), torch.int32, self.device).zero_()  # not read: the sums tell before
+        overflow = allocator.workspace((1,), torch.int32, self.device)  # not read: the sums tell before
         memory = InstanceMemory(
             None, self.capacity.instances, overflow, allocator, Visible(self._sums, self.capacity.visible)
         )  # fmt: skip
@@ -195,7 +198,7 @@ class GraphedRasterizer:
             RuntimeError: The number of Gaussians has changed since they were rendered.
         """
         *gaussians, cameras, projected, counts = saved
-        if len(gaussians[0]) != projected.shape[1]:  # by way of `.data`, which autograd does not see
+        if gaussians[0].shape[0] != projected.shape[1]:  # by way of `.data`, which autograd does not see
             raise RuntimeError(
                 f"{projected.shape[1]:,} Gaussians were rendered, and now there are {len(gaussians[0]):,}: render again first"
             )
@@ -216,34 +219,37 @@ class _Projected(torch.autograd.Function):
     """The projected Gaussians as an autograd result of the seven tensors."""
 
     @staticmethod
-    def forward(ctx, rasterizer, cameras, projection, *inputs):
+    def forward(ctx, rasterizer, cameras, projection, passes, *inputs):
         ctx.save_for_backward(*inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
-        ctx.rasterizer = rasterizer
+        ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return projection[0]
 
     @staticmethod
     @first_order
     def backward(ctx, v_projected):
-        wants_camera = ctx.needs_input_grad[8] or ctx.needs_input_grad[9]  # viewmats and Ks
-        return None, None, None, *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera)
+        ctx.passes.append(True)
+        wants_camera = ctx.needs_input_grad[9] or ctx.needs_input_grad[10]  # viewmats and Ks
+        return None, None, None, None, *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera)
 
 
 class _Blended(torch.autograd.Function):
     """The images as an autograd result of projected Gaussians and backgrounds."""
 
     @staticmethod
-    def forward(ctx, projected, backgrounds, rasterizer, counts, images, block):
+    def forward(ctx, projected, backgrounds, rasterizer, counts, images, block, passes):
         rgb, _, depth = images
         ctx.save_for_backward(projected, counts, backgrounds, rgb, depth, block)
-        ctx.rasterizer = rasterizer
+        ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return tuple(images)
 
     @staticmethod
     @first_order
     def backward(ctx, *v_images):
-        return *ctx.rasterizer.blend_gradients(ctx.saved_tensors, v_images, ctx.needs_input_grad[1]), None, None, None, None
+        ctx.passes.append(True)
+        found = ctx.rasterizer.blend_gradients(ctx.saved_tensors, v_images, ctx.needs_input_grad[1])
+        return *found, None, None, None, None, None
 
 
 # Function.apply itself, which looks for functorch's wrappers first, takes as long again as what it calls
@@ -340,12 +346,13 @@ def call_key(
     whole device.
     """
     means, viewmats = inputs.means, inputs.viewmats
-    projected, tiles = len(means) * len(viewmats), math.prod(grid(*settings.window[2:], settings.tile_size))
+    cameras = viewmats.shape[0]  # len of a tensor takes ten times as long
+    projected, tiles = means.shape[0] * cameras, math.prod(grid(*settings.window[2:], settings.tile_size))
     small = 0 < projected <= MAX_PROJECTED and sums_fit(projected, tiles)
     fit = means.dtype == torch.float32 and (gradients or threading.current_thread() is threading.main_thread())
     if not (small and fit) or torch.is_inference_mode_enabled() or not _can_capture(means.device):
         return None
-    if backgrounds is not None and tuple(backgrounds.shape) != (len(viewmats), 3):
+    if backgrounds is not None and tuple(backgrounds.shape) != (cameras, 3):
         return None
     places = []
     for t in inputs[:5]:

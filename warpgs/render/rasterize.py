@@ -298,6 +298,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     if pixels is not None:
         images = tuple(at_pixels(image, pixels, window) for image in images)
         maps = {name: None if image is None else at_pixels(image, pixels, window) for name, image in maps.items()}
+    count_passes(found[0])
     render = _as_render(camera, images, *found, **maps)
     if options.error_bound:
         render = replace(render, error_bound=_error_bound(render.rgb.detach(), gaussians, camera, options))
@@ -376,5 +377,4 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
 
     shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
     rgb, alpha, depth = map(own, images)
-    count_passes(rest[0])
     return Render(rgb, alpha, depth, *rest, **shaped)

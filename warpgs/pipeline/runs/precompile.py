@@ -83,7 +83,8 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project_cuda.make_backward(wp.float32, CAMERA_MODEL), BLOCK),
     ]
     own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
-    own += [(allocator.make_fetch(), THREADS), (blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
+    own += [(allocator.make_fetch(), THREADS), (blending.order_tiles, blend_cuda.ORDER_THREADS)]
+    own += [(blending.contributions, TILE_SIZE * TILE_SIZE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
         passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
