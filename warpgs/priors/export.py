@@ -37,14 +37,15 @@ class ExportRequest:
     """Choice of the network to write, its weights and its input size."""
 
     model: str
-    """dpt (depth); fcn-resnet18, the paper's segmentation network; fcn-resnet50, one that torchvision has weights for; xfeat
-    (keypoints for --matcher)."""
+    """dpt (depth); fcn-resnet18 (the paper's segmentation network); fcn-resnet50 (segmentation with torchvision's weights);
+    xfeat (keypoints for --matcher)."""
     weights: str | None = None
     """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of your own."""
     random_weights: bool = False
-    """Take a small untrained network, to try the export only."""
+    """Use a small untrained network, to test the export only."""
     size: int = 384
-    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map back. xfeat takes any size."""
+    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map is stretched back. xfeat accepts
+    any size."""
 
     def __post_init__(self):
         if self.model not in MODELS:

@@ -45,32 +45,32 @@ class InitConfig:
     """Source and first values of the Gaussians."""
 
     source: str = "auto"
-    """Source: sweep or flow (a point per pixel whose depth other views confirm), points (those of the reconstruction), random,
-    hull (on the surface of the visual hull of views that know their opacity), or auto: sweep for few views or given depth, else
-    points where the scene has at least 100 that training views saw, else random. Where views know their opacity, points that
-    are empty in one are left out."""
+    """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto: sweep for few views or
+    given depth, else points if training views saw at least 100, else random. If views have an alpha channel, points in an empty
+    area of a view are left out."""
     sweep_up_to: int = 0
-    """auto: most training views from which a fit starts with a sweep, which takes a second a view on two cores."""
+    """auto: largest number of training views for a start by sweep, which takes a second for each view on two cores."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
     """First opacity, in (0, 1)."""
     scale_factor: float = 1.0
-    """First width of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
+    """First standard deviation of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
     near_views: int = 4
-    """sweep, flow: nearest other views that each view is matched with."""
+    """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which consistent points become one [px]; 0 keeps one for every pixel."""
+    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps one for every pixel."""
     fill_px: float = 16.0
-    """sweep, flow: width of the cells of points where no depth is consistent [px]; 0 leaves those places empty."""
+    """sweep, flow: width of the cells of points without consistent depth [px]; 0 leaves these areas empty."""
     flow: str = "dis"
     """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
-    """flow: colours that an ONNX file takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
+    """flow: range of input colours of an ONNX file: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
     max_residual: float = 1.0
     """flow: largest distance of a match from its epipolar line [px]."""
     blend: str = "least_sensitive"
-    """flow: which source view decides: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
+    """flow: combination of the depths from several views: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
 
     def __post_init__(self):
         if self.source not in SOURCES:

@@ -37,15 +37,15 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float = 0.0
-    """Gain of the left-out blocks in the last third of the steps, its noise added, below which growth ends [dB]; the rest of
-    the fit is then shorter in proportion. Not before a third of the time of growth, nor while views are half their size. 0:
-    nothing is held out, and the fit takes the planned steps."""
+    """Growth ends when the gain of the left-out blocks over the last third of the steps, plus its noise, is below this [dB].
+    The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor while views have half size.
+    0 disables early stopping."""
     fraction: float = 0.03
-    """Fraction of the pixels that is held out until growth ends."""
+    """Fraction of the pixels that is left out until growth ends."""
     measurements: int = 12
-    """Number of intervals, equal in length, into which the time of growth is divided; the blocks are measured after each."""
+    """Number of equal intervals of the time of growth; the blocks are measured after each."""
     noise: float = 1.0
-    """Standard errors of the mean gain over the blocks that count as its noise."""
+    """Noise of the gain, in standard errors of its mean over the blocks."""
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:

@@ -101,7 +101,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
 @register("given_normals")
 @dataclass(frozen=True)
 class GivenNormalsDifference(LossTerm):
-    """The weighted 1 - cos between given normals and those of rendered depth, 0 in views without; for pinholes."""
+    """The weighted 1 - cos of the angle between given normals and those of rendered depth, 0 in views without; for pinholes."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
     weight: float = 0.03

@@ -15,7 +15,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 @register("alpha")
 @dataclass(frozen=True)
 class AlphaDifference(LossTerm):
-    """The weighted mean absolute difference of rendered and true opacity, 0 in views that do not know theirs."""
+    """The weighted mean absolute difference of rendered and true opacity, 0 in views without an alpha channel."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha",)
     weight: float = 0.1

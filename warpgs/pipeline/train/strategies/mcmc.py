@@ -40,11 +40,11 @@ class MCMCConfig:
     start: int = 500
     """First step after which Gaussians are relocated and added."""
     every: int = 100
-    """Steps between two such events."""
+    """Steps between these events."""
     stop_fraction: float = 0.83
-    """Fraction of the fit after which the set is left alone; 25,000 of 30,000 steps in the paper."""
+    """Fraction of the fit after which no Gaussians are added or relocated; 25,000 of 30,000 steps in the paper."""
     growth: float = 0.05
-    """Gaussians added at an event, as a fraction of those there are, up to --max-gaussians."""
+    """Gaussians added at an event, as a fraction of the current number, up to --max-gaussians."""
     min_opacity: float = 0.005
     """Largest opacity of a dead Gaussian, in [0, 0.5]."""
     noise_lr: float = 5e5
