@@ -151,7 +151,7 @@ def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
     memory = machine_memory()
     if memory is None:
-        assumed = f"the system does not report it;{format_bytes(ASSUMED_BYTES)} are assumed"
+        assumed = f"the system does not report its memory;{format_bytes(ASSUMED_BYTES)} are assumed"
         yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory

@@ -182,9 +182,9 @@ def _refuse_stray_word(kind: type, arguments: list[str], program: str, complaint
     known, given = {*flag_names(kind)}, {word.partition("=")[0] for word in arguments}
     target = next((flag for flag in TARGETS if flag in known - given), None)
     hint = (
-        f"did you mean {target} {words[0]}?" if target and Path(words[0]).suffix else f"`{program} --help` tells what it takes"
+        f"did you mean {target} {words[0]}?" if target and Path(words[0]).suffix else f"`{program} --help` lists its arguments"
     )
-    raise UsageError(f"{words[0]} is one word too many; {hint}")
+    raise UsageError(f"{words[0]} is an extra argument; {hint}")
 
 
 def check_range(flag: str, value: float, low: float, high: float) -> None:

@@ -273,7 +273,7 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
         raise malformed(path, f"accessor {index} has an unsupported type")
     if kind != "<f4" and accessor.get("normalized") is not True:
-        raise malformed(path, f"accessor {index} holds integers that are no fractions")
+        raise malformed(path, f"accessor {index} contains integers that are not normalised")
     dtype = np.dtype(kind)
     size, rows = dtype.itemsize * width, count(accessor, "count")
     stride = count(view, "byteStride", size) or size

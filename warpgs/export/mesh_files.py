@@ -50,7 +50,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
     if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
         raise DataError(f"{path}: not written, the mesh holds numbers that are not finite; make it again")
     if mesh.faces.size and not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)):
-        raise DataError(f"{path}: not written, a triangle names a vertex that is not there; make the mesh again")
+        raise DataError(f"{path}: not written, a triangle refers to a missing vertex; make the mesh again")
     if path.suffix.lower() == ".ply":
         write_bytes(path, *_ply(mesh))
     else:

@@ -202,7 +202,7 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
     """Yield the sections of a version-4 file, each to be read to its end before the next; an empty section has no stream."""
     wanted = [s for s in sizes if s]
     if count != len(wanted) or place < HEADER_4.size or place + 16 * count > len(data):
-        raise malformed(path, f"its table of {count} streams at byte {place} makes no sense")
+        raise malformed(path, f"its table of {count} streams at byte {place} is invalid")
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_WINDOW)
     view, i, start = memoryview(data), 0, place + 16 * count
     for size in sizes:
@@ -324,4 +324,4 @@ class SPZ(Format):
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
         except BROKEN as e:
-            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
+            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e

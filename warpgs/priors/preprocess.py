@@ -115,7 +115,7 @@ def read_side_file(model: Path) -> dict:
         raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
     for key, value in values.items():
         if key not in KEYS:
-            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} may stand there")
+            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} are supported")
         check_value(key, value, str(path), DataError)
     return values
 

@@ -161,7 +161,7 @@ def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: i
 
 
 def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], object]) -> SemanticsSource:
-    words = "semantics: no network, so saliency stands for foreground and edges for boundaries"
+    words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
     notes.append(Detail(f"{words}; --segmentation-model takes one"))
 
     found = classical_maps([v.image for v in views], tell)
@@ -189,12 +189,12 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
             zeros = np.zeros_like(maps.foreground)
             maps, source = (
                 SemanticMaps(maps.confidence, zeros, zeros),
-                "none: hardly any foreground and no mask of an object",
+                "none: almost no foreground and no object mask",
             )
         result.append((maps, source))
     reason = "a mask is surer than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        words = f"semantics: {reason}, so the mask or black background stands for foreground in {_names(replaced)}"
+        words = f"semantics: {reason}, so the mask or black background is used as foreground in {_names(replaced)}"
         notes.append(Detail(words) if classical else words)
     if empty:
         notes.append(f"semantics: hardly any foreground and no mask of an object in {_names(empty)}: they do not count there")

@@ -151,7 +151,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
         raise UsageError(
-            f"window {options.window} does not fit: in an image of {width} x {height} px its edges must lie at multiples of "
+            f"window {options.window} does not fit: in an image of {width} x {height} px its edges must be multiples of "
             f"{side} px or at the image's edges"
         )
     return x, y, w, h

@@ -79,5 +79,5 @@ def refuse_transforms() -> None:
     if torch._C._are_functorch_transforms_active():
         raise UsageError(
             "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "
-            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] in place of vmap"
+            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] instead of vmap"
         )

@@ -79,8 +79,8 @@ class _Walk:
     def tensor(self, tensor: Message) -> None:
         if any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in tensor):
             raise DataError(
-                f"{self.path}: the weights of {_text(tensor, TENSOR_NAME) or 'a constant'!r} lie in another file, which is not "
-                "read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
+                f"{self.path}: the weights of {_text(tensor, TENSOR_NAME) or 'a constant'!r} are in another file, which is "
+                f"not read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
             )
 
     def node(self, node: Message, depth: int) -> None:

@@ -162,7 +162,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     Raises:
         DataError: The folder is no run, or nothing is left of its model.
         ResourceError: viser is not installed, another process writes into the file's folder, or it cannot be written.
-        UsageError: A filter makes no sense.
+        UsageError: A filter is invalid.
     """
     require_viser()
     run = open_run(folder, "cpu")

@@ -77,7 +77,7 @@ def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple
     parts: Parts = {}
     for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
         if flag_group(name) in parts:
-            raise UsageError(f"{flag} {given}: two of them have the flags --{flag_group(name)}; leave one out")
+            raise UsageError(f"{flag} {given}: two of them define the flags --{flag_group(name)}; leave one out")
         kind = _load(registry, name)
         try:
             parts[flag_group(name)] = kind()

@@ -56,7 +56,7 @@ def _tags(data: bytes) -> dict[int, tuple[int, ...]]:
                 (place,) = struct.unpack_from(order + number, data, place)
             tags[tag] = struct.unpack_from(layout, data, place)
     except (struct.error, OverflowError) as e:
-        raise ValueError("its directory leads out of the file") from e
+        raise ValueError("its directory points outside the file") from e
     return tags
 
 

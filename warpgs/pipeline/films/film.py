@@ -124,7 +124,7 @@ def _frames(
 def _older_images(folder: Path, files: list[Path]) -> list[str]:
     """Return notes on images of an earlier film that lie between those of this one."""
     older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
-    return [f"{len(older)} older images lie in {folder}, too: remove them, or give a new folder"] if older else []
+    return [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
 
 
 def render_film(

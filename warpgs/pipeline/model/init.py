@@ -82,9 +82,9 @@ class InitConfig:
             raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
         self.epipolar()  # its own checks
         if not 1e-3 <= self.scale_factor <= 10:
-            raise UsageError(f"init scale-factor {self.scale_factor} must lie between 0.001 and 10")
+            raise UsageError(f"init scale-factor {self.scale_factor} must be between 0.001 and 10")
         if not 0 < self.opacity < 1:
-            raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
+            raise UsageError(f"init opacity {self.opacity} must be between 0 and 1")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 
@@ -281,8 +281,8 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
     """
     if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
-            "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
-            "use --init.source random, or give a reconstruction with points"
+            "--init.source points needs 3D points that the training views saw, and the scene has none; use --init.source "
+            "random, or give a reconstruction with points"
         )
 
 

@@ -141,7 +141,7 @@ def render(
     """
     color = color_of(background)
     if color is None and background != "auto":
-        raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
+        raise UsageError(f"--background {background}: expected auto, black, white, #rrggbb or r,g,b")
     home, named = folder if file_of is None else folder.parent, out is not None
     out = home / f"path-{Path(path).stem.replace('.', '-')}" if out is None else out
     notes: list[str] = []
@@ -151,7 +151,7 @@ def render(
         notes = stored.notes()
     else:
         stored, notes = open_file(folder, *file_of, device_name, antialiased)
-        notes += ["black lies behind the Gaussians; --background gives another colour"] if color is None else []
+        notes += ["the background is black; choose another colour with --background"] if color is None else []
     tell = Stages()
     settings = replace(settings, background=color)
     plan = plan_film(stored, path, settings)

@@ -156,7 +156,7 @@ class MemoryPlan:
         if self.lowered_from is not None:
             text += f", so there will be at most {self.cap:,} Gaussians, not {self.lowered_from:,}"
         if self.graph_refused:
-            text += ", and steps are taken one by one, not as a CUDA graph, which would need more"
+            text += ", and steps run without a CUDA graph, which would need more"
         return text
 
 

@@ -49,7 +49,7 @@ class StoppingConfig:
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"stopping fraction {self.fraction} must lie above 0 and be at most 0.5")
+            raise UsageError(f"stopping fraction {self.fraction} must be above 0 and at most 0.5")
         if self.measurements < 1:
             raise UsageError(f"stopping measurements must be at least 1, not {self.measurements}")
         for name in ("noise", "min_gain_db"):
@@ -132,7 +132,7 @@ class Stopping:
         self.active = held >= MIN_BLOCKS and ends < planned and len(marks) > 1
         if not self.active:
             few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
-            return [Detail(f"stopping: nothing is held out, since {few}; the fit takes all its steps")]
+            return [Detail(f"early stopping is off, because {few}; the fit takes all its steps")]
         self.whole = context.views
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
         return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}")]

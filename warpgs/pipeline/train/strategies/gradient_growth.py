@@ -53,12 +53,12 @@ class DensityConfig:
             raise UsageError("density: every must be at least 1, start and reset every at least 0")
         for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
+                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1")
         for name in ("gradient", "clone_size", "prune_size"):
             if not getattr(self, name) >= 0:
                 raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
         if not 0 < self.reset_opacity < 1:
-            raise UsageError(f"density reset opacity {self.reset_opacity} must lie between 0 and 1")
+            raise UsageError(f"density reset opacity {self.reset_opacity} must be between 0 and 1")
 
     def times(self, steps: int) -> EventTimes:
         """Return the times of events in a fit of that many steps."""

@@ -59,10 +59,10 @@ class MCMCConfig:
             raise UsageError("mcmc: start must be at least 0 and every at least 1")
         for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
             if not 0 <= getattr(self, name) <= top:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must lie between 0 and {top}")
+                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and {top}")
         for name in ("noise_lr", "opacity_weight", "scale_weight"):
             if not 0 <= getattr(self, name) <= 1e9:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must lie between 0 and 1e9")
+                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and 1e9")
 
 
 @torch.no_grad()

@@ -43,14 +43,14 @@ class SamplerConfig:
         if self.depth not in ("rendered", "consistent"):
             raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, consistent")
         if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
-            raise UsageError("sampler: fraction must lie in (0, 1], gate quantile and min alpha in [0, 1)")
+            raise UsageError("sampler: fraction must be in (0, 1], gate quantile and min alpha in [0, 1)")
         if (
             not 0 < self.opacity < 1
             or not 0 < self.footprint < math.inf
             or self.border < 0
             or not 0 <= self.max_fraction < math.inf
         ):
-            raise UsageError("sampler: opacity must lie in (0, 1), footprint above 0, border and max fraction at 0 or above")
+            raise UsageError("sampler: opacity must be in (0, 1), footprint above 0, border and max fraction at 0 or above")
 
 
 def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | None, config: SamplerConfig) -> torch.Tensor:
