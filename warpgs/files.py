@@ -43,7 +43,7 @@ def replacing(
 
     Args:
         path: File to write or to replace.
-        check: Function that reads the temporary file back and raises where it is not whole.
+        check: Function that reads the temporary file back and raises where it is incomplete.
         size: Bytes that will be written, which must be there at the end; None where nobody knows.
         suffix: End of the temporary file's name, for libraries that take the format from it: none, .mp4 or .webm.
 
@@ -236,7 +236,7 @@ def read_file(path: Path, below: Path) -> bytes:
 
 
 def appending(path: Path) -> BinaryIO:
-    """Open a file to append to, made if it is not there; a link is not followed.
+    """Open a file to append to, made if it is missing; a link is not followed.
 
     Raises:
         OSError: It cannot be opened, or is a link or no regular file.
@@ -272,7 +272,7 @@ def move_folder(folder: Path, name: str) -> Path:
 
 
 def make_folder(folder: Path) -> bool:
-    """Make a folder, and those above it, where it is not there; return whether it was made.
+    """Make a folder, and those above it, where it is missing; return whether it was made.
 
     Raises:
         ResourceError: It cannot be made, or lies behind a link that is not followed.
@@ -295,7 +295,7 @@ def make_folder(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def writing_into(folder: Path) -> Iterator[bool]:
-    """Make a folder where it is not there, and follow no link below it in this block; gives whether it was made.
+    """Make a folder where it is missing, and follow no link below it in this block; gives whether it was made.
 
     Raises:
         ResourceError: It cannot be made or opened, or lies behind a link that is not followed.

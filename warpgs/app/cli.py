@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted.
 
     Raises:
-        SystemExit: Help of a command was asked for, or a word is wrong.
+        SystemExit: Help of a command was requested, or a word is wrong.
     """
     if arguments is None:
         use_utf8_names()

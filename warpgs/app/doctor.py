@@ -102,7 +102,7 @@ def _python() -> Iterable[Finding]:
 
 
 def _find(name: str) -> object:
-    """Look for a module without importing it, which for VTK takes long; ModuleNotFoundError where it is not there."""
+    """Look for a module without importing it, which for VTK takes long; ModuleNotFoundError where it is missing."""
     spec = importlib.util.find_spec(name)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {name!r}")

@@ -217,7 +217,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
 
 
 def _inside(path: Path, uri: object) -> bytes:
-    """Return the bytes of a data URI; other URIs are refused, so that a file cannot choose other files to open."""
+    """Return the bytes of a data URI; other URIs are rejected, so that a file cannot choose other files to open."""
     head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
     if not (head.startswith("data:") and head.endswith(";base64") and comma):
         raise malformed(path, "its numbers are in another file, which is not opened; make one .glb of both")

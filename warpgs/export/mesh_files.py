@@ -41,7 +41,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
             +y, as glTF wants it. None for +y. PLY has no upward direction.
 
     Raises:
-        DataError: A number is not finite, a triangle names a vertex that is not there, or the file would be too large.
+        DataError: A number is not finite, a triangle names a vertex that is missing, or the file would be too large.
         ResourceError: The file cannot be written.
         UsageError: The suffix is neither.
     """

@@ -40,7 +40,7 @@ from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
-"""Function that returns the next bytes of a section, exactly as many as are asked for."""
+"""Function that returns the next bytes of a section, exactly as many as are requested."""
 VERSION = 3
 """Version that is written by default: programs of any age read gzip."""
 VERSIONS = (2, 3, 4)
@@ -253,7 +253,7 @@ def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version
 
 
 def _fixed(data: np.ndarray) -> np.ndarray:
-    """Return coordinates of 24 bits [P, 9], signed, as whole numbers [P, 3]."""
+    """Return coordinates of 24 bits [P, 9], signed, as integers [P, 3]."""
     fixed = np.zeros((len(data), 3, 4), "u1")
     fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, whose shift down keeps the sign
     return fixed.reshape(-1, 12).view("<i4") >> 8

@@ -18,11 +18,11 @@ SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
 """Suffixes of other files that may hold maps, which a message names."""
 NONE = "none"
-"""Word in place of a folder, for no maps at all."""
+"""Word instead of a folder, for no maps at all."""
 CONFIDENCE = ".confidence"
 """End of the stem of a map of confidence."""
 MILLIMETRES = 0.001
-"""Length of a unit of whole numbers where the user names none, as RGB-D cameras store depth beside poses in metres."""
+"""Length of a unit of integers where the user names none, as RGB-D cameras store depth beside poses in metres."""
 MAX_DEPTH = 1e12
 """Largest depth [file units]; beyond it a map is taken for broken."""
 AXES = ("opencv", "opengl")
@@ -93,7 +93,7 @@ class MapFolder:
             found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "put"
             raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named as the images are")
         self.taken: set[str] = set()
-        """Keys of the maps that images asked for."""
+        """Keys of the maps that images requested."""
 
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for what there is not.
@@ -169,7 +169,7 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
 
 
 def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 where there is none.
+    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 for missing values.
 
     Raises:
         DataError: The file is no map, or its values cannot be depths.
@@ -206,7 +206,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
 def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
-    Whole numbers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
+    Integers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
 
     Raises:
         DataError: The file is no map, of another shape, or not in [0, 1].
@@ -226,7 +226,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
 
 
 def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 where there is none.
+    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
 
     Raises:
         DataError: The file is no map, or too many of its vectors have another length than 1.

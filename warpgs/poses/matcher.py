@@ -49,7 +49,7 @@ class Features:
     pixels: np.ndarray
     """Positions [px of the photograph], float32 [K, 2], pixel centres at +0.5."""
     descriptors: np.ndarray
-    """Descriptors times `WHOLE`, whole numbers as int16 [K, D]."""
+    """Descriptors times `WHOLE`, integers as int16 [K, D]."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
 
     Raises:
         DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
-        ResourceError: onnxruntime is not there.
+        ResourceError: onnxruntime is missing.
     """
     path = Path(path)
     data = read_model(path)

@@ -175,7 +175,7 @@ def build(request: ExportRequest) -> torch.nn.Module:
 
     Raises:
         ResourceError: A package of the extra ``export`` is missing.
-        DataError, UsageError: The weights cannot be had.
+        DataError, UsageError: The weights cannot be loaded.
     """
     import torch
 
@@ -200,7 +200,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
         Lines for the user, one on how well onnxruntime and torch agree.
 
     Raises:
-        DataError: The weights cannot be had, the file would be too large, or onnxruntime and torch disagree.
+        DataError: The weights cannot be loaded, the file would be too large, or onnxruntime and torch disagree.
         ResourceError: A package is missing, or the file cannot be written.
         UsageError: There are no weights of that network.
     """

@@ -239,7 +239,7 @@ def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> 
 
     Raises:
         UsageError: The kind or the range is not one of these.
-        DataError: A file is missing or malformed; flow of a pair may also raise it when first asked for.
+        DataError: A file is missing or malformed; flow of a pair may also raise it when first requested.
     """
     if value_range not in RANGES:
         raise UsageError(f"flow range {value_range!r} is not one of {', '.join(RANGES)}")

@@ -55,7 +55,7 @@ class Alignment:
     """Reason why the map is not used; empty where it is."""
 
     def depth(self, given: GivenDepth) -> np.ndarray:
-        """Return the z-depth [u] of a map, float32 [H, W]; 0 where there is none, or where it would not be positive."""
+        """Return the z-depth [u] of a map, float32 [H, W]; 0 for missing values, or where it would not be positive."""
         known = given.values > 0
         found = np.where(known, given.values.astype(np.float64) * self.scale + self.shift, 0)
         known &= found > 0
@@ -185,7 +185,7 @@ def votes(
 
     Args:
         views: All views, pinholes.
-        depths: Depth of each [u], 0 where there is none, shape [H, W] each.
+        depths: Depth of each [u], 0 for missing values, shape [H, W] each.
         index: Index of the view.
         near: Number of nearest views that are asked.
 

@@ -134,7 +134,7 @@ def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) 
 
     Raises:
         DataError: The file beside the model is not what it must be.
-        UsageError: A size was asked for that the graph does not allow.
+        UsageError: A size was requested that the graph does not allow.
     """
     given = {k: v for k, v in flags.items() if v}
     values = read_side_file(network.path) | given

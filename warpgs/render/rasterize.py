@@ -51,7 +51,7 @@ unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 
 
 
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
-"""Outputs of real numbers without a gradient: `Render` refuses one through them."""
+"""Outputs of real numbers without a gradient: `Render` rejects one through them."""
 
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""

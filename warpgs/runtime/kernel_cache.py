@@ -73,7 +73,7 @@ def choose_kernel_cache(configured: str | None = None) -> KernelCache:
 
 
 def _usual(configured: str | None) -> tuple[Path | None, str]:
-    """Return the folder that is asked for, or that Warp takes by itself; or None, and the reason."""
+    """Return the folder that is requested, or that Warp takes by itself; or None, and the reason."""
     asked = configured or os.environ.get("WARP_CACHE_PATH")
     if asked:
         folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
@@ -88,7 +88,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
 
 
 def _fault(folder: Path) -> str:
-    """Return why a folder cannot be used, made if it is not there; empty where it can."""
+    """Return why a folder cannot be used, made if it is missing; empty where it can."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as f:

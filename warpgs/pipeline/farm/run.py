@@ -45,10 +45,10 @@ class EngineRequest:
 
 
 def make_engine(request: EngineRequest, device: str) -> Engine:
-    """Make the engine that is asked for.
+    """Make the engine that is requested.
 
     Raises:
-        ResourceError: The device is not there.
+        ResourceError: The device is missing.
         UsageError: There is no such engine, what it needs is not installed, it cannot have so many slots, or other users can
             write to ``slurm_folder``.
     """

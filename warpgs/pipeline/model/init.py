@@ -314,7 +314,7 @@ def initial_points(
     ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines on what is being done.
 
     Raises:
-        DataError: Points were asked for and the scene has none that the training views saw.
+        DataError: Points were requested and the scene has none that the training views saw.
     """
     check_points(views, points, config)
     if config.source == "hull":

@@ -79,7 +79,7 @@ def evaluate(
         by_coverage: Whether to split the scores by how many training views saw what a pixel shows.
 
     Raises:
-        DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
+        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the weights are
             no weights.
         ResourceError: Another process writes into the folder, or it cannot be written.
     """
@@ -135,7 +135,7 @@ def render(
         antialiased: Whether that file was trained with antialiasing.
 
     Raises:
-        DataError: The folder is no run, or the file, its cameras or the keyframes cannot be read.
+        DataError: The folder is not a run, or the file, its cameras or the keyframes cannot be read.
         ResourceError: A file cannot be written.
         UsageError: The path is unknown, the background is no colour, or a number is out of its range.
     """
@@ -181,7 +181,7 @@ def repeat_failed_step(path: Path, device_name: str) -> list[str]:
 
     Raises:
         DataError: The file holds no such step.
-        ResourceError: The device is not there.
+        ResourceError: The device is missing.
     """
     device, where = choose_device(device_name)
     return [f"{path}, computed again {where}:", *findings(read_failed_step(path, device))]

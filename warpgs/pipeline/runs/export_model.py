@@ -75,7 +75,7 @@ def export(
         format: Format to write, as in `write_gaussians`; None for the one that the name says.
 
     Raises:
-        DataError: The folder is no run, or nothing is left of its model.
+        DataError: The folder is not a run, or nothing is left of its model.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
         UsageError: The name says no format, or not the given one, or a filter is invalid.
     """
@@ -129,7 +129,7 @@ def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
 
 
 def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
-    """Check that only a rotation is asked for.
+    """Check that only a rotation is requested.
 
     Raises:
         UsageError: Another filter is, which cameras do not have, or a format of Gaussians.

@@ -37,8 +37,8 @@ def mesh(
         Lines for the user.
 
     Raises:
-        DataError: The folder is no run, or its training views see no surface.
-        ResourceError: Memory does not suffice, the device is not there, or the file cannot be written.
+        DataError: The folder is not a run, or its training views see no surface.
+        ResourceError: Memory does not suffice, the device is missing, or the file cannot be written.
         UsageError: The suffix is not supported, or an option is out of range.
     """
     check_suffix(target)

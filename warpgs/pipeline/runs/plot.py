@@ -110,7 +110,7 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
         device_name: auto, cpu or cuda.
 
     Raises:
-        DataError: The folder is no run, or the scene has no points to show.
+        DataError: The folder is not a run, or the scene has no points to show.
         ResourceError: This machine cannot render, or the file cannot be written.
         UsageError: The file is no .png.
     """

@@ -116,7 +116,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     """Return the device for auto, cpu, cuda or cuda:N, or a device itself, and a phrase that names it.
 
     Raises:
-        ResourceError: CUDA was asked for and is not there.
+        ResourceError: CUDA was requested and is missing.
         UsageError: The name is none of these.
     """
     if isinstance(name, torch.device):
@@ -149,7 +149,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
         The split, and notes for the user: the choice made, masks and held-out views that make scores mean less.
 
     Raises:
-        DataError: A view that is named is not there.
+        DataError: A view that is named is missing.
         UsageError: The split is not understood.
     """
     split = split_views(scene, "all" if spec is None else spec)

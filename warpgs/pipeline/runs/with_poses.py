@@ -60,7 +60,7 @@ def lost_lines(out: Path | None) -> list[str]:
     """Return a line on the photographs of a run that have no pose, and so no part in it; an empty list where there are none.
 
     Raises:
-        DataError: The record of the run's poses is not whole.
+        DataError: The record of the run's poses is incomplete.
     """
     if out is None or not (out / POSED_SCENE / JSON).is_file():
         return []

@@ -61,7 +61,7 @@ def prepare(
 
     Raises:
         DataError: There is nothing to start from.
-        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. A given map is of
+        UsageError: A view's camera cannot be rendered: its model is missing, or it has other coefficients. A given map is of
             another size or not finite. Or the start or
             the strategy compares views, and a camera is no pinhole.
     """
@@ -133,7 +133,7 @@ def samples(config: FitConfig) -> bool:
 
 
 def needs_priors(config: FitConfig) -> bool:
-    """Return whether the strategy, a loss term or a network's depth in place of a given one needs the priors of the views."""
+    """Return whether the strategy, a loss term or a network's depth instead of a given one needs the priors of the views."""
     by_strategy = find_strategy(config.strategy).needs_priors(config.groups())
     return by_strategy or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 

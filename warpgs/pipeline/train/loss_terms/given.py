@@ -85,8 +85,8 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
     """Compute the mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 where no pixel has both.
 
     Args:
-        normals: Unit normals, 0 where there is none, shape [H, W, 3].
-        target: Given normals, 0 where there is none, shape [H, W, 3]; shorter ones, means of several, count less.
+        normals: Unit normals, 0 for missing values, shape [H, W, 3].
+        target: Given normals, 0 for missing values, shape [H, W, 3]; shorter ones, means of several, count less.
         mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too

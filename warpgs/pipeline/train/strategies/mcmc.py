@@ -74,7 +74,7 @@ def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tens
 
     Args:
         opacities: o of the one Gaussian, in (0, 1), shape [M].
-        copies: N, whole numbers from 1 to `MAX_COPIES`, shape [M].
+        copies: N, integers from 1 to `MAX_COPIES`, shape [M].
 
     Returns:
         New opacities and factors of the scales, shape [M] each, of the type of ``opacities``.

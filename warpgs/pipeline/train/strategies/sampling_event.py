@@ -147,7 +147,7 @@ class SampledView:
     gate: torch.Tensor
     """Pixels that could be sampled, bool, shape [H, W]."""
     quantile: float
-    """Quantile of the geometric score that the gate used; lower than asked for where too few pixels passed."""
+    """Quantile of the geometric score that the gate used; lower than requested where too few pixels passed."""
     at: torch.Tensor
     """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
 
