@@ -84,7 +84,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.capacity is not None and options.capacity > MAX_INSTANCES:
         raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
     if options.error_bound and options.capacity is not None:
-        raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
+        raise UsageError("error_bound and capacity exclude each other: leave one out")
     return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
 
 

@@ -114,7 +114,7 @@ def _unused_networks(config: FitConfig) -> list[str]:
     """Return notes on the networks that are named although nothing in the fit reads priors."""
     switches = {"depth": "--depth-guides or --method.s-geometry", "segmentation": "--method.s-semantic"}
     named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
-    return [f"--{kind}-model is not used, since no part of this fit reads its map; {switches[kind]} does" for kind in named]
+    return [f"--{kind}-model is not used: this fit needs no such map; to use it, add {switches[kind]}" for kind in named]
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
