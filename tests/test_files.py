@@ -163,7 +163,7 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path, monkeypatch):
     with pytest.raises(UsageError, match="refusing to replace the current directory"), filling(Path(".")):
         pass
     monkeypatch.setattr(os, "rename", full)
-    with pytest.raises(ResourceError, match="d: cannot be made"), filling(tmp_path / "d"):
+    with pytest.raises(ResourceError, match="d: cannot be created"), filling(tmp_path / "d"):
         pass
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
 
@@ -172,7 +172,7 @@ def test_a_folder_that_cannot_be_made(tmp_path):
     assert make_folder(tmp_path / "a" / "b") and not make_folder(tmp_path / "a")
     (tmp_path / "file").touch()
     for name in ("file", "file/below", "x" * 300):
-        with pytest.raises(ResourceError, match="cannot be made"):
+        with pytest.raises(ResourceError, match="cannot be created"):
             make_folder(tmp_path / name)
 
 

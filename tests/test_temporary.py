@@ -170,7 +170,7 @@ def test_leftovers_in_a_folder_that_is_made_anew_go(tmp_path):
     (tmp_path / "a").mkdir()
     with open_folder(tmp_path / "a") as above:
         left = TemporaryFolder(above)
-        with pytest.raises(Exception, match="cannot be made"), filling(tmp_path / "a"):
+        with pytest.raises(Exception, match="cannot be created"), filling(tmp_path / "a"):
             pass  # another process works in it
         with replacing(tmp_path / "a" / "b") as file:
             file.touch()

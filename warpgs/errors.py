@@ -43,7 +43,7 @@ class FolderHeldError(ResourceError):
 
 
 class OutOfMemoryError(ResourceError):
-    """A step of a fit asked for more memory than the device had."""
+    """A step of a fit requested more memory than the device had."""
 
     def __init__(self, message: str, intact: bool):
         """Take a message, and whether the state of the fit is still that before the step."""

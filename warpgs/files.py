@@ -43,7 +43,7 @@ def replacing(
 
     Args:
         path: File to write or to replace.
-        check: Function that reads the temporary file back and raises where it is not whole.
+        check: Function that reads the temporary file back and raises where it is incomplete.
         size: Bytes that will be written, which must be there at the end; None where nobody knows.
         suffix: End of the temporary file's name, for libraries that take the format from it: none, .mp4 or .webm.
 
@@ -77,7 +77,7 @@ def _replaced(
                 if not os.path.samestat(written, folder.lstat(temporary.name)):
                     raise OSError(errno.EIO, "another file took the place of the temporary one")
                 if size is not None and found != size:  # some file systems report no error
-                    raise OSError(errno.EIO, f"{found} of {size} bytes are there")
+                    raise OSError(errno.EIO, f"only {found} of {size} bytes were written")
                 if check is not None:
                     check(_reachable(folder) / temporary.name)
                 _replace(folder, temporary, path.name)
@@ -143,8 +143,8 @@ def _clear(above: Folder, name: str) -> None:
 
 def _not_made(folder: Path, error: OSError) -> ResourceError:
     if isinstance(error, RefusedError):
-        return ResourceError(f"{folder}: cannot be made, as {error}")
-    return ResourceError(f"{folder}: cannot be made ({error.strerror or error}). {_remedy(error)}")
+        return ResourceError(f"{folder}: cannot be created, as {error}")
+    return ResourceError(f"{folder}: cannot be created ({error.strerror or error}). {_remedy(error)}")
 
 
 def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
@@ -176,8 +176,8 @@ def _sync(folder: Folder) -> None:
         folder.sync()
     except OSError as e:
         raise ResourceError(
-            f"{folder.path}: was written into, but the disk does not confirm it ({e.strerror or e}); check the disk, and what "
-            "was written last"
+            f"{folder.path}: was written, but the disk does not confirm it ({e.strerror or e}); check the disk and the last "
+            f"written files"
         ) from e
 
 
@@ -236,7 +236,7 @@ def read_file(path: Path, below: Path) -> bytes:
 
 
 def appending(path: Path) -> BinaryIO:
-    """Open a file to append to, made if it is not there; a link is not followed.
+    """Open a file to append to, made if it is missing; a link is not followed.
 
     Raises:
         OSError: It cannot be opened, or is a link or no regular file.
@@ -272,7 +272,7 @@ def move_folder(folder: Path, name: str) -> Path:
 
 
 def make_folder(folder: Path) -> bool:
-    """Make a folder, and those above it, where it is not there; return whether it was made.
+    """Make a folder, and those above it, where it is missing; return whether it was made.
 
     Raises:
         ResourceError: It cannot be made, or lies behind a link that is not followed.
@@ -287,7 +287,7 @@ def make_folder(folder: Path) -> bool:
         raise ResourceError(f"{folder}: cannot be written, as {e}") from e
     except OSError as e:
         raise ResourceError(
-            f"{folder}: cannot be written, as the folder cannot be made ({e.strerror or e}); "
+            f"{folder}: cannot be written, as the folder cannot be created ({e.strerror or e}); "
             f"{'free some disk space, or ' if e.errno in FULL else ''}choose another folder"
         ) from e
     return made
@@ -295,7 +295,7 @@ def make_folder(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def writing_into(folder: Path) -> Iterator[bool]:
-    """Make a folder where it is not there, and follow no link below it in this block; gives whether it was made.
+    """Make a folder where it is missing, and follow no link below it in this block; gives whether it was made.
 
     Raises:
         ResourceError: It cannot be made or opened, or lies behind a link that is not followed.

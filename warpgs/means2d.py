@@ -56,7 +56,7 @@ def projected_means(projected: torch.Tensor, absgrad: bool) -> torch.Tensor:
             setattr(means2d, name, found if before is None else before + found)
 
     def refuse(gradient: torch.Tensor) -> None:
-        raise RuntimeError("means2d has no gradient into the Gaussians: take Render.projected[..., :2], which has one")
+        raise RuntimeError("means2d passes no gradient to the Gaussians: use Render.projected[..., :2] instead")
 
     if projected.requires_grad:
         means2d.requires_grad_().register_hook(refuse)

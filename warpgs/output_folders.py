@@ -187,10 +187,10 @@ def output_folder(folder: Path) -> Iterator[None]:
     """Have all that is written below a folder, in this block, go through its descriptor and follow no link.
 
     The folder itself may be reached through links, unless it lies below another one that is open. Where another folder takes
-    its place meanwhile, the next write is refused.
+    its place meanwhile, the next write is rejected.
 
     Raises:
-        OSError: It is not there, or lies behind a link below a folder that is open.
+        OSError: It is missing, or lies behind a link below a folder that is open.
     """
     path = folder.absolute()
     with _LOCK:
@@ -219,7 +219,7 @@ def open_folder(path: Path, make: bool = False) -> Folder:
 
     Args:
         path: The folder.
-        make: Whether to make folders on the way that are not there; below an open folder alone.
+        make: Whether to make folders on the way that are missing; below an open folder alone.
 
     Raises:
         OSError: It cannot be opened, or a link lies on the way.
@@ -283,9 +283,9 @@ def _again(root: _Root) -> Folder:
 
 
 def _entered(above: Folder, name: str, make: bool) -> Folder:
-    """Open a folder in another one, and make it first if it is not there and shall be."""
+    """Open a folder in another one, and make it first if it is missing and shall be."""
     if name == os.pardir:
-        raise RefusedError(f"{above.path / name}: leads out of the folder; name the place without {os.pardir}")
+        raise RefusedError(f"{above.path / name}: points outside the folder; name the place without {os.pardir}")
     try:
         return above.folder(name)
     except FileNotFoundError:

@@ -120,7 +120,7 @@ class Registry(Generic[T]):
         """Return the class of a name, importing ``module:Class`` or ``path/to/file.py:Class``: runs that code.
 
         Raises:
-            UsageError: The module, file or class is not there, or the class is of another kind.
+            UsageError: The module, file or class is missing, or the class is of another kind.
         """
         if ":" not in spec or spec in self._classes:
             return self.find(spec)
@@ -149,7 +149,7 @@ def load_object(kind: str, spec: str) -> object:
         spec: Place and name.
 
     Raises:
-        UsageError: The module, file or object is not there.
+        UsageError: The module, file or object is missing.
     """
     where, _, name = spec.rpartition(":")
     try:
@@ -173,7 +173,7 @@ def own_code(classes: Iterable[type]) -> dict[str, str]:
 
 @functools.cache
 def _digest(cls: type) -> str:
-    """Return the SHA-256 of the file of a class when first asked for, as it may be edited later; empty without one."""
+    """Return the SHA-256 of the file of a class when first requested, as it may be edited later; empty without one."""
     return module_digest(sys.modules.get(cls.__module__))
 
 
@@ -226,8 +226,8 @@ def module_of(where: str) -> ModuleType:
     """Return the module of a dotted name or of the path of a .py file, importing it: runs that code.
 
     Raises:
-        ImportError: The module is not there.
-        OSError: The file is not there.
+        ImportError: The module is missing.
+        OSError: The file is missing.
     """
     return _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
 

@@ -214,7 +214,7 @@ class ViewDepth:
     searched: bool = True
     """False where the view's depth was not looked for, because there are others enough."""
     given: np.ndarray | None = None
-    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 where there is none; None without a map."""
+    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None without a map."""
 
     @property
     def coverage(self) -> float:

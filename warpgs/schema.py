@@ -23,9 +23,9 @@ MAX_DEPTH = 50
 MAX_PARTS = 2**19
 """Number of lists and objects, each of which takes some thirty times as much memory as text."""
 MAX_WHOLE = 2**63 - 1
-"""Largest whole number: that of 64 bits."""
+"""Largest integer: that of 64 bits."""
 MAX_NUMBER = 1e300
-"""Largest number: no whole number beyond it becomes a float."""
+"""Largest number: no integer beyond it becomes a float."""
 
 Schema = Callable[[Any, str], None]
 
@@ -93,7 +93,7 @@ def read(path: Path, below: Path | None = None) -> Any:
 
     Raises:
         OSError: It cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
-        SchemaError: `parse` refuses what it holds.
+        SchemaError: `parse` rejects what it holds.
     """
     return parse(read_input(path, MAX_BYTES, below))
 
@@ -130,7 +130,7 @@ def one_of(*values: Any) -> Schema:
 
 
 def whole(low: int = -MAX_WHOLE, high: int = MAX_WHOLE) -> Schema:
-    """Return the schema of whole numbers from ``low`` to ``high``."""
+    """Return the schema of integers from ``low`` to ``high``."""
     wanted = "a whole number of 64 bits" if (low, high) == (-MAX_WHOLE, MAX_WHOLE) else f"a whole number from {low} to {high}"
 
     def check(value: Any, place: str) -> None:

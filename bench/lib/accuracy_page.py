@@ -35,9 +35,10 @@ def _most(rows: list[dict]) -> str:
     images = {k: max(_worst(row)[k] for row in rows) for k in ("E mean", "E max", "E depth")}
     of = {k: _e(max(e[k] for e in gradients)) for k in ("rel L2", "1 - cosine", "bias")}
     return (
-        f"Largest over all scenes: mean E {_e(images['E mean'])}, max E {_e(images['E max'])} (depth {_e(images['E depth'])}); "
-        f"of gradients relative L2 {of['rel L2']}, 1 - cosine {of['1 - cosine']}, bias {of['bias']}, wrong zeros "
-        f"{sum(e['wrong zeros'] for e in gradients)}; pixels flipped {sum(row['flips'] for row in rows)}."
+        f"Largest errors over all scenes. Images: mean E {_e(images['E mean'])}, max E {_e(images['E max'])}, depth "
+        f"{_e(images['E depth'])}. Gradients: relative L2 {of['rel L2']}, 1 - cosine {of['1 - cosine']}, bias {of['bias']}, "
+        f"wrong zeros {sum(e['wrong zeros'] for e in gradients)}. "
+        f"Pixels with a flipped decision: {sum(row['flips'] for row in rows)}."
     )
 
 

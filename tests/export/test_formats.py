@@ -305,7 +305,7 @@ def set_to(*keys, value):
         (set_to("means", "files", 0, value="../../etc/passwd"), "not in the archive"),
         (set_to("means", "mins", 0, value=1e300), "not finite"),
         (set_to("scales", "codebook", value=[1.0]), "codebook"),
-        (set_to("scales", value=None), "makes no sense"),
+        (set_to("scales", value=None), "is invalid"),
         (set_to("shN", "count", value=3), "beyond its 3 rows"),
         (set_to("shN", "bands", value=7), "7 degrees"),
         (lambda meta, members: members.update({"quats.webp": bytes(10**7)}), "would take"),

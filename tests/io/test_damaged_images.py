@@ -178,7 +178,7 @@ def test_a_bmp_or_webp_that_is_shorter_than_its_header_says(tmp_path):
     data[22:26] = struct.pack("<i", 80)
     refused(tmp_path, bytes(data), "it ends early")
     data[22:26], data[30:34] = struct.pack("<i", 64), struct.pack("<I", 1)
-    refused(tmp_path, bytes(data), "compressed, which leaves damage unseen")
+    refused(tmp_path, bytes(data), "compressed, so damage would not be detected")
 
 
 # ---- TIFF ------------------------------------------------------------------------------------------------------------

@@ -221,7 +221,7 @@ def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
     content["frames"][0]["file_path"] = "../elsewhere.png"
     root = scenes.write_transforms(tmp_path / "scene", content)
     scenes.save(tmp_path / "elsewhere.png", scenes.image(0))
-    with pytest.raises(DataError, match=r"frame 0: '../elsewhere.png' leads out of the scene folder.*--allow-outside"):
+    with pytest.raises(DataError, match=r"frame 0: '../elsewhere.png' points outside the scene folder.*--allow-outside"):
         load_scene(root)
     scene = load_scene(root, allow_outside=True)
     assert any(v.name.startswith("outside/") and v.name.endswith("elsewhere.png") for v in scene.views)

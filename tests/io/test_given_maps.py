@@ -170,7 +170,7 @@ def test_sizes_beyond_the_limit_and_links_are_refused(tmp_path):
         (maps / "photo0.npy").symlink_to(tmp_path / "outside.npy")
     except OSError:
         pytest.skip("this system does not let the user make links")
-    with pytest.raises(DataError, match=r"photo0\.npy: a link leads out of the folder of maps"):
+    with pytest.raises(DataError, match=r"photo0\.npy: a link points outside the folder of maps"):
         load_scene(scene, depths=maps)
     assert load_scene(scene, depths=maps, allow_outside=True).views[0].depth is not None
     if hasattr(os, "mkfifo"):

@@ -92,7 +92,7 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
     stored = Image.fromarray(mask.astype(np.uint8) * 255)
     stored.getexif()[0x112] = orientation
     assert (loaded.mask == (np.array(ImageOps.exif_transpose(stored)) > 0)).all()
-    assert "turned by the EXIF tag, as the camera asks" in loaded.done
+    assert "rotated by the EXIF orientation" in loaded.done
 
 
 def test_size_within_a_pixel_is_rescaled_and_others_are_refused(tmp_path):

@@ -27,7 +27,7 @@ def moved_out(scene, path):
 
 
 def asks(scene):
-    with pytest.raises(DataError, match=r"leads out of the scene folder.*--allow-outside"):
+    with pytest.raises(DataError, match=r"points outside the scene folder.*--allow-outside"):
         load_scene(scene)
     assert len(load_scene(scene, allow_outside=True).views) == scenes.VIEWS
 

@@ -37,7 +37,7 @@ def test_the_complete_format_is_taken_with_a_note(tmp_path):
     scenes.write_llff(tmp_path)
     scene = load_scene(tmp_path)
     assert scene.format == "llff"
-    assert scene.notes[0] == "the COLMAP reconstruction in sparse/0 lacks images.bin; passed over, llff is complete"
+    assert scene.notes[0] == "the COLMAP reconstruction in sparse/0 lacks images.bin; llff is complete and is used instead"
 
 
 def test_a_complete_reconstruction_elsewhere_is_found(tmp_path):
@@ -203,8 +203,8 @@ def patched_pose(tmp_path, **changes):
         ({"_5": "1e100"}, r"image 'photo1.png': its camera centre .* is beyond 1e\+12 units"),
         ({"_9": "photo0.png"}, r"the image 'photo0.png' is listed twice"),
         ({"_9": "gone.png"}, r"images/gone.png: the image file is missing; restore it"),
-        ({"_9": "../images.png"}, r"'../images.png' leads out of the scene folder"),
-        ({"_9": "/etc/passwd"}, r"'/etc/passwd' leads out of the scene folder"),
+        ({"_9": "../images.png"}, r"'../images.png' points outside the scene folder"),
+        ({"_9": "/etc/passwd"}, r"'/etc/passwd' points outside the scene folder"),
         ({"_9": ".."}, r"images.txt: '..' is not a file name"),
     ],
 )
@@ -277,8 +277,8 @@ SCALED = (np.array(scenes.opengl(1)) @ np.diag([2.0, 2, 2, 1])).tolist()
         ({"file_path": "a\0b"}, r"frame 1: .* is not a file name"),
         ({"file_path": "\ud800.png"}, r"frame 1: .* is not a file name"),
         ({"file_path": "/"}, r"frame 1: '/' is not a file name"),
-        ({"file_path": "images/../../x.png"}, r"frame 1: .* leads out of the scene folder; .*--allow-outside"),
-        ({"mask_path": "../m.png"}, r"frame 1 .*, mask: '../m.png' leads out of the scene folder"),
+        ({"file_path": "images/../../x.png"}, r"frame 1: .* points outside the scene folder; .*--allow-outside"),
+        ({"mask_path": "../m.png"}, r"frame 1 .*, mask: '../m.png' points outside the scene folder"),
         ({"mask_path": "m.png"}, r"m.png: the image file is missing"),
         ({"file_path": "images/photo0.png"}, r"the image 'images/photo0.png' is listed twice"),
         ({"fl_x": -1}, r"frame 1 .*: focal lengths \[-1.0, 20.0\] px must be positive"),

@@ -189,7 +189,7 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
     )
     render_film(model, plan, tmp_path / "images", FilmSettings())
     less = render_film(model, plan_film(model, "turntable", FilmSettings(frames=5)), tmp_path / "images", FilmSettings())
-    assert less.notes[-1].startswith("3 older images lie in ")
+    assert less.notes[-1].startswith("3 older images are also in ")
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 8 and image.size == (40, 32)
     with pytest.raises(UsageError, match="images of coverage are PNG files"):

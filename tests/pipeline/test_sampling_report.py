@@ -206,7 +206,7 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
             fit.advance()
     assert fit.strategy.on_event is None and len(fit.messages) == 1
     assert "the report lacks images of sampling events" in fit.messages[0]
-    assert ("no space left" if cause == "disk" else "cannot be made") in fit.messages[0]
+    assert ("no space left" if cause == "disk" else "cannot be created") in fit.messages[0]
 
 
 def test_an_error_of_ours_in_an_image_is_not_hidden(tmp_path, monkeypatch):

@@ -102,7 +102,7 @@ def test_renders_are_transparent_unless_a_colour_is_named(run, tmp_path, capsys)
     for name, background in (("white", [1, 1, 1]), ("#0000ff", [0, 0, 1])):
         np.testing.assert_allclose(alpha * colors + (1 - alpha) * background, images[name], atol=2.5 / 255)
     assert main(["render", str(run), "--out", str(tmp_path / "x"), "--background", "mean"]) == 2
-    assert "a render takes auto, black, white" in capsys.readouterr().err
+    assert "expected auto, black, white" in capsys.readouterr().err
     opaque = dataclasses.replace(stored, transparent=False)
     file, film = render_path(opaque, [stored.scene_cameras[stored.train[0]]], out=tmp_path / "opaque")
     assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape[2] == 3 and film.name == "film.mp4"

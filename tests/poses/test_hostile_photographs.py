@@ -76,7 +76,7 @@ def test_links_lead_out_only_where_that_is_allowed(folder, what):
         else:
             link(folder / "x" / "y.png", private / "d.png")
     for command in commands(folder):
-        with pytest.raises(DataError, match=r"a link leads out of the folder of photographs; .*--allow-outside"):
+        with pytest.raises(DataError, match=r"a link points outside the folder of photographs; .*--allow-outside"):
             command()
     assert not (folder.parent / "out").exists() and not (folder.parent / "run" / "scene").exists()
     with pytest.raises(DataError, match="leads out"):

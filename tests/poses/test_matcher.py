@@ -59,7 +59,7 @@ def test_a_network_of_another_kind_is_refused_before_any_work(sfm, tmp_path, pho
     words = ["poses", str(photographs), "--out", str(tmp_path / "out"), "--matcher"]
     assert main([*words, network]) == main([*words, str(tmp_path / "none.onnx")]) == DataError.exit_code
     said = capsys.readouterr().err
-    assert "depth.onnx: is no matcher, as it has no output keypoints and scores and descriptors" in said
+    assert "depth.onnx: is not a matcher, because it lacks the output keypoints and scores and descriptors" in said
     assert "none.onnx: the model cannot be read" in said and not (tmp_path / "out").exists()
 
 

@@ -20,23 +20,23 @@ from warpgs.temporary import system_folder
 from warpgs.version import __version__
 
 COMMANDS = {
-    "demo": "write a synthetic scene to try things with",
-    "poses": "find the poses of photographs or a video; gives a scene folder",
+    "demo": "write a synthetic scene",
+    "poses": "find the poses of photographs or a video; writes a scene folder",
     "fit": "fit Gaussians to a scene folder and fill a run folder",
     "view": "show a run, a PLY file or a running fit in a browser",
     "render": "render a run as a film: along a path, its views, or keyframes",
     "plot": "show a run's cameras and Gaussians in one image",
     "priors": "show depth and saliency before a fit, or write networks as ONNX",
-    "export": "write a run's Gaussians to a file, or to a page",
+    "export": "write a run's Gaussians to a file or a web page",
     "convert": "write a file of Gaussians or cameras in another format",
-    "mesh": "make a mesh of the surfaces that a run's views see: .ply, .glb",
-    "prune": "shrink a finished model as far as its training views allow",
+    "mesh": "make a mesh of a run's surfaces: .ply, .glb",
+    "prune": "shrink a finished model within a PSNR budget",
     "eval": "score a run again on its held-out views",
     "compare": "fit presets to scenes with several seeds; tables and plots",
-    "ablate": "fit a preset with its parts off one at a time; the same tables",
-    "convert-lpips": "join LPIPS weights into the file that --lpips-weights takes",
+    "ablate": "fit a preset with one part off at a time; tables and plots",
+    "convert-lpips": "convert LPIPS weights for --lpips-weights",
     "farm": "fit many scenes, on all GPUs, with Ray or on Slurm",
-    "doctor": "check this machine: devices, optional packages, remedies",
+    "doctor": "check this machine: devices, packages, fixes",
 }
 """Commands by name, in the order of the help, each with a line about it."""
 
@@ -75,7 +75,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted.
 
     Raises:
-        SystemExit: Help of a command was asked for, or a word is wrong.
+        SystemExit: Help of a command was requested, or a word is wrong.
     """
     if arguments is None:
         use_utf8_names()

@@ -102,7 +102,7 @@ def _python() -> Iterable[Finding]:
 
 
 def _find(name: str) -> object:
-    """Look for a module without importing it, which for VTK takes long; ModuleNotFoundError where it is not there."""
+    """Look for a module without importing it, which for VTK takes long; ModuleNotFoundError where it is missing."""
     spec = importlib.util.find_spec(name)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {name!r}")
@@ -151,7 +151,7 @@ def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
     memory = machine_memory()
     if memory is None:
-        assumed = f"the system does not report it;{format_bytes(ASSUMED_BYTES)} are assumed"
+        assumed = f"the system does not report its memory;{format_bytes(ASSUMED_BYTES)} are assumed"
         yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory

@@ -75,7 +75,7 @@ def either(flags: Any, name: str) -> bool | None:
 TARGETS = ("--to", "--out")
 """Flags that name the file to write."""
 MAX_WHOLE = 2**63 - 1
-"""Largest whole number that a flag takes: that of 64 bits."""
+"""Largest integer that a flag takes: that of 64 bits."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
 MAX_NUMBER = 3e38
@@ -83,7 +83,7 @@ MAX_NUMBER = 3e38
 
 
 def _whole(words: list[str]) -> int:
-    """Return the whole number that a word stands for; ValueError where it is none, or none of 64 bits."""
+    """Return the integer that a word stands for; ValueError where it is none, or none of 64 bits."""
     if not re.fullmatch(r"[+-]?[0-9][0-9_]{0,40}", words[0]) or abs(number := int(words[0])) > MAX_WHOLE:
         raise ValueError(f"expected an integer of at most 2^63 - 1, got {words[0][:40]!r}")
     return number
@@ -124,7 +124,7 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
         description: Words about the command, for the help.
 
     Raises:
-        SystemExit: A word is wrong, or help was asked for.
+        SystemExit: A word is wrong, or help was requested.
         UsageError: The flag is unknown.
     """
     import tyro
@@ -161,7 +161,7 @@ def _refuse_unknown_flag(kind: type, arguments: list[str], program: str) -> None
 
 
 def _refuse_lone_side(kind: type, arguments: list[str]) -> None:
-    """Raise UsageError for a size that is not two whole numbers."""
+    """Raise UsageError for a size that is not two integers."""
     for flag in {"--size"} & {*flag_names(kind)}:
         at = next((i for i, word in enumerate(arguments) if word.partition("=")[0] == flag), None)
         if at is not None and not ("=" not in arguments[at] and _are_whole(arguments[at + 1 : at + 3])):
@@ -169,7 +169,7 @@ def _refuse_lone_side(kind: type, arguments: list[str]) -> None:
 
 
 def _are_whole(words: list[str]) -> bool:
-    """Return whether words are two whole numbers."""
+    """Return whether words are two integers."""
     return len(words) == 2 and all(re.fullmatch(r"[+-]?[0-9]+", word) for word in words)
 
 
@@ -182,9 +182,9 @@ def _refuse_stray_word(kind: type, arguments: list[str], program: str, complaint
     known, given = {*flag_names(kind)}, {word.partition("=")[0] for word in arguments}
     target = next((flag for flag in TARGETS if flag in known - given), None)
     hint = (
-        f"did you mean {target} {words[0]}?" if target and Path(words[0]).suffix else f"`{program} --help` tells what it takes"
+        f"did you mean {target} {words[0]}?" if target and Path(words[0]).suffix else f"`{program} --help` lists its arguments"
     )
-    raise UsageError(f"{words[0]} is one word too many; {hint}")
+    raise UsageError(f"{words[0]} is an extra argument; {hint}")
 
 
 def check_range(flag: str, value: float, low: float, high: float) -> None:

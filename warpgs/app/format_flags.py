@@ -31,13 +31,13 @@ def format_flags(arguments: list[str]) -> type:
         """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
         clean: tyro.conf.FlagCreatePairsOff[bool] = False
         """Remove floaters and needles: Gaussians that no training view of a run sees, larger than the scene, or long and thin.
-        Done unless the file is a .ply."""
+        Default: on, except for .ply files."""
         no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
-        """Keep them."""
+        """Keep floaters and needles."""
         sh_degree: int | None = None
         """Highest degree of harmonics; 0 for colours without view dependence. Default: all."""
         rotate: str | None = None
-        """Turn the model about the origin: x,y,z,degrees; of a run also level (up as the cameras say)."""
+        """Rotate the model about the origin: x,y,z,degrees; or, for a run, level (the cameras' up becomes up)."""
 
     fields: list[tuple[str, Any, Any]] = []
     for name, kind in _with_options(word_after(arguments, "--format")).items():

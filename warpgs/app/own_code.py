@@ -18,7 +18,7 @@ def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
         load: Function that loads it.
 
     Raises:
-        UsageError: It is not there, or its code does not run; the message names the line.
+        UsageError: It is missing, or its code does not run; the message names the line.
     """
     try:
         return load()

@@ -30,7 +30,7 @@ def malformed(path: Path, what: str) -> DataError:
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
-    """Return an array, float32 [n, *shape], of pieces of at most `ROWS` rows that are asked for in their order.
+    """Return an array, float32 [n, *shape], of pieces of at most `ROWS` rows that are requested in their order.
 
     What leaves float32 becomes an infinity, which `gaussians_of` names.
     """

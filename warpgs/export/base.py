@@ -30,7 +30,7 @@ BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
     NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
-"""Errors of decoders, those of the standard library, of zstandard and our own, about content that makes no sense: zipfile
+"""Errors of decoders, those of the standard library, of zstandard and our own, about invalid content: zipfile
 reports encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
 
 
@@ -75,7 +75,7 @@ class Format:
         Raises:
             UsageError: The format does not define it.
         """
-        raise UsageError(f"{self.suffix} files are read here, not written: {type(self).__name__} defines no encode")
+        raise UsageError(f"{self.suffix} files can be read but not written: {type(self).__name__} defines no encode")
 
     def decode(self, path: Path, data: Any) -> Arrays:
         """Return the arrays that `encode` takes.
@@ -87,7 +87,7 @@ class Format:
         Raises:
             UsageError: The format does not define it.
         """
-        raise UsageError(f"{path}: {self.suffix} files are written here, not read: {type(self).__name__} defines no decode")
+        raise UsageError(f"{path}: {self.suffix} files can be written but not read: {type(self).__name__} defines no decode")
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether a file declares that its Gaussians are antialiased; False if the format cannot.
@@ -138,7 +138,7 @@ class Format:
             with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
                 arrays = self.decode(path, data if self.archive else data.read())
         except BROKEN as e:
-            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
+            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
         return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
 
 

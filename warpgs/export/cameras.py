@@ -46,7 +46,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
         write_json(path, {"camera_model": "PINHOLE", "frames": [_frame(i, c) for i, c in enumerate(cameras)]})
     elif path.name == "sparse":
         if path.exists() and not (path.is_dir() and is_empty(path)):
-            raise UsageError(f"{path}: is there already, and may be a reconstruction; give another folder for it")
+            raise UsageError(f"{path}: exists already and may be a reconstruction; give another folder")
         with filling(path) as temporary:
             make_folder(temporary / "0")
             for name, text in _colmap(cameras).items():

@@ -99,7 +99,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     tables = {}
     for element in elements:
         if element.name in tables or element.has_list or not element.properties:
-            raise malformed(path, f"its element {element.name[:40]!r} makes no sense")
+            raise malformed(path, f"its element {element.name[:40]!r} is invalid")
         tables[element.name], start = _table(path, data, element, start)
     chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
     if chunk is None or vertex is None:
@@ -178,7 +178,7 @@ def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.nd
 def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
     """Return a column of a table; DataError where it is missing or of another type."""
     if name not in (table.dtype.names or ()) or table.dtype[name] != np.dtype(kind):
-        raise malformed(path, f"the property {name} is missing, or not of its type")
+        raise malformed(path, f"the property {name} is missing, or has the wrong type")
     return table[name]
 
 

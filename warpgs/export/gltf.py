@@ -217,7 +217,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
 
 
 def _inside(path: Path, uri: object) -> bytes:
-    """Return the bytes of a data URI; other URIs are refused, so that a file cannot choose other files to open."""
+    """Return the bytes of a data URI; other URIs are rejected, so that a file cannot choose other files to open."""
     head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
     if not (head.startswith("data:") and head.endswith(";base64") and comma):
         raise malformed(path, "its numbers are in another file, which is not opened; make one .glb of both")
@@ -273,7 +273,7 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     if kind is None or width is None or "sparse" in accessor or view.get("buffer") != 0:
         raise malformed(path, f"accessor {index} has an unsupported type")
     if kind != "<f4" and accessor.get("normalized") is not True:
-        raise malformed(path, f"accessor {index} holds integers that are no fractions")
+        raise malformed(path, f"accessor {index} contains integers that are not normalised")
     dtype = np.dtype(kind)
     size, rows = dtype.itemsize * width, count(accessor, "count")
     stride = count(view, "byteStride", size) or size

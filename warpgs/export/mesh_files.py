@@ -41,7 +41,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
             +y, as glTF wants it. None for +y. PLY has no upward direction.
 
     Raises:
-        DataError: A number is not finite, a triangle names a vertex that is not there, or the file would be too large.
+        DataError: A number is not finite, a triangle names a vertex that is missing, or the file would be too large.
         ResourceError: The file cannot be written.
         UsageError: The suffix is neither.
     """
@@ -50,7 +50,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
     if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
         raise DataError(f"{path}: not written, the mesh holds numbers that are not finite; make it again")
     if mesh.faces.size and not (mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices)):
-        raise DataError(f"{path}: not written, a triangle names a vertex that is not there; make the mesh again")
+        raise DataError(f"{path}: not written, a triangle refers to a missing vertex; make the mesh again")
     if path.suffix.lower() == ".ply":
         write_bytes(path, *_ply(mesh))
     else:

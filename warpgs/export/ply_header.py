@@ -95,7 +95,7 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
             case ["property", kind, name] if elements and kind in _TYPES:
                 elements[-1].properties.append((name, _TYPES[kind]))
             case _:
-                raise ply_error(path, f"header line {line[:80]!r} makes no sense")
+                raise ply_error(path, f"header line {line[:80]!r} is invalid")
     if formats != ["binary_little_endian 1.0"]:
         raise ply_error(path, f"its format is {' and '.join(formats)[:80] or 'not given'}, not binary_little_endian 1.0")
     return elements, end.end()

@@ -354,4 +354,4 @@ class SOG(Format):
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
         except BROKEN as e:
-            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
+            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e

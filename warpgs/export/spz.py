@@ -40,7 +40,7 @@ from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
-"""Function that returns the next bytes of a section, exactly as many as are asked for."""
+"""Function that returns the next bytes of a section, exactly as many as are requested."""
 VERSION = 3
 """Version that is written by default: programs of any age read gzip."""
 VERSIONS = (2, 3, 4)
@@ -202,7 +202,7 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
     """Yield the sections of a version-4 file, each to be read to its end before the next; an empty section has no stream."""
     wanted = [s for s in sizes if s]
     if count != len(wanted) or place < HEADER_4.size or place + 16 * count > len(data):
-        raise malformed(path, f"its table of {count} streams at byte {place} makes no sense")
+        raise malformed(path, f"its table of {count} streams at byte {place} is invalid")
     decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_WINDOW)
     view, i, start = memoryview(data), 0, place + 16 * count
     for size in sizes:
@@ -253,7 +253,7 @@ def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version
 
 
 def _fixed(data: np.ndarray) -> np.ndarray:
-    """Return coordinates of 24 bits [P, 9], signed, as whole numbers [P, 3]."""
+    """Return coordinates of 24 bits [P, 9], signed, as integers [P, 3]."""
     fixed = np.zeros((len(data), 3, 4), "u1")
     fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, whose shift down keeps the sign
     return fixed.reshape(-1, 12).view("<i4") >> 8
@@ -324,4 +324,4 @@ class SPZ(Format):
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
         except BROKEN as e:
-            raise malformed(path, f"its content makes no sense ({type(e).__name__}: {str(e)[:80]})") from e
+            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e

@@ -22,7 +22,7 @@ FOLDERS = ("image", "images")
 MAX_ARCHIVE_BYTES = 2**24
 """Size of the largest archive that is read [bytes]; one of 64 cameras has a hundred thousand."""
 MAX_MATRIX_BYTES = 4096
-"""Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is refused."""
+"""Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is rejected."""
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:

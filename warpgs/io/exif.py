@@ -16,7 +16,7 @@ MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769,
 """Tags: maker and model of the device, orientation, place of the exposure data, and in it the equivalent focal length [mm]."""
 ASCII = 2
 NUMBERS = {3: "H", 4: "I"}
-"""Layouts of the whole numbers that these tags may hold, by type."""
+"""Layouts of the integers that these tags may hold, by type."""
 MAX_ENTRIES = 1000
 """Largest number of tags in a directory."""
 MAX_TEXT = 100
@@ -110,7 +110,7 @@ class _Directory:
             self.entries[tag] = kind, length, place + 8
 
     def number(self, tag: int) -> int | None:
-        """Return a single whole number, or None."""
+        """Return a single integer, or None."""
         kind, length, place = self.entries.get(tag, (0, 0, 0))
         if kind not in NUMBERS or length != 1:
             return None

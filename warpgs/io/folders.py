@@ -41,7 +41,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
         The path; the file may not exist.
 
     Raises:
-        DataError: The name is empty or no file name, or leads out of the scene folder.
+        DataError: The name is empty or no file name, or points outside the scene folder.
     """
     usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
     if usable:
@@ -55,7 +55,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
     if "\\" in name and not path.is_file():
         path = folder / name.replace("\\", "/")  # written on Windows
     if not allow_outside and not is_below(path, root or folder):
-        raise DataError(f"{where}: {name!r} leads out of the scene folder; move the file inside, or pass --allow-outside")
+        raise DataError(f"{where}: {name!r} points outside the scene folder; move the file inside, or pass --allow-outside")
     return path
 
 

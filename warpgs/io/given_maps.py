@@ -71,7 +71,7 @@ class GivenMaps:
     def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: MapOptions) -> GivenDepth:
         if loaded.camera_model not in CENTRAL or loaded.camera_model == "fisheye":
             raise UsageError(
-                f"{path}: depth along the axis is not read for the camera model {loaded.camera_model}; leave out --lenses "
+                f"{path}: depth is not supported for the camera model {loaded.camera_model}; leave out --lenses "
                 f"native, or the map ({DEPTHS} none)"
             )
         stored = read_depth(path, options, self.max_pixels)
@@ -82,8 +82,8 @@ class GivenMaps:
             values = np.where(sure > 0, values, 0)
         if not values.any():
             raise DataError(
-                f"{path}: no depth is left of it in the pixels that count, after mask, confidence and --downscale; remove the "
-                "file, a view needs none"
+                f"{path}: it has no depth in the pixels that count, after mask, confidence and --downscale; remove the "
+                f"file, because views may have none"
             )
         return GivenDepth(values, options.depth_kind, sure)
 

@@ -338,7 +338,7 @@ def load_image(
         image, alpha = turn_upright(image, orientation), None if alpha is None else turn_upright(alpha, orientation)
     height, width = image.shape[:2]
     K = np.diag([width / lens.width, height / lens.height, 1.0]) @ lens.K
-    done = () if orientation == 1 else ("turned by the EXIF tag, as the camera asks",)
+    done = () if orientation == 1 else ("rotated by the EXIF orientation",)
     if mask is not None:
         mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
     loaded = _with_mask(path, LoadedImage(image, mask, K, done, alpha), cutout)

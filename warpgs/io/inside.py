@@ -15,7 +15,7 @@ def inside(path: Path, root: Path, noun: str) -> Path:
         DataError: One does.
     """
     if not is_below(path, root):
-        raise DataError(f"{path}: a link leads out of {noun}; put the files inside of it, or pass --allow-outside")
+        raise DataError(f"{path}: a link points outside {noun}; put the files inside of it, or pass --allow-outside")
     return path
 
 

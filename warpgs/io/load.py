@@ -136,9 +136,9 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
             images = f". It holds no photograph either ({READ})"
         raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}{images}")
     taken, *others = complete
-    notes = [f"{lack}; passed over, {taken.name} is complete" for lack in broken]
+    notes = [f"{lack}; {taken.name} is complete and is used instead" for lack in broken]
     if others:
-        notes.append(f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is taken")
+        notes.append(f"the folder also holds {' and '.join(r.name for r in others)}: {taken.name} is used")
     return taken, notes
 
 

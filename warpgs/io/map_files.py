@@ -18,11 +18,11 @@ SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
 """Suffixes of other files that may hold maps, which a message names."""
 NONE = "none"
-"""Word in place of a folder, for no maps at all."""
+"""Word instead of a folder, for no maps at all."""
 CONFIDENCE = ".confidence"
 """End of the stem of a map of confidence."""
 MILLIMETRES = 0.001
-"""Length of a unit of whole numbers where the user names none, as RGB-D cameras store depth beside poses in metres."""
+"""Length of a unit of integers where the user names none, as RGB-D cameras store depth beside poses in metres."""
 MAX_DEPTH = 1e12
 """Largest depth [file units]; beyond it a map is taken for broken."""
 AXES = ("opencv", "opengl")
@@ -93,7 +93,7 @@ class MapFolder:
             found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "put"
             raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named as the images are")
         self.taken: set[str] = set()
-        """Keys of the maps that images asked for."""
+        """Keys of the maps that images requested."""
 
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for what there is not.
@@ -169,7 +169,7 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
 
 
 def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 where there is none.
+    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 for missing values.
 
     Raises:
         DataError: The file is no map, or its values cannot be depths.
@@ -187,24 +187,26 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
     values = np.where(finite, values, 0)
     if (values < 0).any():
         raise DataError(
-            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth is along the camera's "
-            "axis and positive, and 0 where there is none"
+            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth must be positive "
+            f"along the camera's axis, or 0 for missing values"
         )
     if metric:
         unit = options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0)
         with np.errstate(over="ignore"):
             values = values * np.float32(unit)
     if not values.any():
-        raise DataError(f"{path}: holds no depth, all values are 0 or not finite; remove the file, a view needs none")
+        raise DataError(
+            f"{path}: contains no depth, all values are 0 or not finite; remove the file, because views may have none"
+        )
     if not values.max() < MAX_DEPTH:
-        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; mark what has no depth by 0")
+        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; use 0 for missing values")
     return values
 
 
 def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
-    Whole numbers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
+    Integers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
 
     Raises:
         DataError: The file is no map, of another shape, or not in [0, 1].
@@ -219,12 +221,12 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
         largest = int(raw.max())
         values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
     if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"{path}: confidence must lie in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
+        raise DataError(f"{path}: confidence must be in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
     return values
 
 
 def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 where there is none.
+    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
 
     Raises:
         DataError: The file is no map, or too many of its vectors have another length than 1.
@@ -242,11 +244,11 @@ def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) 
         lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
     known = usable & (lengths >= NO_NORMAL)
     if not known.any():
-        raise DataError(f"{path}: holds no normal; remove the file, a view needs none")
+        raise DataError(f"{path}: contains no normals; remove the file, because views may have none")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
         raise DataError(
-            f"{path}: {stray:.0%} of its vectors are no unit normals (median length {float(np.median(lengths[known])):.3g}); "
+            f"{path}: {stray:.0%} of its vectors are not unit normals (median length {float(np.median(lengths[known])):.3g}); "
             "save PNG as (n + 1) / 2, or NPY with unit vectors"
         )
     known &= np.abs(lengths - 1) <= UNIT_TOLERANCE

@@ -84,7 +84,7 @@ class MiddleburyReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         path, *others = files_of(folder)
-        notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} passed over"] if others else []
+        notes = [f"cameras taken from {path.name}; {', '.join(p.name for p in others)} ignored"] if others else []
         scene, views = SceneFolder(folder, options), ViewList()
         for number, name, values in read_rows(scene.inside(path)):
             where = f"{path}, line {number}, image {name!r}"

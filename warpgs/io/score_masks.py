@@ -67,7 +67,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     folder = inner if inner.is_dir() else folder
     files = list_images(folder) if folder.is_dir() else []
     if not files:
-        raise DataError(f"{folder}: there are no masks; name the folder that holds 000.png, 001.png, ... with --score-masks")
+        raise DataError(f"{folder}: contains no masks; name the folder that contains 000.png, 001.png, ... with --score-masks")
     masks, ids = _by_id(files, folder), image_ids([v.name for v in views])
     if ids is None:
         raise DataError(
@@ -83,8 +83,8 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
         )
     if min(ids) == 1 and 0 in masks and not named_by_dtu([v.name for v in views]):
         raise DataError(
-            f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so it cannot be known "
-            "whether they are off by one; rename the images so that they count from 0, or remove mask 0"
+            f"{folder}: the images start with 1 ({views[ids.index(1)].name}), the masks with 0, so the masks may be off by "
+            f"one; rename the images so that they count from 0, or remove mask 0"
         )
     done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
     return done, f"scores count the pixels of the masks in {folder}, matched by image id; the fit sees every pixel"

@@ -49,7 +49,7 @@ def _every_8th(names: list[str], count: int, spec: str) -> Split:
     pool = [n for i, n in enumerate(names) if i % 8]
     if not 1 <= count <= len(pool):
         raise DataError(
-            f"split {spec}: wants {count} training views, but {len(pool)} remain of {len(names)} after every 8th is held out; "
+            f"split {spec}: needs {count} training views, but {len(pool)} remain of {len(names)} after every 8th is held out; "
             "ask for fewer"
         )
     # np.round goes half to even, as the published id tables do

@@ -261,7 +261,7 @@ class TransformsReader(Reader):
                 raise DataError(f"{files_of(folder)[0]}: {text}. Restore them, or leave out --strict to go on without them")
             notes.append(f"skipped: {text}")
         if reading.outside:
-            notes.append(f"{reading.outside} images lie outside the scene folder; their views are named outside/...")
+            notes.append(f"{reading.outside} images are outside the scene folder; their views are named outside/...")
         notes += resampling_note(options.downscale) + reading.views.notes(options)
         return self.scene(
             folder,

@@ -127,7 +127,7 @@ def composite(
     """Return the images, and what the backward pass needs. Nothing is checked, and no gradient is recorded.
 
     Args:
-        projected: Projected Gaussians, contiguous, shape [C, N, 9 + D] with D channels in place of the colour, D out of
+        projected: Projected Gaussians, contiguous, shape [C, N, 9 + D] with D channels instead of the colour, D out of
             `WIDTHS`; [C, N, 12] with a colour.
         tiles: Their instances.
         backgrounds: Channels behind everything, contiguous, shape [C, D].

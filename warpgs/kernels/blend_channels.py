@@ -1,4 +1,4 @@
-"""Compositing of any number of channels: each Gaussian brings D values of its own in place of a colour.
+"""Compositing of any number of channels: each Gaussian brings D values of its own instead of a colour.
 
 The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). More channels take several passes over the same
 instances, and no memory but that of the image and the gradient (docs/blend.md, section 3).
@@ -102,7 +102,7 @@ class _Group(NamedTuple):
     channels: slice
     """Their place among all D."""
     projected: torch.Tensor
-    """Projected Gaussians that have them in place of a colour, shape [C, N, 9 + G]. All groups share the memory."""
+    """Projected Gaussians that have them instead of a colour, shape [C, N, 9 + G]. All groups share the memory."""
     backgrounds: torch.Tensor
     """Background of the channels, shape [C, G]: zeros fill up the last group."""
 

@@ -159,7 +159,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
     @wp.func(inline=True)
     def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[r.Gradient]):
-        """Add the magnitudes of what a pixel gives to the gradient of the mean, where they are asked for."""
+        """Add the magnitudes of what a pixel gives to the gradient of the mean, where they are requested."""
         if wp.static(absgrad):
             x = wp.static(channels * STRIP) + lane
             y = wp.static((channels + 1) * STRIP) + lane

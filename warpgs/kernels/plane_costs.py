@@ -1,6 +1,6 @@
 """Matching costs of a plane sweep on a CPU: other images by a plane's homography, correlated in windows.
 
-A task owns some rows and some planes. Colours and the sums over windows are whole numbers, and no multiplication is fused with
+A task owns some rows and some planes. Colours and the sums over windows are integers, and no multiplication is fused with
 a sum, so that costs are the same bits on any processor and number of threads. Loops over `LANES` pixels vectorise.
 """
 
@@ -23,7 +23,7 @@ ROWS = 32
 PLANES = 16
 """Planes of a task: 32 bytes of each pixel's costs, half a cache line."""
 WHITE = 4095
-"""Brightness 1 as a whole number: so fine that rounding is far below the noise of 8-bit images."""
+"""Brightness 1 as an integer: so fine that rounding is far below the noise of 8-bit images."""
 LOW = WHITE + 1
 """Added to colours while they are interpolated, so that those outside, -`WHITE`, are above 0."""
 MIDDLE = 2048
@@ -266,11 +266,11 @@ def plane_costs(
     Args:
         gray: Brightness in [0, 1], float32, shape [H, W].
         others: The same of N other images, of any size.
-        homographies: H from pixel centres at whole numbers to those of each other image, positive in front of its camera,
+        homographies: H from pixel centres at integers to those of each other image, positive in front of its camera,
             shape [D, N, 3, 3].
         window: Side of the square in which pixels are correlated [px], odd, at most 2 `MAX_RADIUS` + 1.
         noise: Variance that is added to that of a window.
-        unit: Cost 1 as a whole number, below 2^15.
+        unit: Cost 1 as an integer, below 2^15.
 
     Returns:
         Costs, int16, shape [H, W, P]: P is D rounded up to a multiple of `LANES`, and costs past D are ``unit``.

@@ -1,4 +1,4 @@
-"""Depths of a plane sweep on a CPU: the best plane of each pixel, and whether another view's depth leads back to the pixel.
+"""Depths of a plane sweep on a CPU: the best plane of each pixel, and whether another view's depth returns to the pixel.
 
 In float64, a thread a pixel; nothing is fused, so that depths are the same bits on any processor.
 """
@@ -100,7 +100,7 @@ def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
     """Return the inverse depth [1/u], float64, shape [H, W], of least cost, refined by the parabola through three costs.
 
     Args:
-        costs: Whole numbers, int16, shape [H, W, P] with P at least D.
+        costs: Integers, int16, shape [H, W, P] with P at least D.
         inverses: Inverse depths of the D planes, evenly spaced, at least three, shape [D].
     """
     height, width, padded = costs.shape

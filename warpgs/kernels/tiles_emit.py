@@ -90,7 +90,7 @@ def make_emit(real, slotted: bool):
 
     Args:
         real: wp.float32 or wp.float64.
-        slotted: True to write the slot and the owner of each instance; False to write its owner alone, in place of the slot.
+        slotted: True to write the slot and the owner of each instance; False to write its owner alone, instead of the slot.
     """
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)

@@ -70,13 +70,11 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
         if i not in found.views:
             best = partners(found, i)
             if found.keypoints[i] < MIN_KEYPOINTS:
-                said.append(f"take {names[i]} again, sharp, in light, and with something patterned in view")
+                said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
             elif best:
                 said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
             else:
-                said.append(
-                    f"take photographs that lead from {names[i]} to the others, each overlapping the last by two thirds"
-                )
+                said.append(f"take photographs from {names[i]} to the others, each overlapping the last by two thirds")
     tree = neighbours(found)
     for i, j, angle in sorted(tree, key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:

@@ -54,7 +54,7 @@ def source_digest(source: Path, allow_outside: bool = False) -> str:
     """Return the SHA-256 over the names and contents of a source's photographs, or of a video.
 
     Raises:
-        DataError: A file cannot be read, or a link leads out of the folder and that is not allowed.
+        DataError: A file cannot be read, or a link points outside the folder and that is not allowed.
     """
     total = hashlib.sha256()
     if is_video(source):
@@ -199,7 +199,7 @@ def _prepared(
         root = work / "frames"
         make_folder(root)
         total = write_frames(source, root, frames, progress)
-        notes.append(f"{min(frames, total)} of {total} frames are taken: the sharpest of as many equal stretches of the video")
+        notes.append(f"{min(frames, total)} of {total} frames are used: the sharpest of as many equal parts of the video")
     root = image_root(root)
     paths, unread = find_photographs(root), unread_note(root)
     notes += folder_notes(root)
@@ -264,7 +264,7 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     if 2 * blank >= count:
         most = max(found.keypoints)
         why = (
-            f"{blank} of {count} show next to nothing that can be found again (at most {most:,} keypoints): a blank wall, "
+            f"{blank} of {count} show almost nothing that can be matched (at most {most:,} keypoints): a blank wall, "
             "darkness or blur. Photograph something patterned, sharp and in light"
         )
     elif not largest:
@@ -272,6 +272,6 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     else:
         why = (
             f"at most {len(found.views)} of {count} fit together, and {MIN_PHOTOGRAPHS} are needed. Take photographs that "
-            f"overlap by two thirds, moving the camera, not only turning it. By now {_links(found, photographs)}"
+            f"overlap by two thirds, moving the camera, not only turning it. So far {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")

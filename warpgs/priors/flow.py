@@ -55,8 +55,8 @@ def read_flo(path: Path) -> np.ndarray:
         raise DataError(f"{path}: its header gives {width} x {height} px; sides must be 1 to {MAX_SIDE}. Write the flow again")
     if len(raw) != 12 + 8 * width * height:
         raise DataError(
-            f"{path}: {len(raw)} bytes, but {width} x {height} px take {12 + 8 * width * height}; it was cut or changed on the "
-            "way. Copy or write it again"
+            f"{path}: {len(raw)} bytes, but {width} x {height} px take {12 + 8 * width * height}; it is truncated or "
+            f"damaged. Copy or write it again"
         )
     flow = np.frombuffer(raw, "<f4", offset=12).reshape(height, width, 2)
     return np.where((np.abs(flow) < MIN_UNKNOWN).all(2, keepdims=True), flow, np.float32(np.nan)).astype(np.float32)
@@ -239,7 +239,7 @@ def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> 
 
     Raises:
         UsageError: The kind or the range is not one of these.
-        DataError: A file is missing or malformed; flow of a pair may also raise it when first asked for.
+        DataError: A file is missing or malformed; flow of a pair may also raise it when first requested.
     """
     if value_range not in RANGES:
         raise UsageError(f"flow range {value_range!r} is not one of {', '.join(RANGES)}")

@@ -55,7 +55,7 @@ class Alignment:
     """Reason why the map is not used; empty where it is."""
 
     def depth(self, given: GivenDepth) -> np.ndarray:
-        """Return the z-depth [u] of a map, float32 [H, W]; 0 where there is none, or where it would not be positive."""
+        """Return the z-depth [u] of a map, float32 [H, W]; 0 for missing values, or where it would not be positive."""
         known = given.values > 0
         found = np.where(known, given.values.astype(np.float64) * self.scale + self.shift, 0)
         known &= found > 0
@@ -89,7 +89,8 @@ def check_given(views: Sequence[View]) -> None:
             low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
             if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
                 raise UsageError(
-                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; 0 stands for none"
+                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; use 0 for missing "
+                    f"values"
                 )
         if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
             raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
@@ -165,10 +166,10 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     made = Alignment(scale, shift, count, float(np.median(off)))
     good = float((off <= GOOD).mean())
     if good < MIN_GOOD:
-        return replace(made, why_not=f"{good:.0%} of its depths lie within {GOOD:.0%} of those that the views confirm")
+        return replace(made, why_not=f"{good:.0%} of its depths are within {GOOD:.0%} of those that the views confirm")
     if not scale > 0:
         other = "relative" if kind == "disparity" else "disparity"
-        return replace(made, why_not=f"its values fall where depth asks that they rise; are they {other}?")
+        return replace(made, why_not=f"its values fall where depth rises; are they {other}?")
     return made
 
 
@@ -184,7 +185,7 @@ def votes(
 
     Args:
         views: All views, pinholes.
-        depths: Depth of each [u], 0 where there is none, shape [H, W] each.
+        depths: Depth of each [u], 0 for missing values, shape [H, W] each.
         index: Index of the view.
         near: Number of nearest views that are asked.
 

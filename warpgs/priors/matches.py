@@ -26,7 +26,7 @@ class Features(NamedTuple):
     pixels: np.ndarray
     """Positions [px], pixel centres at +0.5, shape [N, 2]."""
     descriptors: np.ndarray | None
-    """Descriptors, whole numbers from 0 to 255, uint8, shape [N, 128]; None without features."""
+    """Descriptors, integers from 0 to 255, uint8, shape [N, 128]; None without features."""
 
 
 def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> Features:

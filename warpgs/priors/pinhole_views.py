@@ -27,7 +27,7 @@ def pinhole_view(view: View) -> View:
         return view
     if camera.model not in lenses.CENTRAL:
         raise UsageError(
-            f"searching for depth and coverage need pinholes, which cannot stand for the camera model {camera.model!r}: start "
+            f"depth estimation and coverage need pinholes and do not support the camera model {camera.model!r}: start "
             "from points (--init.source points), with --strategy clone_split or mcmc"
         )
     maps = _lens_pixels(camera) - 0.5  # OpenCV's pixel centres are at whole numbers

@@ -115,7 +115,7 @@ def read_side_file(model: Path) -> dict:
         raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
     for key, value in values.items():
         if key not in KEYS:
-            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} may stand there")
+            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} are supported")
         check_value(key, value, str(path), DataError)
     return values
 
@@ -134,7 +134,7 @@ def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) 
 
     Raises:
         DataError: The file beside the model is not what it must be.
-        UsageError: A size was asked for that the graph does not allow.
+        UsageError: A size was requested that the graph does not allow.
     """
     given = {k: v for k, v in flags.items() if v}
     values = read_side_file(network.path) | given

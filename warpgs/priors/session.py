@@ -96,7 +96,7 @@ def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -
     Raises:
         UsageError: The provider is neither cpu nor cuda.
         DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
-        ResourceError: onnxruntime or the provider is not there.
+        ResourceError: onnxruntime or the provider is missing.
     """
     if provider not in PROVIDERS:
         raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")

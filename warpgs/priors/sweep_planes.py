@@ -18,7 +18,7 @@ NOISE = (2 / 255) ** 2
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
 UNIT = 4096
-"""Cost 1 in the 16-bit whole numbers that volumes hold: to touch memory for the first time takes as long as to compute what
+"""Cost 1 in the 16-bit integers that volumes hold: to touch memory for the first time takes as long as to compute what
 goes there, and this is half of float32's."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
@@ -103,7 +103,7 @@ def plane_inverses(
 
 
 def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
-    """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at whole numbers (OpenCV)."""
+    """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at integers (OpenCV)."""
     check_pinhole(first)
     check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)

@@ -35,36 +35,36 @@ Colors = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Networks that make priors, and their inputs; classical methods where none is named."""
+    """Networks for priors, and their inputs; classical methods without networks."""
 
     depth_model: str | None = None
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
     depth_output: str = "auto"
-    """Meaning of its output: disparity (inverse depth), depth, or auto: as in FILE.json beside it, else disparity."""
+    """Output of the depth network: disparity (inverse depth), depth, or auto: as in FILE.onnx.json, else disparity."""
     depth_guides: bool = False
-    """The depth network's map places Gaussians and guides the fit as maps of --depths do, in views without one."""
+    """Use the depth network's map like a map of --depths, to place Gaussians and guide the fit, in views without one."""
     depth_size: int = 0
-    """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 384."""
+    """Shorter side of its input [px], if the network leaves it free; 0 for the value of FILE.onnx.json, else 384."""
     depth_multiple: int = 0
-    """Divisor of both sides of its input [px]; 0 for what FILE.json says, else 32. Depth Anything needs 14."""
+    """Divisor of both sides of its input [px]; 0 for the value of FILE.onnx.json, else 32. Depth Anything needs 14."""
     depth_mean: Colors | None = None
-    """Colour subtracted from colours in [0, 1]; else what FILE.json says, else 0.5 0.5 0.5."""
+    """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     depth_std: Colors | None = None
-    """Divisor of the difference; else what FILE.json says, else 0.5 0.5 0.5."""
+    """Divisor of the difference. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     segmentation_model: str | None = None
-    """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges stand in."""
+    """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
     segmentation_size: int = 0
-    """Shorter side of its input [px] where the file leaves it free; 0 for what FILE.json says, else 512."""
+    """Shorter side of its input [px], if the network leaves it free; 0 for the value of FILE.onnx.json, else 512."""
     segmentation_multiple: int = 0
-    """Divisor of both sides of its input [px]; 0 for what FILE.json says, else 32."""
+    """Divisor of both sides of its input [px]; 0 for the value of FILE.onnx.json, else 32."""
     segmentation_mean: Colors | None = None
-    """Colour subtracted from colours in [0, 1]; else what FILE.json says, else ImageNet's 0.485 0.456 0.406."""
+    """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else ImageNet's 0.485 0.456 0.406."""
     segmentation_std: Colors | None = None
-    """Divisor of the difference; else what FILE.json says, else ImageNet's 0.229 0.224 0.225."""
+    """Divisor of the difference. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
     onnx_provider: str = "cpu"
     """Device of the networks: cpu or cuda."""
     cache: bool = True
-    """Keep what networks give in the user's cache folder, or in WARPGS_CACHE."""
+    """Cache the outputs of networks in the user's cache folder, or in WARPGS_CACHE."""
 
     def __post_init__(self):
         if self.onnx_provider not in PROVIDERS:
@@ -161,7 +161,7 @@ def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: i
 
 
 def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], object]) -> SemanticsSource:
-    words = "semantics: no network, so saliency stands for foreground and edges for boundaries"
+    words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
     notes.append(Detail(f"{words}; --segmentation-model takes one"))
 
     found = classical_maps([v.image for v in views], tell)
@@ -189,12 +189,12 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
             zeros = np.zeros_like(maps.foreground)
             maps, source = (
                 SemanticMaps(maps.confidence, zeros, zeros),
-                "none: hardly any foreground and no mask of an object",
+                "none: almost no foreground and no object mask",
             )
         result.append((maps, source))
     reason = "a mask is surer than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        words = f"semantics: {reason}, so the mask or black background stands for foreground in {_names(replaced)}"
+        words = f"semantics: {reason}, so the mask or black background is used as foreground in {_names(replaced)}"
         notes.append(Detail(words) if classical else words)
     if empty:
         notes.append(f"semantics: hardly any foreground and no mask of an object in {_names(empty)}: they do not count there")

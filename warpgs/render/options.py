@@ -20,7 +20,7 @@ SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "ab
 """Options that are True or False."""
 
 WHOLE_NUMBERS = ("sh_degree", "tile_size", "heaviest", "memory_budget", "capacity", "max_instances")
-"""Options that are whole numbers; None for the default, but of the tile size and the heaviest."""
+"""Options that are integers; None for the default, but of the tile size and the heaviest."""
 
 
 def _is_whole(value: object) -> bool:

@@ -51,7 +51,7 @@ unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 
 
 
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
-"""Outputs of real numbers without a gradient: `Render` refuses one through them."""
+"""Outputs of real numbers without a gradient: `Render` rejects one through them."""
 
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
@@ -84,7 +84,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.capacity is not None and options.capacity > MAX_INSTANCES:
         raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
     if options.error_bound and options.capacity is not None:
-        raise UsageError("error_bound reads sizes from the device, which a capacity forbids: leave out one of them")
+        raise UsageError("error_bound and capacity exclude each other: leave one out")
     return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
 
 
@@ -151,7 +151,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
     inside = 0 <= x < x + w <= width and 0 <= y < y + h <= height
     if not inside or x % side or y % side or ((x + w) % side and x + w != width) or ((y + h) % side and y + h != height):
         raise UsageError(
-            f"window {options.window} does not fit: in an image of {width} x {height} px its edges must lie at multiples of "
+            f"window {options.window} does not fit: in an image of {width} x {height} px its edges must be multiples of "
             f"{side} px or at the image's edges"
         )
     return x, y, w, h

@@ -220,7 +220,7 @@ def _scores(page: Page) -> list[str]:
     """Return the sections on views, their scores and how these were made."""
     sections = []
     if page.views:
-        heading = "Views the fit has not seen" if page.held_out else "Views the fit was trained on"
+        heading = "Held-out views" if page.held_out else "Views the fit was trained on"
         sections.append(f"<h2>{heading}</h2>{''.join(map(_view, page.views))}")
     if len(page.table) > 1:
         sections.append("<h2>Scores</h2>" + _table(page.table))

@@ -70,7 +70,7 @@ class SizingAllocator(Allocator):
 
 
 class Arena(Allocator):
-    """An allocator of the tensors that a function asked for before: outputs one by one, the others as parts of two blocks."""
+    """An allocator of the tensors that a function requested before: outputs one by one, the others as parts of two blocks."""
 
     def __init__(self, sizes: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
         """Ask torch for all of the memory.

@@ -1,4 +1,4 @@
-"""Derivatives that the kernels do not have: second ones, and those of torch.func. They are refused, never wrong."""
+"""Derivatives that the kernels do not have: second ones, and those of torch.func. They are rejected, never wrong."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from warpgs.errors import UsageError
 
 
 class _NotTwice(torch.autograd.Function):
-    """A gradient that depends on tensors, and raises where its own gradient is asked for."""
+    """A gradient that depends on tensors, and raises where its own gradient is requested."""
 
     @staticmethod
     def forward(ctx: Any, gradient: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
@@ -46,7 +46,7 @@ def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _WithoutGradient(torch.autograd.Function):
-    """Values that hang on the tensors that they were made from, so that a gradient through them is refused and not dropped."""
+    """Values that hang on the tensors that they were made from, so that a gradient through them is rejected and not dropped."""
 
     @staticmethod
     def forward(ctx: Any, name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
@@ -79,5 +79,5 @@ def refuse_transforms() -> None:
     if torch._C._are_functorch_transforms_active():
         raise UsageError(
             "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "
-            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] in place of vmap"
+            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] instead of vmap"
         )

@@ -66,7 +66,7 @@ def no_memory_message(error: BaseException, purpose: str = "") -> str:
 
 @functools.cache
 def installed_bytes(device: torch.device) -> int:
-    """Return the memory of a device [bytes], on a CPU no more than its container may use; asked for once."""
+    """Return the memory of a device [bytes], on a CPU no more than its container may use; requested once."""
     if device.type == "cuda":
         import torch
 
@@ -160,6 +160,6 @@ def _number(path: Path) -> int | None:
 
 
 def _row(path: Path, name: str) -> int:
-    """Return the number behind a name in a file of rows, 0 where it is not there."""
+    """Return the number behind a name in a file of rows, 0 where it is missing."""
     rows = (row.split() for row in _text(path).splitlines())
     return next((int(r[1]) for r in rows if len(r) == 2 and r[0] == name and r[1].isdecimal()), 0)

@@ -30,7 +30,7 @@ MOST_LETTERS = 200
 
 @contextlib.contextmanager
 def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
-    """Hold a folder, which is made if it is not there, so that no other process writes into it meanwhile.
+    """Hold a folder, which is made if it is missing, so that no other process writes into it meanwhile.
 
     The system gives the lock free when its holder ends, killed or not, and keeps it for processes in other containers, too; who
     holds it stands in the lock file. What killed writers left in the folder, and where the system has temporary files, is
@@ -103,7 +103,7 @@ def _held(folder: Folder) -> Iterator[bool]:
 
 
 def _open(folder: Folder) -> BinaryIO:
-    """Open a lock file to read and write, made if it is not there."""
+    """Open a lock file to read and write, made if it is missing."""
     try:
         return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
     except RefusedError as e:

@@ -41,8 +41,8 @@ def prepare_kernel_cache() -> KernelCache:
     chosen = choose_kernel_cache(warp.config.kernel_cache_dir)
     if chosen.refused:
         say(
-            f"warpgs: {chosen.refused}; kernels are compiled into {chosen.folder} for this process alone, which takes a minute "
-            f"or two. {REMEDY}",
+            f"warpgs: {chosen.refused}; kernels are compiled into {chosen.folder} for this process only, which takes a "
+            f"minute or two. {REMEDY}",
             error=True,
         )
     if chosen.refused or warp.config.kernel_cache_dir is None:
@@ -73,12 +73,12 @@ def choose_kernel_cache(configured: str | None = None) -> KernelCache:
 
 
 def _usual(configured: str | None) -> tuple[Path | None, str]:
-    """Return the folder that is asked for, or that Warp takes by itself; or None, and the reason."""
+    """Return the folder that is requested, or that Warp takes by itself; or None, and the reason."""
     asked = configured or os.environ.get("WARP_CACHE_PATH")
     if asked:
         folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
         if asked.startswith("~") and not folder.is_absolute():
-            return None, f"the kernel cache {asked} lies in a home folder that is not known"
+            return None, f"the kernel cache {asked} is in an unknown home folder"
         return folder.resolve(), ""
     home = cache_home()
     if home is None:
@@ -88,7 +88,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
 
 
 def _fault(folder: Path) -> str:
-    """Return why a folder cannot be used, made if it is not there; empty where it can."""
+    """Return why a folder cannot be used, made if it is missing; empty where it can."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as f:

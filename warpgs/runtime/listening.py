@@ -161,11 +161,11 @@ class WebGuard:
         """Return the path below the token that a request asks for, or None where it must be refused.
 
         Args:
-            target: Target of the request line. One with a query is refused: pages obey parameters that others choose.
+            target: Target of the request line. One with a query is rejected: pages obey parameters that others choose.
             hosts: Values of all headers ``Host``. There must be one, with one of `NAMES`: a foreign name that resolves to
-                127.0.0.1 is refused.
+                127.0.0.1 is rejected.
             origins: Values of all headers ``Origin``. Each must be the server's own, and a websocket must have exactly one.
-            upgrade: Whether a websocket is asked for, which is found at the top alone.
+            upgrade: Whether a websocket is requested, which is found at the top alone.
         """
         if len(hosts) != 1 or not _is_own(hosts[0]):
             return None

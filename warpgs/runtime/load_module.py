@@ -61,7 +61,7 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
 
 @contextlib.contextmanager
 def exclusive(path: Path) -> Iterator[None]:
-    """Hold a file, which is made if it is not there, so that one thread of one process at a time runs the body.
+    """Hold a file, which is made if it is missing, so that one thread of one process at a time runs the body.
 
     The system gives the file free when its holder ends, killed or not. A file system without locks is passed over: Warp puts a
     compiled module in place by renaming, so that two that compile it lose time and nothing else.

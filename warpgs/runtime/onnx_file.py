@@ -42,7 +42,7 @@ def _varint(data: memoryview, at: int) -> tuple[int, int]:
 
 
 def _message(data: memoryview) -> Message:
-    """Return field numbers and values, whole numbers or bytes; ValueError or IndexError if the data is not protobuf."""
+    """Return field numbers and values, integers or bytes; ValueError or IndexError if the data is not protobuf."""
     fields, at = [], 0
     while at < len(data):
         key, at = _varint(data, at)
@@ -71,7 +71,7 @@ def _text(message: Message, number: int) -> str:
 
 
 class _Walk:
-    """A walk through every node and tensor of a model that refuses what needs other files or foreign code."""
+    """A walk through every node and tensor of a model that rejects what needs other files or foreign code."""
 
     def __init__(self, path: Path, own: set[tuple[str, str]]):
         self.path, self.own = path, own
@@ -79,8 +79,8 @@ class _Walk:
     def tensor(self, tensor: Message) -> None:
         if any(n == TENSOR_EXTERNAL or (n == TENSOR_LOCATION and v != 0) for n, v in tensor):
             raise DataError(
-                f"{self.path}: the weights of {_text(tensor, TENSOR_NAME) or 'a constant'!r} lie in another file, which is not "
-                "read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
+                f"{self.path}: the weights of {_text(tensor, TENSOR_NAME) or 'a constant'!r} are in another file, which is "
+                f"not read. Save the model as one file: `onnx.save(onnx.load(FILE), OUT)`, or export it without external data"
             )
 
     def node(self, node: Message, depth: int) -> None:

@@ -50,7 +50,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
 
     Raises:
         DataError: onnxruntime cannot load the model.
-        ResourceError: onnxruntime or the provider is not there.
+        ResourceError: onnxruntime or the provider is missing.
     """
     try:
         import onnxruntime as ort

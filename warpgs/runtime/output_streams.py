@@ -22,7 +22,7 @@ NAMES = ("stdin", "stdout", "stderr")
 
 
 def open_missing_descriptors() -> None:
-    """Open the null device in place of a closed stdin, stdout or stderr.
+    """Open the null device instead of a closed stdin, stdout or stderr.
 
     Otherwise the next file that is opened gets that number, and output is written into it.
     """

@@ -53,7 +53,7 @@ def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] 
         views: Views that were read before, by name.
 
     Raises:
-        DataError: The folder is no run, or it holds no checkpoint yet.
+        DataError: The folder is not a run, or it holds no checkpoint yet.
     """
     run = open_run(folder, device)
     level = load_checkpoint(folder)[0].get("columns.level")

@@ -45,7 +45,7 @@ HELP = (
     "document.querySelector('#warpgs-help button').addEventListener('click',back);"
     "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
 )
-"""Line of help with a button that leads back to the first view; it loads the page again where viser offers no way back."""
+"""Line of help with a button that returns to the first view; it loads the page again where viser offers no way back."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
@@ -160,9 +160,9 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
         filters: Filters of the model; it is cleaned where they do not say.
 
     Raises:
-        DataError: The folder is no run, or nothing is left of its model.
+        DataError: The folder is not a run, or nothing is left of its model.
         ResourceError: viser is not installed, another process writes into the file's folder, or it cannot be written.
-        UsageError: A filter makes no sense.
+        UsageError: A filter is invalid.
     """
     require_viser()
     run = open_run(folder, "cpu")

@@ -32,7 +32,7 @@ NEAR = 1e-3
 
 
 class Maps:
-    """Renders images of one model; depths of its training views are rendered once, when coverage is first asked for."""
+    """Renders images of one model; depths of its training views are rendered once, when coverage is first requested."""
 
     def __init__(self, content: Content, extent: float):
         """Keep the model; ``extent`` is the size of the rig of its cameras [u]."""

@@ -41,7 +41,7 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
 
     Raises:
         DataError: It is neither.
-        ResourceError: viser or the device is not there.
+        ResourceError: viser or the device is missing.
         UsageError: The port is taken.
     """
     choose_device(device)

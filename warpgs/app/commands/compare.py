@@ -16,7 +16,7 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True, kw_only=True)
     class Compare(base):
         presets: str = ",".join(PRESETS)
-        """Presets as `warpgs fit --preset` takes them, with commas between; the others are compared with the first."""
+        """Presets as for `warpgs fit --preset`, separated by commas; the others are compared with the first."""
 
     a = parse_flags(Compare, arguments, "warpgs compare", f"{about}\n\n{listed('presets', PRESETS.described())}")
     from warpgs.pipeline.study.compare import preset_variants

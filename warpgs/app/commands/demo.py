@@ -28,11 +28,11 @@ def run(arguments: list[str], about: str) -> int:
         height: int = 240
         """Image height [px]."""
         seed: int = 0
-        """Decides the textures; of an object also its shape."""
+        """Seed of the textures, and of the shape of an object."""
         object: bool = False
-        """Instead of a still life, an object with nothing around it: RGBA images, eight of them to fit."""
+        """Write a single object instead of a still life: RGBA images, eight of them for training."""
         format: str = "transforms"
-        """Of an object: transforms (transforms.json with RGBA images) or colmap (RGB images with cut-out masks)."""
+        """Format of --object: transforms (transforms.json with RGBA images) or colmap (RGB images with cut-out masks)."""
 
     a = parse_flags(Demo, arguments, "warpgs demo", about)
     check_range("--views", a.views, 8, 10_000)

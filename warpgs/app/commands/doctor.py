@@ -20,9 +20,9 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Doctor:
         warm: bool = False
-        """Instead, compile all kernels of a fit for this machine's devices."""
+        """Compile all kernels of a fit for this machine's devices instead of the checks."""
         repeat: Path | None = None
-        """Instead, repeat a step with a non-finite loss and name the values: not_finite.safetensors of a run."""
+        """File not_finite.safetensors of a run: repeat this step and name the non-finite values, instead of the checks."""
         device: str = "auto"
         """Device for --repeat: auto, cpu or cuda."""
 

@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         reader: str | None = None
-        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+        """User-defined reader, as for `warpgs fit --reader`."""
         by_coverage: bool = False
         """Split the scores by the number of training views that saw each pixel's surface: none, one, two or more."""
 

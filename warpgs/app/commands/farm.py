@@ -29,11 +29,11 @@ def run(arguments: list[str], about: str) -> int:
         """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} per line, with any flags of
         `warpgs fit`. Place it before switches of `warpgs fit`, such as --strict."""
         out: Path
-        """Folder of the results. Repeat the command to continue; several at once share the work."""
+        """Folder of the results. Repeat the command to continue; start it on several machines to share the work."""
         engine: str = "local"
         """local (processes of this machine), ray or slurm."""
         slots: int | None = None
-        """Jobs at a time. Default: one for each GPU times --per-gpu; one on a CPU; all of a cluster."""
+        """Number of concurrent jobs. Default: --per-gpu for each GPU; one on a CPU; the capacity of a cluster."""
         per_gpu: int = 1
         """Jobs that share a GPU."""
         threads: int = 1

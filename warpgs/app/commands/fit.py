@@ -46,16 +46,16 @@ def _request_type() -> type:
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         resume: bool = False
-        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all else but
+        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all other flags except
         --lpips-weights from the run."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         time_budget: float | None = None
-        """Choose the number of steps so that the fit is done in this time [s]; not with --steps."""
+        """Choose the number of steps so that the fit finishes in this time [s]; not with --steps."""
         view: bool = False
-        """Show the model in a browser while it trains, at the printed address; the result is the same to the byte."""
+        """Show the model in a browser while it trains, at the printed address; the result has the same bytes."""
         view_port: int = 8080
-        """PORT of --view; 0 for any free one."""
+        """Port of --view; 0 for any free one."""
 
     return Request
 
@@ -77,7 +77,7 @@ def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple
     parts: Parts = {}
     for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
         if flag_group(name) in parts:
-            raise UsageError(f"{flag} {given}: two of them have the flags --{flag_group(name)}; leave one out")
+            raise UsageError(f"{flag} {given}: two of them define the flags --{flag_group(name)}; leave one out")
         kind = _load(registry, name)
         try:
             parts[flag_group(name)] = kind()
@@ -216,7 +216,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         resume: bool = False
         """Continue it."""
         device: str | None = None
-        """That of the run where not given."""
+        """auto, cpu or cuda. Default: that of the run."""
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         view: bool = False
@@ -224,7 +224,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         view_port: int = 8080
         """Port of --view; 0 for any free one."""
         lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; a run does not remember it, and without it LPIPS is not measured."""
+        """File of `warpgs convert-lpips`; a run does not store it, and without it LPIPS is not measured."""
 
     a = parse_flags(Continue, arguments, "warpgs fit", about)
     check_range("--threads", a.threads, 0, MAX_THREADS)

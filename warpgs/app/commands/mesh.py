@@ -18,13 +18,13 @@ def run(arguments: list[str], about: str) -> int:
         out: Path
         """File to write: .ply, or .glb (glTF)."""
         voxel: float | None = None
-        """Side of a voxel, in units of the scene's files; smaller ones show more detail and more noise."""
+        """Side of a voxel, in units of the scene's files; smaller voxels show more detail and more noise."""
         resolution: int | None = None
         """Voxels along the longest side, instead of --voxel. Default: 256, or fewer for small images."""
         max_faces: int = 200_000
-        """Most triangles; a mesh of more is simplified."""
+        """Largest number of triangles; larger meshes are simplified."""
         depth: str = "median"
-        """Rendered depth that is fused: median, or mean, which is less accurate at edges."""
+        """Rendered depth to fuse: median, or mean, which is less accurate at edges."""
         device: str = "auto"
         """auto, cpu or cuda."""
 

@@ -19,7 +19,7 @@ def run(arguments: list[str], about: str) -> int:
         photographs: tyro.conf.Positional[Path]
         """Folder of photographs, or a video file."""
         out: Path
-        """Scene folder to make; must not exist yet."""
+        """Scene folder to write; must not exist yet."""
         frames: int = FRAMES
         """Frames to take from a video, evenly spaced and sharp."""
         threads: int = 0
@@ -27,7 +27,7 @@ def run(arguments: list[str], about: str) -> int:
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image may have."""
         allow_outside: bool = False
-        """Let links lead to photographs outside the folder."""
+        """Allow links to photographs outside the folder."""
 
         matcher: Path | None = None
         """ONNX file of `warpgs priors export --model xfeat`; finds matches where SIFT leaves photographs without a pose."""

@@ -35,21 +35,21 @@ def _show(arguments: list[str], about: str) -> int:
         scene: tyro.conf.Positional[Path]
         """Scene folder."""
         out: Path
-        """Folder for a PNG sheet per training view."""
+        """Folder for PNG sheets, one for each training view."""
         split: str | None = None
         """As for `warpgs fit`."""
         downscale: int | None = None
-        """Factor by which both image sides shrink; without --max-side there is then no limit."""
+        """Factor by which both image sides shrink; it removes the default limit of --max-side."""
         max_side: int | None = None
-        """Longest side that an image keeps [px], 0 for no limit; 1600 where neither this nor --downscale is given."""
+        """Largest image side [px], 0 for no limit. Default: 1600 without --downscale."""
         allow_outside: bool = False
-        """Let names and links of the scene lead to files outside its folder."""
+        """Allow names and links that point to files outside the scene folder."""
         max_pixels: int = MAX_PIXELS
         """Largest number of pixels that an image or a mask may have as stored."""
         threads: int = 0
         """CPU threads of the networks; 0 for as many as there are cores."""
         source: str = "sweep"
-        """Method that finds depth without a network: sweep or flow, as --init.source of a fit."""
+        """Method of depth estimation without a network: sweep or flow, as --init.source of a fit."""
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
     a = parse_flags(Show, arguments, "warpgs priors show", about)

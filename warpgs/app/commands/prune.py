@@ -14,15 +14,15 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Prune:
         run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`; it stays as it is."""
+        """Run folder of `warpgs fit`; it is not changed."""
         keep_psnr: float = 0.1
-        """PSNR that the mean over the training views may fall by [dB]."""
+        """Largest drop of the mean PSNR over the training views [dB]."""
         out: Path | None = None
         """Run folder to write; must not exist yet. Default: RUN-pruned."""
         device: str = "auto"
         """auto, cpu or cuda."""
         reader: str | None = None
-        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+        """User-defined reader, as for `warpgs fit --reader`."""
 
     a = parse_flags(Prune, arguments, "warpgs prune", about)
     from warpgs.pipeline.runs.prune import prune

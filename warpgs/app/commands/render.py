@@ -19,19 +19,19 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Render:
         run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`, or a file of Gaussians trained anywhere, in a format of `warpgs convert`."""
+        """Run folder of `warpgs fit`, or a file of Gaussians from any program, in a format of `warpgs convert`."""
         cameras: Path | None = None
         """Cameras for a file of Gaussians: cameras.json, transforms.json, COLMAP's folder, or a scene."""
         rule: str | None = None
-        """Cut-offs that a file of Gaussians was trained with: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
+        """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
-        """Render a file of Gaussians that was trained with antialiasing, as by gsplat's rasterize_mode antialiased, where
-        the file does not say so."""
+        """Render a file of Gaussians with antialiasing, if it was trained with it (gsplat's rasterize_mode antialiased) but
+        does not declare it."""
         path: str = "auto"
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
-        """Folder for the images and film.mp4; or a film alone: .mp4, .webm, .webp or .gif. Default: RUN/path-PATH."""
+        """Folder for the images and film.mp4; or only a film: .mp4, .webm, .webp or .gif. Default: RUN/path-PATH."""
         seconds: float | None = None
         """Duration of the film [s]. Default: chosen by the path."""
         fps: int = 30
@@ -43,7 +43,7 @@ def run(arguments: list[str], about: str) -> int:
         fov: float | None = None
         """Vertical field of view [deg]. Default: that of the photographs."""
         background: str = "auto"
-        """auto (that of the fit; images of objects cut out are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
+        """auto (that of the fit; images of cut-out objects are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
         sheet: bool = False
         """Also write six frames in one image: sheet.png."""
         device: str = "auto"

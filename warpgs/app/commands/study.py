@@ -20,7 +20,7 @@ def study_flags() -> type:
         scenes: tyro.conf.Positional[tuple[Path, ...]]
         """Scene folders."""
         out: Path
-        """Folder of the study; repeat the command to continue a study that stopped."""
+        """Folder of the study; repeat the command to continue an interrupted study."""
         seeds: int = 5
         """Runs of each setting on each scene, seeds 0, 1, ..."""
         steps: int | None = None
@@ -28,7 +28,8 @@ def study_flags() -> type:
         device: str = "auto"
         """auto, cpu or cuda."""
         slots: int | None = None
-        """Runs at a time, each in a process of its own. Without this and --per-gpu, runs follow each other in one process."""
+        """Number of concurrent runs, each in its own process. Without this and --per-gpu, runs follow each other in one
+        process."""
         per_gpu: int | None = None
         """Runs that share a GPU."""
         lpips_weights: Path | None = None

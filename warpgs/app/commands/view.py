@@ -13,13 +13,13 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class View:
         run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`, also while it goes on; or a file of Gaussians, in a format of `warpgs convert`."""
+        """Run folder of `warpgs fit`, also during the fit; or a file of Gaussians, in a format of `warpgs convert`."""
         port: int = 8080
         """Port of the viewer on this machine; 0 for any free one."""
         device: str = "auto"
         """Device that renders depth, coverage and error: auto, cpu or cuda."""
         reader: str | None = None
-        """Reader from outside warpgs, as `warpgs fit --reader` was given it."""
+        """User-defined reader, as for `warpgs fit --reader`."""
 
     a = parse_flags(View, arguments, "warpgs view", about)
     check_range("--port", a.port, 0, 65535)

@@ -1,6 +1,6 @@
 """AVIF, decoded to 8 bits by Pillow's libavif, and how it is told from HEIC: both are ISO base media files.
 
-libavif refuses a file that ends early. Damage inside of the coded pixels is not seen.
+libavif rejects a file that ends early. Damage inside of the coded pixels is not seen.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def kind(data: bytes) -> str | None:
 
 
 def open_image(data: bytes) -> ImageFile.ImageFile:
-    """Return an image whose header is read; its pixels are decoded when they are asked for.
+    """Return an image whose header is read; its pixels are decoded when they are requested.
 
     Raises:
         ValueError: The header is broken, or the file ends early.

@@ -39,7 +39,7 @@ def check(data: bytes) -> None:
     """
     width, height, bits, stored, start = _header(data)
     if stored != RAW and stored not in MASKED:
-        raise ValueError("its pixels are compressed, which leaves damage unseen; save it as PNG")
+        raise ValueError("its pixels are compressed, so damage would not be detected; save it as PNG")
     rows = height * ((width * bits + 31) // 32 * 4)
     (announced,) = struct.unpack_from("<I", data, 2)
     if start < 26 or max(start + rows, announced) > len(data):

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from warpgs.io.image_formats.png import unpacked_size
 
 TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-"""Layouts of the whole numbers that tags may hold, by type."""
+"""Layouts of the integers that tags may hold, by type."""
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 8: 2, 9: 4, 11: 4, 13: 4}
 """Bytes of a value by type; those of all others have 8."""
 WIDTH, HEIGHT, BITS, COMPRESSION, CHANNELS, PLANES = 256, 257, 258, 259, 277, 284
@@ -31,7 +31,7 @@ MAX_ENTRIES = 4096
 
 
 def _tags(data: bytes) -> dict[int, tuple[int, ...]]:
-    """Return the whole numbers of the first directory by tag."""
+    """Return the integers of the first directory by tag."""
     order = "<" if data[:2] == b"II" else ">"
     big = len(data) > 4 and data[2:4] in (b"+\0", b"\0+")
     number, entry, slot = ("Q", "HHQ", 8) if big else ("I", "HHI", 4)
@@ -56,7 +56,7 @@ def _tags(data: bytes) -> dict[int, tuple[int, ...]]:
                 (place,) = struct.unpack_from(order + number, data, place)
             tags[tag] = struct.unpack_from(layout, data, place)
     except (struct.error, OverflowError) as e:
-        raise ValueError("its directory leads out of the file") from e
+        raise ValueError("its directory points outside the file") from e
     return tags
 
 

@@ -78,7 +78,7 @@ def _set_aside(folder: Path) -> Path:
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
-    """Return the scores of a finished run with LPIPS of the weights asked for, measured now where they are not there yet."""
+    """Return the scores of a finished run with LPIPS of the weights requested, measured now where they are missing yet."""
     for found in (metrics, _scores(folder / "eval.json")):
         if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
             return metrics | {k: found[k] for k in ("test", "views", "variants")}
@@ -96,7 +96,7 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the finished run that is asked for.
+    """Ensure that a run folder holds the finished run that is requested.
 
     A finished run of the same configuration, code of the user's own, data, views, kind of device and version is kept. A
     half-finished one is continued from its checkpoint. What is there and is neither is moved aside, and the run is done anew.

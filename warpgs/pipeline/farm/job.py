@@ -58,7 +58,7 @@ def job_of(text: str) -> FarmJob:
     """Return the job of `job_text`; code of the user's own that it names is imported, as in the process that wrote it.
 
     Raises:
-        UsageError: That code is not there.
+        UsageError: That code is missing.
     """
     values = schema.parse(text)
     r = values["request"]

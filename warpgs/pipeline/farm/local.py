@@ -41,8 +41,8 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
         per_gpu: Slots of each GPU.
 
     Raises:
-        ResourceError: CUDA was asked for and is not there.
-        UsageError: More slots are asked for than can be, or than the GPUs have.
+        ResourceError: CUDA was requested and is missing.
+        UsageError: More slots are requested than can be, or than the GPUs have.
     """
     import torch
 

@@ -45,10 +45,10 @@ class EngineRequest:
 
 
 def make_engine(request: EngineRequest, device: str) -> Engine:
-    """Make the engine that is asked for.
+    """Make the engine that is requested.
 
     Raises:
-        ResourceError: The device is not there.
+        ResourceError: The device is missing.
         UsageError: There is no such engine, what it needs is not installed, it cannot have so many slots, or other users can
             write to ``slurm_folder``.
     """
@@ -124,6 +124,6 @@ def check_failures(statuses: list[JobStatus]) -> None:
         first = failed[0].record
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
         raise ResourceError(
-            f"{len(failed)} of {len(statuses)} jobs failed: {names}; their messages stand in {INDEX}. The first: "
+            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. The first: "
             f"{first.message.rstrip('.') if first else 'unknown'}. The same command tries them again"
         )

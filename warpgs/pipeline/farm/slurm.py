@@ -24,7 +24,7 @@ from warpgs.runtime.subprocesses import ProgramResult, run_program
 from warpgs.runtime.terminal import say
 
 QUEUED = 100
-"""Jobs that are handed to Slurm at a time, where nothing else is asked for."""
+"""Jobs that are handed to Slurm at a time, where nothing else is requested."""
 ASK_EVERY = 1.0
 """Time between two looks for answers [s]."""
 QUEUE_EVERY = 15.0
@@ -101,7 +101,7 @@ class SlurmEngine:
         """Hand a job to Slurm.
 
         Raises:
-            ResourceError: Slurm refuses it.
+            ResourceError: Slurm rejects it.
         """
         number = next(self._numbers)
         text, answer, log = (self._folder / f"{number}.{kind}" for kind in ("json", "answer", "log"))

@@ -13,7 +13,7 @@ from warpgs.pipeline.films.rig import MIN_SWING, Rig
 from warpgs.scene import Camera
 
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
-"""Path of each kind of rig where none was asked for."""
+"""Path of each kind of rig where none was requested."""
 WIDE_ARC = math.radians(75)
 """Arc of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the captured area."""
 SWING = 0.9
@@ -55,7 +55,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
 
 
 def path_of(rig: Rig) -> str:
-    """Return the path of a rig where none was asked for."""
+    """Return the path of a rig where none was requested."""
     wide = rig.kind == "forward" and rig.span is not None and rig.span[1] - rig.span[0] > WIDE_ARC
     return "interpolate" if wide else BY_KIND[rig.kind]
 

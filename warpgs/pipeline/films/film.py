@@ -55,7 +55,7 @@ class RenderedPath:
     """Result of `render_film`: files, and lines for the user."""
 
     files: list[Path]
-    """A PNG for each camera in order, unless only a film was asked for; then the film, if any."""
+    """A PNG for each camera in order, unless only a film was requested; then the film, if any."""
     notes: list[str]
     """Lines for the user: choices made, and frames that show nothing."""
 
@@ -64,7 +64,7 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size.
 
     Raises:
-        UsageError: There is no camera, or something was asked for that cannot be made of these frames or put into that place.
+        UsageError: There is no camera, or something was requested that cannot be made of these frames or put into that place.
     """
     if not plan.cameras:
         raise UsageError("no camera to render; give at least one")
@@ -124,7 +124,7 @@ def _frames(
 def _older_images(folder: Path, files: list[Path]) -> list[str]:
     """Return notes on images of an earlier film that lie between those of this one."""
     older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
-    return [f"{len(older)} older images lie in {folder}, too: remove them, or give a new folder"] if older else []
+    return [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
 
 
 def render_film(
@@ -151,7 +151,7 @@ def render_film(
 
     Raises:
         ResourceError: A file cannot be written, or another process writes into the folder.
-        UsageError: There is no camera, or one film was asked for of images that differ in size.
+        UsageError: There is no camera, or one film was requested of images that differ in size.
     """
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)

@@ -148,7 +148,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
             "seconds"
         ) from e
     if not 1 <= len(values) <= MAX_KEYFRAMES:
-        raise DataError(f"{path}: holds {len(values)} keyframes; a path takes 1 to {MAX_KEYFRAMES:,}")
+        raise DataError(f"{path}: holds {len(values)} keyframes; a path needs 1 to {MAX_KEYFRAMES:,}")
     K = np.array([[template.K[0, 0], 0, 0.5 * template.width], [0, template.K[1, 1], 0.5 * template.height], [0, 0, 1.0]])
     template, result = replace(pinhole_of(template), K=K), []
     for i, value in enumerate(values):

@@ -62,7 +62,7 @@ class FilmSettings:
         """
         low, high = LIMITS["width"]
         if self.size is not None and not all(low <= s <= high for s in self.size):
-            raise UsageError(f"a film of {self.size[0]} x {self.size[1]} px: each side takes {low} to {high} px")
+            raise UsageError(f"a film of {self.size[0]} x {self.size[1]} px: each side must have {low} to {high} px")
         narrow, wide = (math.radians(v) for v in LIMITS["fov"])
         if self.fov_y is not None and not narrow <= self.fov_y <= wide:
             raise UsageError(
@@ -71,7 +71,7 @@ class FilmSettings:
         if self.seconds is not None and not 0 < self.seconds * self.fps <= MAX_FRAMES:
             raise UsageError(f"a film of {self.seconds:g} s: give more than 0, and at most {MAX_FRAMES:,} frames")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
-            raise UsageError(f"a film needs at least 1 frame and takes at most {MAX_FRAMES:,}, not {self.frames}")
+            raise UsageError(f"a film needs at least 1 frame and may have at most {MAX_FRAMES:,}, not {self.frames}")
 
     def count(self, seconds: float) -> int:
         """Return the number of frames of a film that lasts ``seconds`` where no duration is given."""
@@ -128,7 +128,7 @@ def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[C
 def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
     """Return the cameras of a film through the keyframes of a file, and how it goes."""
     if settings.fov_y is not None:
-        raise UsageError(f"{path}: keyframes have fields of view of their own; leave out --fov")
+        raise UsageError(f"{path}: keyframes have their own fields of view; leave out --fov")
     keyframes = read_keyframes(path, framed(first, settings.size), model.normalization)
     if rig.is_watched([k.camera for k in keyframes]):  # then the path goes around it, and not across
         keyframes = [replace(k, reach=rig.reach(k.camera)) for k in keyframes]
@@ -169,7 +169,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
     notes = [f"{len(train)} training cameras look {rig.describe()}"]
     if rig.turned:
-        notes.append("the photographs lie on their side; the film is upright, by the plane of the cameras")
+        notes.append("the photographs are rotated; the film is upright, by the plane of the cameras")
     kind = path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)

@@ -186,4 +186,4 @@ def _summary(rows: dict[str, dict[str, Any]]) -> str:
     if unseen is None:
         return "every held-out pixel was seen by a training view"
     pixels, error = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
-    return f"{pixels} of the held-out pixels were seen by no training view; they hold {error} of the squared error"
+    return f"{pixels} of the held-out pixels were seen by no training view; they have {error} of the squared error"

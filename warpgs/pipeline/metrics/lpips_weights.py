@@ -115,7 +115,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     if not isinstance(state, dict):
-        raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; give the weights alone")
+        raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; save only the weights")
     return state, digest
 
 

@@ -36,24 +36,24 @@ class InitConfig:
     """Source and first values of the Gaussians."""
 
     source: str = "auto"
-    """Source: sweep or flow (a point per pixel whose depth other views confirm), points (those of the reconstruction), random,
-    hull (on the surface of the visual hull of views that know their opacity), or auto: sweep for few views or given depth, else
-    points where the scene has at least 100 that training views saw, else random. Where views know their opacity, points that
-    are empty in one are left out."""
+    """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto: sweep for few views or
+    given depth, else points if training views saw at least 100, else random. If views have an alpha channel, points in an empty
+    area of a view are left out."""
     sweep_up_to: int = 0
-    """auto: most training views from which a fit starts with a sweep, which takes a second a view on two cores."""
+    """auto: largest number of training views for a start by sweep, which takes a second for each view on two cores."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
     """First opacity, in (0, 1)."""
     scale_factor: float = 1.0
-    """First width of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
+    """First standard deviation of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
     near_views: int = 4
-    """sweep, flow: nearest other views that each view is matched with."""
+    """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which consistent points become one [px]; 0 keeps one for every pixel."""
+    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps one for every pixel."""
     fill_px: float = 16.0
-    """sweep, flow: width of the cells of points where no depth is consistent [px]; 0 leaves those places empty."""
+    """sweep, flow: width of the cells of points without consistent depth [px]; 0 leaves these areas empty."""
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind edges of depth
     (docs/decisions/026-extrapolated-points.md). Then opacity decay spares Gaussians that a step does not use. None: by the
@@ -61,11 +61,11 @@ class InitConfig:
     flow: str = "dis"
     """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
-    """flow: colours that an ONNX file takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
+    """flow: range of input colours of an ONNX file: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
     max_residual: float = 1.0
     """flow: largest distance of a match from its epipolar line [px]."""
     blend: str = "least_sensitive"
-    """flow: which source view decides: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
+    """flow: combination of the depths from several views: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
 
     def __post_init__(self):
         if self.source not in SOURCES:
@@ -77,9 +77,9 @@ class InitConfig:
             raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
         self.epipolar()  # its own checks
         if not 1e-3 <= self.scale_factor <= 10:
-            raise UsageError(f"init scale-factor {self.scale_factor} must lie between 0.001 and 10")
+            raise UsageError(f"init scale-factor {self.scale_factor} must be between 0.001 and 10")
         if not 0 < self.opacity < 1:
-            raise UsageError(f"init opacity {self.opacity} must lie between 0 and 1")
+            raise UsageError(f"init opacity {self.opacity} must be between 0 and 1")
         if self.random_count < 1:
             raise UsageError(f"init random count {self.random_count} must be at least 1")
 
@@ -177,8 +177,8 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
     """
     if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
-            "the scene holds no 3D points that the training views saw, and --init.source points asks for them; "
-            "use --init.source random, or give a reconstruction with points"
+            "--init.source points needs 3D points that the training views saw, and the scene has none; use --init.source "
+            "random, or give a reconstruction with points"
         )
 
 
@@ -210,7 +210,7 @@ def initial_points(
     ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines on what is being done.
 
     Raises:
-        DataError: Points were asked for and the scene has none that the training views saw.
+        DataError: Points were requested and the scene has none that the training views saw.
     """
     check_points(views, points, config)
     if config.source == "hull":

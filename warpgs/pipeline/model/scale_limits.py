@@ -98,7 +98,7 @@ class LimitConfig:
         if not 0 <= self.min_pixels <= 1e6:
             raise UsageError(f"limits min-pixels must be 0, for no limit, or at most 1e6, not {self.min_pixels}")
         if not 0 <= self.ratio_from <= 1:
-            raise UsageError(f"limits ratio-from must lie between 0 and 1, not {self.ratio_from}")
+            raise UsageError(f"limits ratio-from must be between 0 and 1, not {self.ratio_from}")
 
     def at(self, progress: float, radius: float, antialiased: bool = False) -> Limits:
         """Return the limits of a step.

@@ -37,7 +37,7 @@ def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Return the coefficients [N, K, 3] that `pack` stored, K that of the highest degree, zeros above each one's degree.
 
     Raises:
-        ValueError: The degrees are not whole numbers from 0 to 4, or others than those that the coefficients were packed with.
+        ValueError: The degrees are not integers from 0 to 4, or others than those that the coefficients were packed with.
     """
     whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
     count = 3 * int((degrees.long() + 1).square().sum()) if whole else -1

@@ -79,7 +79,7 @@ def evaluate(
         by_coverage: Whether to split the scores by how many training views saw what a pixel shows.
 
     Raises:
-        DataError: The folder is no run, its scene is gone, the scene's data have changed since the fit, or the weights are
+        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the weights are
             no weights.
         ResourceError: Another process writes into the folder, or it cannot be written.
     """
@@ -135,13 +135,13 @@ def render(
         antialiased: Whether that file was trained with antialiasing.
 
     Raises:
-        DataError: The folder is no run, or the file, its cameras or the keyframes cannot be read.
+        DataError: The folder is not a run, or the file, its cameras or the keyframes cannot be read.
         ResourceError: A file cannot be written.
         UsageError: The path is unknown, the background is no colour, or a number is out of its range.
     """
     color = color_of(background)
     if color is None and background != "auto":
-        raise UsageError(f"--background {background}: a render takes auto, black, white, #rrggbb or r,g,b")
+        raise UsageError(f"--background {background}: expected auto, black, white, #rrggbb or r,g,b")
     home, named = folder if file_of is None else folder.parent, out is not None
     out = home / f"path-{Path(path).stem.replace('.', '-')}" if out is None else out
     notes: list[str] = []
@@ -151,7 +151,7 @@ def render(
         notes = stored.notes()
     else:
         stored, notes = open_file(folder, *file_of, device_name, antialiased)
-        notes += ["black lies behind the Gaussians; --background gives another colour"] if color is None else []
+        notes += ["the background is black; choose another colour with --background"] if color is None else []
     tell = Stages()
     settings = replace(settings, background=color)
     plan = plan_film(stored, path, settings)
@@ -181,7 +181,7 @@ def repeat_failed_step(path: Path, device_name: str) -> list[str]:
 
     Raises:
         DataError: The file holds no such step.
-        ResourceError: The device is not there.
+        ResourceError: The device is missing.
     """
     device, where = choose_device(device_name)
     return [f"{path}, computed again {where}:", *findings(read_failed_step(path, device))]

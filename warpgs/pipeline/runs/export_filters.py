@@ -52,13 +52,13 @@ def filtered(
         The Gaussians that are left, the rotation [3, 3] that turned them (None for none), and lines for the user.
 
     Raises:
-        UsageError: A filter makes no sense, or needs the cameras of a run.
+        UsageError: A filter is invalid, or needs the cameras of a run.
     """
     rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool), []
     if filters.crop is not None:
         keep = inside(gaussians, box_of(filters.crop))
-        lines.append(f"{int((~keep).sum()):,} Gaussians lie outside of the box")
+        lines.append(f"{int((~keep).sum()):,} Gaussians are outside the box")
     if cleaned if filters.clean is None else filters.clean:
         removed = disturbing(gaussians, None if stored is None else _maxima(stored))
         counts = ", ".join(f"{int((where & keep).sum()):,} {reason}" for reason, where in removed.items())

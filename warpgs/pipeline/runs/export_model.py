@@ -46,7 +46,7 @@ def convert(
     Raises:
         DataError: The file cannot be read or is malformed, or nothing is left of it.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: A suffix is unknown, a given format is that of neither file, a filter makes no sense, or needs the cameras
+        UsageError: A suffix is unknown, a given format is that of neither file, a filter is invalid, or needs the cameras
             of a run.
     """
     if holds_cameras(target):
@@ -75,9 +75,9 @@ def export(
         format: Format to write, as in `write_gaussians`; None for the one that the name says.
 
     Raises:
-        DataError: The folder is no run, or nothing is left of its model.
+        DataError: The folder is not a run, or nothing is left of its model.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: The name says no format, or not the given one, or a filter makes no sense.
+        UsageError: The name says no format, or not the given one, or a filter is invalid.
     """
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))
@@ -104,7 +104,9 @@ def _written(
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
         lines.append(f"the file does not hold the background colour of the fit, #{color}")
     if antialiased and not kind.declares:
-        lines.append(f"{kind.suffix} files cannot say that the model is antialiased: choose that mode where the file is shown")
+        lines.append(
+            f"{kind.suffix} files cannot declare that the model is antialiased: choose the antialiased mode in your viewer"
+        )
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
     with hold_folder(target.parent) as notes:
@@ -127,7 +129,7 @@ def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
 
 
 def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
-    """Check that only a rotation is asked for.
+    """Check that only a rotation is requested.
 
     Raises:
         UsageError: Another filter is, which cameras do not have, or a format of Gaussians.

@@ -182,7 +182,7 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
     job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
     job.notes += [*([background] if background else []), *chosen]
     if job.config.antialiased:
-        job.notes.append("antialiased: other programs show exported files as they are in their antialiased mode alone")
+        job.notes.append("antialiased: other programs show exported files correctly only in their antialiased mode")
     check_renders(job.config.batch, job.config.steps or 0)
 
 

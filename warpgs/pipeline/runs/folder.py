@@ -90,7 +90,7 @@ def camera_values(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any]) -> Camera:
-    """Return the camera of values that `camera_values` made; UsageError where its model is not there."""
+    """Return the camera of values that `camera_values` made; UsageError where its model is missing."""
     arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
     camera = Camera(**(values | arrays))
     check_camera(camera)
@@ -98,7 +98,7 @@ def _camera(values: dict[str, Any]) -> Camera:
 
 
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
-    """Return cameras by name that a file holds; DataError where a model is not there."""
+    """Return cameras by name that a file holds; DataError where a model is missing."""
     try:
         return {n: _camera(c) for n, c in stored.items()}
     except UsageError as e:
@@ -126,7 +126,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read config.json of a run folder, its format first.
 
     Raises:
-        DataError: The folder is no run, its record is not whole, or another version of warpgs wrote it in a format that this
+        DataError: The folder is no run, its record is incomplete, or another version of warpgs wrote it in a format that this
             one does not read; the message names that version and the way out.
     """
     path = folder / CONFIG
@@ -270,7 +270,7 @@ def stored_request(folder: Path) -> FitRequest:
     """Return the request that continues a run, with everything as the run was started.
 
     Raises:
-        DataError: The folder is no run, its settings are invalid, or its scene was passed from Python.
+        DataError: The folder is not a run, its settings are invalid, or its scene was passed from Python.
         UsageError: The run used code from outside warpgs, which must be named again.
     """
     record = read_record(folder)

@@ -37,8 +37,8 @@ def mesh(
         Lines for the user.
 
     Raises:
-        DataError: The folder is no run, or its training views see no surface.
-        ResourceError: Memory does not suffice, the device is not there, or the file cannot be written.
+        DataError: The folder is not a run, or its training views see no surface.
+        ResourceError: Memory does not suffice, the device is missing, or the file cannot be written.
         UsageError: The suffix is not supported, or an option is out of range.
     """
     check_suffix(target)
@@ -53,7 +53,7 @@ def mesh(
     def planned(plan: GridPlan, memory: str) -> None:
         say(
             f"grid of {' x '.join(map(str, plan.shape))} points {plan.voxel / scale:.4g} units of the scene's files apart, "
-            f"{memory}; {100 * (1 - plan.inside):.1f} % of the observed surface lies outside the grid and is left out"
+            f"{memory}; {100 * (1 - plan.inside):.1f} % of the observed surface is outside the grid and is left out"
         )
 
     with hold_folder(target.parent) as notes:
@@ -62,7 +62,7 @@ def mesh(
         up = common_up(cameras)
         write_mesh(target, made, up)
     if up is None and target.suffix.lower() == ".glb":
-        notes = [*notes, "the cameras agree on no upward direction, so the mesh may lie on its side in a viewer"]
+        notes = [*notes, "the cameras have no common upward direction, so the mesh may be rotated in a viewer"]
     return [*run.notes(), *notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
 
 

@@ -40,7 +40,7 @@ def open_file(
 
     Raises:
         DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
-        ResourceError: The device is not there.
+        ResourceError: The device is missing.
         UsageError: No cameras are given, or the rule is unknown.
     """
     if cameras is None:

@@ -64,7 +64,7 @@ class PlotSettings:
             if value not in known:
                 raise UsageError(f"{flag} {value}: give one of {', '.join(known)}")
         if not all(SIZES[0] <= s <= SIZES[1] for s in self.size):
-            raise UsageError(f"--size {self.size[0]} {self.size[1]}: each side takes {SIZES[0]} to {SIZES[1]} px")
+            raise UsageError(f"--size {self.size[0]} {self.size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
         if self.points == "start" and self.color == "coverage":
             raise UsageError("--color coverage: coverage is measured of Gaussians; leave out --points start")
 
@@ -110,7 +110,7 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
         device_name: auto, cpu or cuda.
 
     Raises:
-        DataError: The folder is no run, or the scene has no points to show.
+        DataError: The folder is not a run, or the scene has no points to show.
         ResourceError: This machine cannot render, or the file cannot be written.
         UsageError: The file is no .png.
     """

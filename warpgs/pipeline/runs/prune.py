@@ -88,8 +88,8 @@ def prune(
         Lines for the user.
 
     Raises:
-        DataError: The folder is no run, its scene is gone, or the scene's data have changed since the fit.
-        ResourceError: The new folder cannot be written, or the device is not there.
+        DataError: The folder is not a run, its scene is gone, or the scene's data have changed since the fit.
+        ResourceError: The new folder cannot be written, or the device is missing.
         UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
     """
     if not 0 < keep_psnr < math.inf:

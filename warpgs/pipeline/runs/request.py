@@ -26,10 +26,10 @@ NO_SCORES = "no scores: all photographs train; --split every:8 holds some out"
 
 @dataclass(frozen=True)
 class SceneRequest:
-    """A scene folder and the options it is read with."""
+    """A scene folder with options for reading it."""
 
     path: str
-    """Scene folder, in a format that one of the readers knows; or photographs or a video without cameras."""
+    """Scene folder in a supported format; or a folder of photographs or a video, without cameras."""
     # empty where a scene was passed from Python
     split: str | None = None
     """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (trains on all), or
@@ -37,42 +37,41 @@ class SceneRequest:
     downscale: int | None = None
     """Factor by which both image sides shrink; None for 1."""
     strict: bool = False
-    """A frame without an image file is an error."""
+    """Treat a frame without an image file as an error."""
     allow_outside: bool = False
-    """Names and links of the scene may lead to files outside its folder."""
+    """Allow names and links that point to files outside the scene folder."""
     masks: str = "ignore"
-    """Treatment of masked-out pixels: ignore (they do not count) or cutout (they are transparent)."""
+    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
-    """Dark pixels around an object are transparent, where every image shows one on black."""
+    """Make dark pixels around an object transparent, if every image shows an object on black."""
     score_masks: str | None = None
     """Folder of object masks for scoring, matched by image id; None for the scene's own idrmasks, if any."""
     reader: str | None = None
-    """Name of the scene's format, or a reader of your own: module:Class or path/to/file.py:Class; None to ask every reader."""
+    """Name of the scene's format, or your own reader as module:Class or path/to/file.py:Class; None to detect the format."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have as stored."""
     max_side: int | None = None
-    """Longest side that an image keeps [px], 0 for no limit; None for 0 where a factor is given, else for 1600, or 800 in a fit
-    on a CPU."""
+    """Largest image side [px], 0 for no limit; None for no limit with --downscale, else for 1600, or 800 in a fit on a CPU."""
     lenses: str = "undistort"
-    """Treatment of lens distortion: undistort (images become those of a pinhole) or native (the model is rendered through the
-    lens; the only way to read fisheyes)."""
+    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (the model is rendered through the
+    lens). Fisheyes need native."""
     depths: str | None = None
-    """Folder of depth maps, 16-bit PNG or NPY, named as the images are; they place the first Gaussians and guide the fit. By
-    default those that transforms.json names; the word none ignores them."""
+    """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
+    Default: those named in transforms.json; none to ignore these."""
     normals: str | None = None
-    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, likewise."""
+    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, as for --depths."""
     depth_kind: str = "metric"
     """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
     disparity (inverse lengths of unknown scale and shift, as networks give)."""
     depth_unit: float | None = None
-    """Length of one unit of a metric depth map in units of the cameras; None for 0.001 in whole numbers, 1 in others."""
+    """Length of one unit of a metric depth map in units of the cameras; None for 0.001 for integers, 1 for floats."""
     normal_axes: str = "opencv"
     """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
     matcher: str | None = None
-    """ONNX file that finds matches where SIFT leaves photographs without a pose, from `warpgs priors export --model xfeat`;
-    None for SIFT alone."""
+    """ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose; None for SIFT
+    only."""
 
     def with_scale(self, device: str) -> SceneRequest:
         """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
@@ -83,7 +82,7 @@ class SceneRequest:
 
 @dataclass(frozen=True)
 class FitRequest:
-    """A fit as the command line and studies ask for it."""
+    """A fit that the command line or a study requests."""
 
     scene: SceneRequest
     out: Path
@@ -96,7 +95,7 @@ class FitRequest:
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
     time_budget: float | None = None
-    """Time that the fit may take [s], by which its steps are chosen; None for those of ``config``. Not with ``resume``."""
+    """Time that the fit may take [s], which determines the number of steps; None to use ``config``. Not with ``resume``."""
     notes: tuple[str, ...] = ()
     """Choices made for the user while the request was read."""
     view_port: int | None = None
@@ -117,7 +116,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
     """Return the device for auto, cpu, cuda or cuda:N, or a device itself, and a phrase that names it.
 
     Raises:
-        ResourceError: CUDA was asked for and is not there.
+        ResourceError: CUDA was requested and is missing.
         UsageError: The name is none of these.
     """
     if isinstance(name, torch.device):
@@ -150,7 +149,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
         The split, and notes for the user: the choice made, masks and held-out views that make scores mean less.
 
     Raises:
-        DataError: A view that is named is not there.
+        DataError: A view that is named is missing.
         UsageError: The split is not understood.
     """
     split = split_views(scene, "all" if spec is None else spec)

@@ -35,7 +35,9 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
-            raise UsageError(f"--matcher finds poses, and {source} is no folder of photographs without cameras; leave it out")
+            raise UsageError(
+                f"--matcher finds poses, and {source} is not a folder of photographs without cameras; leave it out"
+            )
         return request, []
     if out is None:
         raise UsageError(f"{source}: has no cameras, and those found are kept in a run folder; give out")
@@ -58,7 +60,7 @@ def lost_lines(out: Path | None) -> list[str]:
     """Return a line on the photographs of a run that have no pose, and so no part in it; an empty list where there are none.
 
     Raises:
-        DataError: The record of the run's poses is not whole.
+        DataError: The record of the run's poses is incomplete.
     """
     if out is None or not (out / POSED_SCENE / JSON).is_file():
         return []

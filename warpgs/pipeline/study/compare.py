@@ -129,7 +129,7 @@ def _fits(request: StudyRequest, places: list[Place]) -> dict[Key, tuple[Place, 
 
 
 def _farmed(request: StudyRequest, fits: dict[Key, tuple[Place, FitRequest]]) -> dict[Key, JobRecord]:
-    """Run all fits on a farm where one is asked for; return their records."""
+    """Run all fits on a farm where one is requested; return their records."""
     if request.engine is None:
         return {}
     jobs = {}
@@ -176,7 +176,7 @@ def run_study(request: StudyRequest) -> list[str]:
 
     Raises:
         DataError: A scene cannot be read or holds out no view; the LPIPS weights are none; or every run of a variant failed.
-        ResourceError: The folder cannot be written, another process writes into it, or the device is not there.
+        ResourceError: The folder cannot be written, another process writes into it, or the device is missing.
     """
     device, where = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()

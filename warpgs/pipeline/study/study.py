@@ -70,7 +70,9 @@ class StudyRequest:
         if not names:
             raise UsageError("name at least one scene folder")
         if len(set(names)) < len(names):
-            raise UsageError(f"two scene folders have one name ({', '.join(names)}); results lie below it, so rename one")
+            raise UsageError(
+                f"two scene folders have one name ({', '.join(names)}); results are stored under it, so rename one"
+            )
 
 
 def scene_name(request: SceneRequest) -> str:

@@ -41,7 +41,7 @@ class Row:
     name: str
     """Name of the variant."""
     samples: dict[str, Sample]
-    """Mean and deviation by metric; a metric that is not there was not measured."""
+    """Mean and deviation by metric; a metric that is missing was not measured."""
     differences: dict[str, Difference]
     """Paired difference to the table's base by metric; empty for the base itself."""
     marks: tuple[bool, ...] = ()

@@ -21,7 +21,7 @@ CHOSEN = ("auto", "mean", "scene")
 BEHIND = 0x62616B67
 """Key that sets random backgrounds apart from other random numbers of a fit."""
 LEVELS = 2**16 - 1
-"""Levels that colours are rounded to before they are added: sums of whole numbers are exact in any order."""
+"""Levels that colours are rounded to before they are added: sums of integers are exact in any order."""
 
 
 def color_of(text: str) -> Color | None:

@@ -121,11 +121,11 @@ class FitConfig:
         if not self.checkpoint_seconds >= 0:
             raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
         if self.half_resolution is not None and not 0 <= self.half_resolution <= 1:
-            raise UsageError(f"half-resolution must lie in [0, 1], not {self.half_resolution}")
+            raise UsageError(f"half-resolution must be in [0, 1], not {self.half_resolution}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_DEGREE:
-            raise UsageError(f"sh-degree must lie in [0, {MAX_DEGREE}], not {self.sh_degree}")
+            raise UsageError(f"sh-degree must be in [0, {MAX_DEGREE}], not {self.sh_degree}")
         if not 0 <= self.dropout < 1:
-            raise UsageError(f"dropout must lie in [0, 1), not {self.dropout}")
+            raise UsageError(f"dropout must be in [0, 1), not {self.dropout}")
         rule_named(self.rule)
         color_of(self.background)
         check_terms(self.loss_terms)

@@ -24,7 +24,7 @@ eighth is less than the least, it is that eighth."""
 MIN_BLOCKS = 12
 """Fewest blocks over all views with which a gain can be told from noise."""
 MAX_FRACTION = 0.1
-"""Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was asked for."""
+"""Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was requested."""
 
 
 @dataclass(frozen=True)

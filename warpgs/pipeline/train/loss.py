@@ -27,14 +27,14 @@ class Target:
     mask: torch.Tensor | None
     """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
     maps: Mapping[str, torch.Tensor]
-    """Maps that loss terms asked for (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
+    """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
     background; with `LossConfig.random_background` it changes at each step."""
 
 
 class _Outputs(dict[str, torch.Tensor]):
-    """Images of a render that a term asked for; an error says how to ask for others."""
+    """Images of a render that a term requested; an error says how to ask for others."""
 
     def __init__(self, term: LossTerm, images: Mapping[str, torch.Tensor]):
         super().__init__({n: images[n] for n in term.needs_outputs})

@@ -121,7 +121,7 @@ class MemoryPlan:
     planned_at_cap: int
     """Bytes of steps at the cap, if each Gaussian then touches as many tiles as at the start."""
     lowered_from: int | None = None
-    """Cap that was asked for, where the limit lowered it."""
+    """Cap that was requested, where the limit lowered it."""
     chunked: bool = False
     """True where the first steps render images in chunks."""
     chunked_at_cap: bool = False
@@ -156,7 +156,7 @@ class MemoryPlan:
         if self.lowered_from is not None:
             text += f", so there will be at most {self.cap:,} Gaussians, not {self.lowered_from:,}"
         if self.graph_refused:
-            text += ", and steps are taken one by one, not as a CUDA graph, which would need more"
+            text += ", and steps run without a CUDA graph, which would need more"
         return text
 
 

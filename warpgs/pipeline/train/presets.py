@@ -1,6 +1,6 @@
 """Presets: named settings that a fit starts from. Ours are TOML files, and so may a user's be.
 
-Importing this costs nothing: the help of one screen reads the names. The settings load when a preset is asked for.
+Importing this costs nothing: the help of one screen reads the names. The settings load when a preset is requested.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Presets(Mapping[str, "FitConfig"]):
     """Settings of every preset by name."""
 
     def __init__(self, folder: Path):
-        """Find the files of a folder; they are read when they are asked for."""
+        """Find the files of a folder; they are read when they are requested."""
         self._files = {p.stem: p for p in sorted(folder.glob(f"*{SUFFIX}"), key=lambda p: (p.stem != DEFAULT_PRESET, p.stem))}
         self._made: dict[str, FitConfig] = {}
         self._about: dict[str, str] = {}

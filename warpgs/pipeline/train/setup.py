@@ -61,7 +61,7 @@ def prepare(
 
     Raises:
         DataError: There is nothing to start from.
-        UsageError: A view's camera cannot be rendered: its model is not there, or it has other coefficients. A given map is of
+        UsageError: A view's camera cannot be rendered: its model is missing, or it has other coefficients. A given map is of
             another size or not finite. Or the start or
             the strategy compares views, and a camera is no pinhole.
     """
@@ -114,7 +114,7 @@ def _unused_networks(config: FitConfig) -> list[str]:
     """Return notes on the networks that are named although nothing in the fit reads priors."""
     switches = {"depth": "--depth-guides or --method.s-geometry", "segmentation": "--method.s-semantic"}
     named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
-    return [f"--{kind}-model is not used, since no part of this fit reads its map; {switches[kind]} does" for kind in named]
+    return [f"--{kind}-model is not used: this fit needs no such map; to use it, add {switches[kind]}" for kind in named]
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
@@ -133,7 +133,7 @@ def samples(config: FitConfig) -> bool:
 
 
 def needs_priors(config: FitConfig) -> bool:
-    """Return whether the strategy, a loss term or a network's depth in place of a given one needs the priors of the views."""
+    """Return whether the strategy, a loss term or a network's depth instead of a given one needs the priors of the views."""
     by_strategy = find_strategy(config.strategy).needs_priors(config.groups())
     return by_strategy or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 

@@ -37,19 +37,19 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float | None = 0.0
-    """Gain of the left-out blocks in the last third of the steps, its noise added, below which growth ends [dB]; the rest of
-    the fit is then shorter in proportion. Not before a third of the time of growth, nor while views are half their size. 0:
-    nothing is held out, and the fit takes the planned steps. None: 0.1, or 0 where the time of a CPU limits the steps."""
+    """Growth ends when the gain of the left-out blocks over the last third of the steps, plus its noise, is below this [dB].
+    The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor while views have half size.
+    0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 where a CPU's time limits the steps."""
     fraction: float = 0.03
-    """Fraction of the pixels that is held out until growth ends."""
+    """Fraction of the pixels that is left out until growth ends."""
     measurements: int = 12
-    """Number of intervals, equal in length, into which the time of growth is divided; the blocks are measured after each."""
+    """Number of equal intervals of the time of growth; the blocks are measured after each."""
     noise: float = 1.0
-    """Standard errors of the mean gain over the blocks that count as its noise."""
+    """Noise of the gain, in standard errors of its mean over the blocks."""
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"stopping fraction {self.fraction} must lie above 0 and be at most 0.5")
+            raise UsageError(f"stopping fraction {self.fraction} must be above 0 and at most 0.5")
         if self.measurements < 1:
             raise UsageError(f"stopping measurements must be at least 1, not {self.measurements}")
         for name in ("noise", "min_gain_db"):
@@ -134,7 +134,7 @@ class Stopping:
         self.active = held >= MIN_BLOCKS and ends < planned and len(marks) > 1
         if not self.active:
             few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
-            return [Detail(f"stopping: nothing is held out, since {few}; the fit takes all its steps")]
+            return [Detail(f"early stopping is off, because {few}; the fit takes all its steps")]
         self.whole = context.views
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
         return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}")]

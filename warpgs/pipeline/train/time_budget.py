@@ -82,12 +82,12 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     if steps < MIN_STEPS:
         raise UsageError(
             f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s here, "
-            f"where a render with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
+            f"where an image with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
         )
     needed = setup + steps * step
     return dataclasses.replace(config, steps=steps), (
         f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, predicted to take {needed:.0f} s "
-        f"here, where a render with gradients takes {1000 * probe:.0f} ms"
+        f"here, where an image with gradients takes {1000 * probe:.0f} ms"
         + (f"; {len(views)} views need no more" if steps == most else "")
         + "; poses, start, scores and report come on top"
     )

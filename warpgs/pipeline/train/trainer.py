@@ -225,7 +225,7 @@ class Trainer:
                 raise
             raise self._no_memory(e) from e
         self.messages.append(
-            f"memory: none was left for step {self.step + 1}; steps are taken one by one from here on, within "
+            f"memory: step {self.step + 1} ran out of memory; steps run without CUDA graphs from here on, within "
             f"{format_bytes(self.memory_limit)}"
         )
 
@@ -282,7 +282,7 @@ class Trainer:
             self.taker.clear()
             self.layout = dataclasses.replace(self.layout, graphs=0)
             self.count_changed()
-            self.messages.append(f"memory: steps are taken one by one from here on, because {e}")
+            self.messages.append(f"memory: steps run without CUDA graphs from here on, because {e}")
             return False
         return True
 

@@ -162,7 +162,7 @@ class ViewStack:
     masks: Rows | None
     """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
     maps: Mapping[str, Rows]
-    """Maps that loss terms asked for, by name, each of shape [V, H, W, ...]."""
+    """Maps that loss terms requested, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
     """Number of each view among all training views, int64, shape [V]."""
     alphas: Rows | None = None

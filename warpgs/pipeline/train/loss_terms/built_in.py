@@ -19,20 +19,19 @@ class LossConfig:
     ssim_weight: float = 0.2
     """Fraction lambda of the structural term, in [0, 1]."""
     random_background: bool = True
-    """True to set views that know their opacity, and their renders, before another colour at each step: what is empty cannot
-    be matched by Gaussians in the colour of the background. Opaque views do not have it."""
+    """True to change the background of views with an alpha channel, and of their renders, at each step. Otherwise Gaussians of
+    the background colour could cover empty areas. It has no effect on opaque views."""
     alpha_weight: float = 1.0
-    """Weight of the mean absolute difference of opacities, in views that know theirs, in [0, 1000]; 0 for no such term."""
+    """Weight of the mean absolute difference of opacities, for views with an alpha channel, in [0, 1000]; 0 to disable."""
 
     smooth_weight: float | None = 0.0
-    """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 for no such term. None:
-    by the number of views."""
+    """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: by the
+    number of views."""
     depth_weight: float = 0.3
-    """Weight of the difference of rendered and given inverse depth, in views with given depth, in [0, 1000]; 0 for no such
-    term."""
+    """Weight of the difference of rendered and given inverse depth, for views with given depth, in [0, 1000]; 0 to disable."""
     normal_weight: float = 0.03
-    """Weight of 1 - cos between given normals and those of rendered depth, in views with given normals, in [0, 1000]; 0 for no
-    such term."""
+    """Weight of 1 - cos of the angle between given normals and those of rendered depth, for views with given normals, in [0,
+    1000]; 0 to disable."""
 
     exposure_weight: float = 0.01
     """Weight of the sum of squares of each view's exposure less the identity, where exposures are learned, in [0, 1000]."""
@@ -40,9 +39,9 @@ class LossConfig:
     def __post_init__(self) -> None:
         for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
             if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
-                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1000")
+                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1000")
         if not 0 <= self.ssim_weight <= 1:
-            raise UsageError(f"loss ssim weight {self.ssim_weight} must lie between 0 and 1")
+            raise UsageError(f"loss ssim weight {self.ssim_weight} must be between 0 and 1")
 
 
 def built_in_terms(

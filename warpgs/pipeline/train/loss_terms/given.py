@@ -58,7 +58,7 @@ class GivenDepthDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-depth: weight {self.weight} must lie between 0 and 1000")
+            raise UsageError(f"given-depth: weight {self.weight} must be between 0 and 1000")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return weight times q / d, weight, and weight times q, [H, W, 3]; 0 where no depth is given."""
@@ -85,8 +85,8 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
     """Compute the mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 where no pixel has both.
 
     Args:
-        normals: Unit normals, 0 where there is none, shape [H, W, 3].
-        target: Given normals, 0 where there is none, shape [H, W, 3]; shorter ones, means of several, count less.
+        normals: Unit normals, 0 for missing values, shape [H, W, 3].
+        target: Given normals, 0 for missing values, shape [H, W, 3]; shorter ones, means of several, count less.
         mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
@@ -101,7 +101,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
 @register("given_normals")
 @dataclass(frozen=True)
 class GivenNormalsDifference(LossTerm):
-    """The weighted 1 - cos between given normals and those of rendered depth, 0 in views without; for pinholes."""
+    """The weighted 1 - cos of the angle between given normals and those of rendered depth, 0 in views without; for pinholes."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
     weight: float = 0.03
@@ -109,7 +109,7 @@ class GivenNormalsDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-normals: weight {self.weight} must lie between 0 and 1000")
+            raise UsageError(f"given-normals: weight {self.weight} must be between 0 and 1000")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""

@@ -15,7 +15,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 @register("alpha")
 @dataclass(frozen=True)
 class AlphaDifference(LossTerm):
-    """The weighted mean absolute difference of rendered and true opacity, 0 in views that do not know theirs."""
+    """The weighted mean absolute difference of rendered and true opacity, 0 in views without an alpha channel."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha",)
     weight: float = 0.1
@@ -23,7 +23,7 @@ class AlphaDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"alpha: weight {self.weight} must lie between 0 and 1000")
+            raise UsageError(f"alpha: weight {self.weight} must be between 0 and 1000")
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the difference, its magnitude and its gradient."""

@@ -28,9 +28,9 @@ class DensityConfig:
     start: int = 500
     """First step after which Gaussians are added and removed."""
     every: int = 100
-    """Steps between two such events."""
+    """Steps between these events."""
     stop_fraction: float = 0.5
-    """Fraction of the fit after which the set is left alone."""
+    """Fraction of the fit after which no Gaussians are added or removed."""
     gradient: float = 2e-4
     """Mean gradient of the projected mean, in half image widths and heights, above which a Gaussian is densified."""
     clone_size: float = 0.01
@@ -38,11 +38,11 @@ class DensityConfig:
     prune_opacity: float = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: float = 0.1
-    """Gaussians larger than this fraction of the extent are removed once an opacity reset has happened, but not where more
-    than half of all are larger; 0 for never."""
+    """Size above which Gaussians are removed after the first opacity reset, as a fraction of the extent, unless these are more
+    than half of all; 0 to disable."""
     reset_every: int = 0
-    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views a reset costs decibels that the
-    rest of the fit does not win back (docs/decisions/002-no-opacity-reset.md)."""
+    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views the fit does not recover from a reset
+    (docs/decisions/002-no-opacity-reset.md)."""
     reset_opacity: float = 0.01
     """Largest opacity after a reset."""
     morton_order: bool = True
@@ -53,12 +53,12 @@ class DensityConfig:
             raise UsageError("density: every must be at least 1, start and reset every at least 0")
         for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must lie between 0 and 1")
+                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1")
         for name in ("gradient", "clone_size", "prune_size"):
             if not getattr(self, name) >= 0:
                 raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
         if not 0 < self.reset_opacity < 1:
-            raise UsageError(f"density reset opacity {self.reset_opacity} must lie between 0 and 1")
+            raise UsageError(f"density reset opacity {self.reset_opacity} must be between 0 and 1")
 
     def times(self, steps: int) -> EventTimes:
         """Return the times of events in a fit of that many steps."""

@@ -31,10 +31,10 @@ class ImportanceConfig:
     geometry: float = 0.4
     """Weight of the geometric score (paper, w3)."""
     residual: str = "length"
-    """Rendering residual: length (the paper), of the colour difference in the view itself; or gain, by how much a fine Gaussian
-    there would lower the squared error of all training views."""
+    """Rendering residual: length (the paper) of the colour difference in the view; or gain, the estimated drop of the squared
+    error of all training views by a fine Gaussian at the pixel."""
     curvature: float = 0.5
-    """Weight of the second derivatives within the geometric score (lambda_curv, which the paper leaves open)."""
+    """Weight of the second derivatives in the geometric score (lambda_curv; the paper gives no value)."""
 
     def __post_init__(self):
         if self.residual not in ("length", "gain"):

@@ -40,11 +40,11 @@ class MCMCConfig:
     start: int = 500
     """First step after which Gaussians are relocated and added."""
     every: int = 100
-    """Steps between two such events."""
+    """Steps between these events."""
     stop_fraction: float = 0.83
-    """Fraction of the fit after which the set is left alone; 25,000 of 30,000 steps in the paper."""
+    """Fraction of the fit after which no Gaussians are added or relocated; 25,000 of 30,000 steps in the paper."""
     growth: float = 0.05
-    """Gaussians added at an event, as a fraction of those there are, up to --max-gaussians."""
+    """Gaussians added at an event, as a fraction of the current number, up to --max-gaussians."""
     min_opacity: float = 0.005
     """Largest opacity of a dead Gaussian, in [0, 0.5]."""
     noise_lr: float = 5e5
@@ -59,10 +59,10 @@ class MCMCConfig:
             raise UsageError("mcmc: start must be at least 0 and every at least 1")
         for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
             if not 0 <= getattr(self, name) <= top:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must lie between 0 and {top}")
+                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and {top}")
         for name in ("noise_lr", "opacity_weight", "scale_weight"):
             if not 0 <= getattr(self, name) <= 1e9:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must lie between 0 and 1e9")
+                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and 1e9")
 
 
 @torch.no_grad()
@@ -74,7 +74,7 @@ def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tens
 
     Args:
         opacities: o of the one Gaussian, in (0, 1), shape [M].
-        copies: N, whole numbers from 1 to `MAX_COPIES`, shape [M].
+        copies: N, integers from 1 to `MAX_COPIES`, shape [M].
 
     Returns:
         New opacities and factors of the scales, shape [M] each, of the type of ``opacities``.

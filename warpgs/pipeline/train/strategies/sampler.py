@@ -22,35 +22,35 @@ class SamplerConfig:
     """Placement of fine Gaussians at one event."""
 
     depth: str = "rendered"
-    """Depth that Gaussians are placed at: rendered (the paper), or consistent, the depth of the start where other views confirm
-    it. With the latter, a pixel is reliable only where its depth is consistent, in views that have such depth."""
+    """Depth of new Gaussians: rendered (the paper), or consistent, the depth of the start where other views confirm it. With
+    consistent, only pixels with such depth are reliable, in views that have some."""
     fraction: float = 0.005
     """Gaussians per event and view, as a fraction of the view's pixels."""
     gate_quantile: float = 0.6
-    """Quantile of a view's geometric score above which a pixel is reliable, in [0, 1) (tau_geometry); 0 for no such gate."""
+    """Quantile of a view's geometric score above which a pixel is reliable, in [0, 1) (tau_geometry); 0 to disable."""
     min_alpha: float = 0.5
-    """Least rendered opacity of a pixel at which a Gaussian may be placed, in [0, 1)."""
+    """Smallest rendered opacity of a pixel that may receive a Gaussian, in [0, 1)."""
     border: int = 2
-    """Distance to the image border below which no pixel is sampled [px]."""
+    """Width of the image border in which no pixel is sampled [px]."""
     opacity: float = 0.1
     """First opacity of a fine Gaussian, in (0, 1)."""
     footprint: float = 1.0
-    """First standard deviation of a fine Gaussian [px], in the view that placed it."""
+    """First standard deviation of a fine Gaussian [px], in the view of its pixel."""
     max_fraction: float = 0.5
-    """Most fine Gaussians, as a fraction of the coarse ones."""
+    """Largest number of fine Gaussians, as a fraction of the coarse ones."""
 
     def __post_init__(self):
         if self.depth not in ("rendered", "consistent"):
             raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, consistent")
         if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
-            raise UsageError("sampler: fraction must lie in (0, 1], gate quantile and min alpha in [0, 1)")
+            raise UsageError("sampler: fraction must be in (0, 1], gate quantile and min alpha in [0, 1)")
         if (
             not 0 < self.opacity < 1
             or not 0 < self.footprint < math.inf
             or self.border < 0
             or not 0 <= self.max_fraction < math.inf
         ):
-            raise UsageError("sampler: opacity must lie in (0, 1), footprint above 0, border and max fraction at 0 or above")
+            raise UsageError("sampler: opacity must be in (0, 1), footprint above 0, border and max fraction at 0 or above")
 
 
 def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | None, config: SamplerConfig) -> torch.Tensor:

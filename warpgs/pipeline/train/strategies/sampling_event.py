@@ -44,9 +44,9 @@ class ProtectConfig:
     """Protection of new Gaussians."""
 
     steps: int = 500
-    """Age [steps] up to which a sampled Gaussian is protected (T_protect, which the paper leaves open): five refinements."""
+    """Age up to which a sampled Gaussian is protected [steps] (T_protect; the paper gives no value): five refinements."""
     opacity: float = 0.05
-    """Least opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times the pruning threshold."""
+    """Smallest opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times the pruning threshold."""
 
     def __post_init__(self):
         if self.steps < 0 or not 0 < self.opacity < 1:
@@ -60,41 +60,42 @@ class ProtectConfig:
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Switches of the paper's parts (its Table 2), and their settings. All off is plain 3D Gaussian splatting."""
+    """Switches of the paper's parts (its Table 2), and their settings. With all off it is plain 3D Gaussian splatting."""
 
     events: bool = False
     """Sampling events: fine Gaussians are added in phase 2."""
     hier: bool | None = False
-    """Two layers: from phase 2 on the coarse one is neither cloned nor split, and its means move slowly. None: by the number of
-    views."""
+    """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: by the number
+    of views."""
     s_render: bool = True
-    """Weight of the rendering residual in the importance."""
+    """Use the rendering residual in the importance."""
     s_semantic: bool = True
-    """Weight of the semantic score in the importance."""
+    """Use the semantic score in the importance."""
     s_geometry: bool = True
-    """Weight of the geometric score in the importance. A gate with gate_quantile above 0 (paper-literal) uses the map even when
-    this is off; with 0 (default, quick) no gate uses it."""
+    """Use the geometric score in the importance. With gate_quantile above 0 (paper-literal) the reliability gate uses the score
+    even if this is off."""
     ra: bool = True
-    """Reliability gate: only pixels above gate_quantile of the geometric score (0: no such gate) and, with sampler.depth
-    consistent, only pixels with consistent depth in views that have some."""
+    """Reliability gate: sample only pixels above gate_quantile of the geometric score and, with sampler.depth consistent, only
+    pixels with consistent depth, in views that have some."""
     agp: bool = True
-    """Adaptive Gaussian placement: pixels are sampled at random by importance; off takes the highest ones."""
+    """Adaptive Gaussian placement: sample pixels at random in proportion to importance; off takes those of highest
+    importance."""
     pm: bool = True
-    """Protection mechanism: new fine Gaussians keep a least opacity and are not pruned."""
+    """Protection mechanism: new fine Gaussians keep a minimum opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
-    """Fraction of its Adam step that each mean of the coarse layer takes from phase 2 on, in [0, 1]."""
+    """Factor of the learning rate of the means of the coarse layer from phase 2 on, in [0, 1]."""
     keep: float = 1.0
-    """Fraction of the Gaussians that stay when phase 3 begins, in (0, 1]: those with the largest sums of
-    blending weights over the training views."""
+    """Fraction of the Gaussians that are kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
+    over the training views."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
 
     def __post_init__(self):
         if not 0 < self.keep <= 1:
-            raise UsageError(f"method keep {self.keep} must lie in (0, 1]")
+            raise UsageError(f"method keep {self.keep} must be in (0, 1]")
         if not 0 <= self.coarse_lr_factor <= 1:
-            raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must lie between 0 and 1")
+            raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must be between 0 and 1")
 
     def weights(self, semantics: bool = True) -> tuple[float, float, float]:
         """Return the weights of the render, semantic and geometric score, 0 where switched off, scaled to sum to 1.
@@ -146,7 +147,7 @@ class SampledView:
     gate: torch.Tensor
     """Pixels that could be sampled, bool, shape [H, W]."""
     quantile: float
-    """Quantile of the geometric score that the gate used; lower than asked for where too few pixels passed."""
+    """Quantile of the geometric score that the gate used; lower than requested where too few pixels passed."""
     at: torch.Tensor
     """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
 

@@ -73,22 +73,22 @@ def exposed(rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
 @register("exposure")
 @dataclass(frozen=True)
 class Exposure(ViewModule):
-    """Learn an affine map of colours for each training view, for photographs that differ in brightness or white balance.
+    """Learn an affine map of colours for each training view, for photographs with different brightness or white balance.
 
-    No held-out view has one, and no render: scores are of the model's own colours (docs/your-photos.md).
+    Held-out views and renders do not use the maps: scores are those of the model's own colours (docs/your-photos.md).
     """
 
     lr: float = 5e-3
     """Learning rate of the exposures at the start."""
     decay: float = 0.1
-    """Fraction of it that is left at the last step; log-linear between."""
+    """Fraction of the learning rate at the last step; log-linear between."""
     weight: float = 0.01
-    """Weight of the sum of squares of each view's exposure less the identity, in [0, 1000]."""
+    """Weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
 
     def __post_init__(self) -> None:
         check_lrs(self.name, lr=self.lr, decay=self.decay)
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"exposure weight must lie between 0 and 1000, not {self.weight}")
+            raise UsageError(f"exposure weight must be between 0 and 1000, not {self.weight}")
 
     def check(self, views: Sequence[View]) -> None:
         """Check that no view knows its opacity: an exposure would change the background with the object.

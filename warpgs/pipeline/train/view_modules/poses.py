@@ -201,18 +201,18 @@ def pose_figures(
 @register("refine_poses")
 @dataclass(frozen=True)
 class RefinePoses(ViewModule):
-    """Learn an increment of each training camera but the first, for poses that are a little off (docs/your-photos.md)."""
+    """Learn a small correction of each training camera except the first, for inexact poses (docs/your-photos.md)."""
 
     start: float = 0.2
-    """Fraction of the steps before poses are refined, in [0, 1): the first Gaussians tell nothing of them."""
+    """Fraction of the steps before poses are refined, in [0, 1), because the first Gaussians are inaccurate."""
     rotation_lr: float = 2e-4
-    """Learning rate of the training cameras' rotations [rad] from then on."""
+    """Learning rate of the rotations of the training cameras [rad], when refinement starts."""
     translation_lr: float = 2e-4
-    """The same of their translations, times the scene's extent."""
+    """Learning rate of their translations, times the scene's extent."""
     focal_lr: float | None = None
-    """The same of the logarithm of each camera's focal length, which all its views share; None keeps it as given."""
+    """Learning rate of the logarithm of each camera's focal length, shared by all its views; None to keep it fixed."""
     decay: float = 0.1
-    """Fraction of all three that is left at the last step; log-linear between."""
+    """Fraction of these learning rates at the last step; log-linear between."""
 
     def __post_init__(self) -> None:
         lrs = {"rotation_lr": self.rotation_lr, "translation_lr": self.translation_lr, "focal_lr": self.focal_lr}
