@@ -11,6 +11,7 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.lens_cameras import COEFFICIENTS, LENSES, lens_camera, opencv_pixels
 from warpgs import lenses
 from warpgs.constants import RULES
+from warpgs.errors import UsageError
 from warpgs.kernels.project import project
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.render.reference import reference_image
@@ -101,6 +102,22 @@ def test_a_lens_without_distortion_is_a_pinhole(device):
     for one, other in zip(*found):
         # a hundred roundings of the largest number in a sum
         assert float((one - other).abs().max()) <= 100 * 2.3e-16 * float(one.abs().max())
+
+
+def test_none_is_no_coefficient_and_not_zeros(device):
+    """For a pinhole None and an empty array give the same bits; a model with coefficients asks for zeros, and names them.
+
+    opencv with zeros takes the lens's formulas: its float32 image differs from the pinhole's by rounding (measured 4.7e-6).
+    """
+    gaussians, cam = cloud(300, torch.float32, device), camera(75, 53, cameras=2, dtype=torch.float32, device=device)
+    image = rasterize(gaussians, cam).rgb
+    for empty in (cam.K.new_zeros(0), cam.K.new_zeros(2, 0)):
+        assert torch.equal(rasterize(gaussians, dataclasses.replace(cam, distortion=empty)).rgb, image)
+    zeros = rasterize(gaussians, dataclasses.replace(cam, model="opencv", distortion=cam.K.new_zeros(8))).rgb
+    assert float((zeros - image).abs().max()) < 2e-5 and float(image.max()) > 0.3
+    for model, count in (("opencv", 8), ("fisheye", 4)):
+        with pytest.raises(UsageError, match=f"{model!r} takes {count} coefficients of distortion, found 0; give .* zeros"):
+            rasterize(gaussians, dataclasses.replace(cam, model=model))
 
 
 @pytest.mark.parametrize("model", LENSES)

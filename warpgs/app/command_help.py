@@ -65,6 +65,18 @@ def flag_names(kind: type, prefix: str = "") -> Iterator[str]:
                 yield f"--{parent}{'.' * bool(parent)}no-{last}"
 
 
+def positional_names(kind: type) -> list[str]:
+    """Return the names of the words that a command needs before its flags, as its help has them."""
+    hints, names = typing.get_type_hints(kind, include_extras=True), []
+    for field in dataclasses.fields(kind):
+        hint, markers = _parts(hints[field.name])
+        if dataclasses.is_dataclass(hint):
+            names += positional_names(typing.cast(type, hint))
+        elif "Positional" in str(markers) and _required(field):
+            names.append(field.name.upper())
+    return names
+
+
 def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """Return the type and the markers of an annotation; None is left out of a union."""
     markers: tuple[Any, ...] = ()

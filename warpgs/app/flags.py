@@ -6,14 +6,13 @@ import io
 import re
 import typing
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from warpgs.app.command_help import flag_names, help_text
+from warpgs.app.command_help import help_text
+from warpgs.app.wrong_words import refuse
 from warpgs.errors import UsageError
 from warpgs.field_docs import field_docs
 from warpgs.runtime.terminal import say
-from warpgs.suggestion import did_you_mean
 
 Settings = TypeVar("Settings")
 
@@ -72,10 +71,8 @@ def either(flags: Any, name: str) -> bool | None:
     return True if yes else False if no else None
 
 
-TARGETS = ("--to", "--out")
-"""Flags that name the file to write."""
 MAX_WHOLE = 2**63 - 1
-"""Largest integer that a flag takes: that of 64 bits."""
+"""Largest whole number that a flag takes: that of 64 bits."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
 MAX_NUMBER = 3e38
@@ -83,7 +80,7 @@ MAX_NUMBER = 3e38
 
 
 def _whole(words: list[str]) -> int:
-    """Return the integer that a word stands for; ValueError where it is none, or none of 64 bits."""
+    """Return the whole number that a word stands for; ValueError where it is none, or none of 64 bits."""
     if not re.fullmatch(r"[+-]?[0-9][0-9_]{0,40}", words[0]) or abs(number := int(words[0])) > MAX_WHOLE:
         raise ValueError(f"expected an integer of at most 2^63 - 1, got {words[0][:40]!r}")
     return number
@@ -114,8 +111,7 @@ def _number_rule(info: Any) -> Any:
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
     """Return an instance of a dataclass of flags from the words of a command line; ``--help`` prints one screen.
 
-    Numbers are finite and written in the digits 0 to 9. For all other faults than unknown flags tyro prints the reason and ends
-    the process with exit code 2.
+    Numbers are finite and written in the digits 0 to 9.
 
     Args:
         kind: The dataclass.
@@ -124,8 +120,8 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
         description: Words about the command, for the help.
 
     Raises:
-        SystemExit: A word is wrong, or help was requested.
-        UsageError: The flag is unknown.
+        SystemExit: Help was asked for.
+        UsageError: A word is wrong, or one is missing.
     """
     import tyro
 
@@ -142,49 +138,8 @@ def parse_flags(kind: type, arguments: list[str], program: str, description: str
             return tyro.cli(kind, args=arguments, prog=program, description=description, registry=registry)
     except SystemExit:
         if complaint.getvalue():
-            _refuse_unknown_flag(kind, arguments, program)
-            _refuse_lone_side(kind, arguments)
-            _refuse_stray_word(kind, arguments, program, complaint.getvalue())
-        for line in re.sub(r"\x1b\[[0-9;]*m", "", complaint.getvalue()).splitlines():
-            say(line, error=True)
-        raise
-
-
-def _refuse_unknown_flag(kind: type, arguments: list[str], program: str) -> None:
-    """Raise UsageError for the first word that looks like a flag and is none of a dataclass of flags."""
-    known = {*flag_names(kind), "--help"}
-    for word in arguments:
-        flag = word.partition("=")[0].replace("_", "-")
-        if flag.startswith("--") and flag not in known:
-            hint = did_you_mean(flag, known) or f"`{program} --help-all` lists the flags"
-            raise UsageError(f"unknown flag {flag}; {hint}")
-
-
-def _refuse_lone_side(kind: type, arguments: list[str]) -> None:
-    """Raise UsageError for a size that is not two integers."""
-    for flag in {"--size"} & {*flag_names(kind)}:
-        at = next((i for i, word in enumerate(arguments) if word.partition("=")[0] == flag), None)
-        if at is not None and not ("=" not in arguments[at] and _are_whole(arguments[at + 1 : at + 3])):
-            raise UsageError(f"{flag} needs two numbers: width height, such as {flag} 1280 720")
-
-
-def _are_whole(words: list[str]) -> bool:
-    """Return whether words are two integers."""
-    return len(words) == 2 and all(re.fullmatch(r"[+-]?[0-9]+", word) for word in words)
-
-
-def _refuse_stray_word(kind: type, arguments: list[str], program: str, complaint: str) -> None:
-    """Raise UsageError for the word that tyro's ``complaint`` calls unrecognized; it may be the file that a flag names."""
-    _, found, rest = complaint.partition("Unrecognized options:")
-    words = re.sub(r"\x1b\[[0-9;]*m|[│╭╮╰╯─]", " ", rest).split()
-    if not found or not words or words[0] not in arguments:
-        return
-    known, given = {*flag_names(kind)}, {word.partition("=")[0] for word in arguments}
-    target = next((flag for flag in TARGETS if flag in known - given), None)
-    hint = (
-        f"did you mean {target} {words[0]}?" if target and Path(words[0]).suffix else f"`{program} --help` lists its arguments"
-    )
-    raise UsageError(f"{words[0]} is an extra argument; {hint}")
+            refuse(kind, arguments, program, complaint.getvalue())
+        raise  # after tyro's help
 
 
 def check_range(flag: str, value: float, low: float, high: float) -> None:

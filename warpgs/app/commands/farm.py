@@ -86,10 +86,10 @@ def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
         if job.flags not in requests:
             try:
                 requests[job.flags] = request_of(["SCENE", "--out", "RUN", *shared, *job.flags], "")
-            except SystemExit as e:
-                if not job.flags or not e.code:
+            except UsageError as e:
+                if not job.flags:
                     raise
-                raise UsageError(f"job {job.name}: a flag of its line, above, is wrong: {' '.join(job.flags)}") from e
+                raise UsageError(f"job {job.name}: {e}") from e
         request, folder = requests[job.flags], out / job.name
         scene = dataclasses.replace(request.scene, path=str(job.scene))
         jobs.append(FarmJob(job.name, dataclasses.replace(request, scene=scene, out=folder / "run"), folder, out))

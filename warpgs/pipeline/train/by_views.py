@@ -164,7 +164,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if limit:
         notes.append(limit)
     chosen_parts = {
-        "steps": steps, "sh_degree": degree, "sh_every": sh_every, "half_resolution": half, "init": init, "optimizer": optimizer,
-        "method": method, "loss": loss, "stopping": stopping,
+        "steps": steps, "sh_degree": degree, "sh_every": sh_every, "half_resolution": half, "init": init,
+        "optimizer": optimizer, "method": method, "loss": loss, "stopping": stopping,
     }  # fmt: skip
     return dataclasses.replace(config, **chosen_parts), notes

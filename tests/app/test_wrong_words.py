@@ -1,0 +1,56 @@
+"""A command line that cannot be read ends in one line that names the word and the fix, with exit code 2."""
+
+import dataclasses
+
+import pytest
+
+from warpgs.app.cli import main
+from warpgs.app.wrong_words import refuse
+from warpgs.errors import UsageError
+
+WHOLE = "expected an integer of at most 2^63 - 1, got"
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        ("fit --ouut run", "unknown flag --ouut; did you mean --out?"),
+        ("fit scene -out run", "unknown flag -out; did you mean --out?"),
+        ("fit scene run", "run is an extra argument; did you mean --out run?"),
+        ("fit", "SCENE and --out PATH are missing; `warpgs fit --help` lists what it takes"),
+        ("fit scene --out", "--out needs a value; `warpgs fit --help` lists what it takes"),
+        ("fit scene --out --steps 3", "--out needs a value; `warpgs fit --help` lists what it takes"),
+        ("fit scene --out run --steps abc", f"--steps: {WHOLE} 'abc'; `warpgs fit --help` lists what it takes"),
+        ("fit scene --out run --seed 1.5", f"--seed: {WHOLE} '1.5'; `warpgs fit --help` lists what it takes"),
+        ("fit scene --out run --method.hier x", "--method.hier: 'x' is not one of "),
+        ("mesh run", "--out PATH is missing; `warpgs mesh --help` lists what it takes"),
+        ("convert a", "TARGET is missing; `warpgs convert --help` lists what it takes"),
+        ("demo", "FOLDER is missing; `warpgs demo --help` lists what it takes"),
+        ("view --port x run", f"--port: {WHOLE} 'x'; `warpgs view --help` lists what it takes"),
+        ("farm", "JOBS and --out PATH are missing; `warpgs farm --help` lists what it takes"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(words, error, tmp_path, capsys, monkeypatch):
+    """Nothing is made."""
+    monkeypatch.chdir(tmp_path)
+    assert main(words.split()) == 2
+    output = capsys.readouterr()
+    assert output.err.startswith(f"warpgs: {error}") and len(output.err.splitlines()) == 1 and not output.out
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("columns", "box"), [("30", True), ("30", False), ("100", True)])
+def test_the_terminal_does_not_matter(columns, box, capsys, monkeypatch):
+    """Narrow or wide, with or without the letters of a box."""
+    monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setattr("tyro._fmtlib._FORCE_UTF8_BOXES", box)
+    assert [main(words.split()) for words in ("mesh run", "view --port x run", "doctor x")] == [2, 2, 2]
+    missing, wrong, stray = capsys.readouterr().err.splitlines()
+    assert "--out PATH is missing; " in missing and f"--port: {WHOLE} 'x'; " in wrong and "x is an extra argument" in stray
+
+
+def test_a_complaint_in_other_words_is_passed_on_in_one_line():
+    """As another version of the parser may have them."""
+    box = "╭─ Fault ────╮\n│ Something  │\n│ is wrong.  │\n│ ────────── │\n│ For more.. │\n╰────────────╯\n"
+    with pytest.raises(UsageError, match=r"^Something is wrong.; `warpgs fit --help` lists what it takes$"):
+        refuse(dataclasses.make_dataclass("Flags", []), [], "warpgs fit", box)
