@@ -163,5 +163,5 @@ def test_the_table_of_gradients_says_where_ours_are_not_lowest():
     )
     rows[-1] |= {"p99": 1e-8, "bias": -2e-8}
     made = rasterizers_page.gradients_table([result])
-    assert "within 5 % of the lowest, but for: sh of `garden` (gsplat dense 1.0e-08, ours 1.0e-06)." in made
+    assert "within 5 % of the lowest, except: sh of `garden` (gsplat dense 1.0e-08, ours 1.0e-06)." in made
     assert "| garden | `gsplat-1.6` | gsplat dense | 1.0e-05 |" in made and "-2.0e-08" in made

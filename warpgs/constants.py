@@ -77,14 +77,14 @@ class Rule:
     name: str
     """Name in options and reports."""
     alpha_cut: float = ALPHA_CUT
-    """Smallest alpha that is blended, 1/255 by default; 0 blends all, and every Gaussian then spans every tile."""
+    """Smallest alpha that is blended, 1/255 by default. With 0 all are blended, and every Gaussian touches every tile."""
     alpha_max: float = ALPHA_MAX
     """Largest alpha; where alpha is clamped to it, its gradient is zero."""
     transmittance_stop: float = TRANSMITTANCE_STOP
     """Transmittance below which a pixel is finished."""
     inclusive_stop: bool = True
-    """True to blend the Gaussian that crosses the stop, so that at most 1e-4 of the pixel is left for what lies behind, and
-    accumulated alpha is monotone in every opacity within that. False to drop it, which leaves up to 1e-2."""
+    """True to blend the Gaussian that crosses the stop. Then at most 1e-4 of the pixel is lost, and accumulated alpha is
+    monotone in every opacity within that. False to drop it, which loses up to 1e-2."""
     near: float = NEAR
     """Nearest depth rendered [u], at least 0."""
     far: float = FAR
@@ -92,7 +92,7 @@ class Rule:
     low_pass: float = LOW_PASS
     """Variance added to both image axes [px^2]."""
     square_sigma: float = 0.0
-    """0 for Gaussians that reach exactly as far as alpha >= alpha_cut. Else they reach the tiles that a square of half side
+    """0 to render Gaussians exactly where alpha >= alpha_cut. Else they are rendered in the tiles that a square of half side
     ceil(square_sigma * longest axis) touches, as in the first 3DGS renderer."""
 
     def __post_init__(self) -> None:

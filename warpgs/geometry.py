@@ -216,22 +216,22 @@ def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:
 
 
 def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
-    """Compute the normals of the surface that a depth map shows, from finite differences of its back-projected pixels.
+    """Compute the normals of the surface of a depth map, from finite differences of its back-projected pixels.
 
-    A normal is perpendicular to the differences between the neighbours right and left, and below and above: exact for a plane.
-    Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` where those require gradients. Nothing is read back
-    from the device. A depth that is NaN makes normals NaN.
+    A normal is perpendicular to two differences: between the right and left neighbour, and between the lower and upper one.
+    It is exact for planes. Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` if they require
+    gradients. Nothing is read back from the device. A NaN depth gives NaN normals.
 
     Args:
-        camera: Its tensors, of one camera, have the type and device of ``depth``.
+        camera: One camera, with tensors of the type and device of ``depth``.
         depth: z-depths [u], above 0 where there is a surface, shape [H, W].
 
     Returns:
-        Unit normals in the axes of the world, towards the camera, shape [H, W, 3]; 0 at the border of the image, and where the
-        pixel or one of its four neighbours has no depth.
+        Unit normals in world axes, towards the camera, shape [H, W, 3]; 0 at the border of the image, and where the pixel or
+        one of its four neighbours has no depth.
 
     Raises:
-        UsageError: The camera is no pinhole.
+        UsageError: The camera is not a pinhole.
     """
     import torch
 
@@ -258,18 +258,18 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
 def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) -> torch.Tensor:
     """Compute the normal of each Gaussian: its shortest axis, on the side of the camera.
 
-    Differentiable in ``quats``. Which axis and which side has no gradient. A round Gaussian has no normal of meaning. As
-    `RasterizeOptions.features` the normals render an image of normals.
+    Differentiable in ``quats``; the choice of axis and side has no gradient. The normal of a round Gaussian is meaningless.
+    Pass the normals as `RasterizeOptions.features` to render an image of normals.
 
     Args:
         gaussians: N Gaussians.
         camera: One camera, or C of them, with arrays or tensors.
 
     Returns:
-        Unit normals in the axes of the world, shape [N, 3], or [C, N, 3] for C cameras.
+        Unit normals in world axes, shape [N, 3], or [C, N, 3] for C cameras.
 
     Raises:
-        TypeError: Gaussians are given by covariances.
+        TypeError: The Gaussians are given by covariances.
     """
     import torch
 

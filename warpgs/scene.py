@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Camera:
     """One camera, or a batch of C cameras that share an image size and a camera model.
 
-    Readers make numpy float64 cameras; the rasterizer also takes torch tensors, and gradients flow into them.
+    Readers return cameras with numpy float64 arrays. The rasterizer also accepts torch tensors and computes their gradients.
     """
 
     viewmat: Array
@@ -36,8 +36,9 @@ class Camera:
     model: str = "pinhole"
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
-    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv 8, k1 k2 p1 p2 k3 k4 k5 k6, for fisheye 4,
-    k1 to k4; zeros for an ideal lens; None for a model without. They have no gradient: those that require one are refused."""
+    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv k1 k2 p1 p2 k3 k4 k5 k6, for fisheye k1 to
+    k4, zeros for an ideal lens; None for models without coefficients. They have no gradient; tensors that require one are an
+    error."""
 
     @property
     def center(self) -> np.ndarray:
@@ -53,10 +54,10 @@ DEPTH_KINDS = ("metric", "relative", "disparity")
 
 @dataclass(frozen=True)
 class GivenDepth:
-    """Depth of the pixels of one view from outside the photographs: a sensor, a laser scan or a network."""
+    """Depth map of one view from another source than the photographs: a sensor, a laser scan or a network."""
 
     values: np.ndarray
-    """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 where there is none."""
+    """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 for missing values."""
     kind: str = "metric"
     """Unit of the values, one of `DEPTH_KINDS`: metric [u], or an unknown scale and shift of each view."""
     confidence: np.ndarray | None = None
@@ -76,18 +77,18 @@ class View:
     mask: np.ndarray | None = None
     """True where the pixel counts, bool, shape [H, W]; None where every pixel counts."""
     score_mask: np.ndarray | None = None
-    """True where a render is scored, bool, shape [H, W]; the fit does not see it. None where ``mask`` decides both."""
+    """True where a render is scored, bool, shape [H, W]; the fit does not use it. None to score by ``mask``."""
     alpha: np.ndarray | None = None
     """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None
     where the image is opaque."""
     alpha_estimated: bool = False
-    """True where ``alpha`` was estimated from a black background: it says where Gaussians start and what is scored. The loss
-    does not use it, since dark parts of the object may be taken for background."""
+    """True if ``alpha`` was estimated from a black background. It then selects the pixels that start Gaussians and are scored.
+    The loss does not use it, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
-    """Depth from outside, for the start and the loss of a fit; None where none is given."""
+    """Given depth, for the start and the loss of a fit; None without."""
     normals: np.ndarray | None = None
-    """Normals from outside, unit vectors towards the camera in its axes (+x right, +y down, +z forward), float32, shape
-    [H, W, 3]; 0 where there is none. None where none are given."""
+    """Given normals: unit vectors towards the camera in its axes (+x right, +y down, +z forward), float32, shape [H, W, 3]; 0
+    for missing values. None without normals."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class PointCloud:
         return len(self.points)
 
     def seen_by(self, names: set[str], least: int = 1) -> PointCloud:
-        """Return the points whose tracks name at least ``least`` of the views; all points where tracks are unknown."""
+        """Return the points seen by at least ``least`` of the views; all points if the tracks are unknown."""
         if self.tracks is None:
             return self
         keep = np.array([len(names & t) >= least for t in self.tracks], dtype=bool)
@@ -126,7 +127,7 @@ class Normalization:
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything read from a scene folder, converted to the conventions above."""
+    """A scene: views, points and notes, in the conventions above."""
 
     path: str
     """Folder that was read."""
@@ -135,9 +136,9 @@ class Scene:
     views: tuple[View, ...]
     """All views, sorted by name."""
     points: PointCloud | None = None
-    """Sparse points of the reconstruction; None where the format has none."""
+    """Sparse points of the reconstruction; None if the format has none."""
     normalization: Normalization = field(default_factory=Normalization)
-    """Similarity that leads back to the coordinates of the files."""
+    """Similarity from file to scene coordinates."""
     notes: tuple[str, ...] = ()
     """Messages about choices made while reading (skipped images, undistortion, the image folder taken)."""
     fingerprint: str = ""
@@ -150,7 +151,7 @@ class Scene:
 
     @property
     def transparent(self) -> bool:
-        """True if a view has an alpha channel: the scene is an object cut out."""
+        """True if a view has an alpha channel, as photographs of a cut-out object do."""
         return any(v.alpha is not None for v in self.views)
 
     def view(self, name: str) -> View:
@@ -180,17 +181,17 @@ class Mesh:
 
 @dataclass(frozen=True)
 class Prior:
-    """Evidence on the pixels of one view from before the fit; every map is float32, shape [H, W], in [0, 1]."""
+    """Maps of one view that are computed before the fit; each is float32, shape [H, W], in [0, 1]."""
 
     disparity: np.ndarray
-    """Relative inverse depth, 0 at the farthest and 1 at the nearest pixel of the view; 0 everywhere where nothing is known."""
+    """Relative inverse depth, 0 at the farthest and 1 at the nearest pixel of the view; 0 everywhere if depth is unknown."""
     confidence: np.ndarray
     """Probability of the likeliest class: F_seg of the paper (Multi-Modal Importance Assessment)."""
     boundary: np.ndarray
     """omega_boundary: 1 at label changes, falling with the distance to them."""
     foreground: np.ndarray
-    """omega_foreground: probability of not being background. Where no semantics are known of the view, this and
-    ``boundary`` are 0 everywhere, and its semantic weight must be 0."""
+    """omega_foreground: probability of not being background. If the view has no semantics, this map and ``boundary`` are 0
+    everywhere, and its semantic weight must be 0."""
     depth_source: str
     """Source of the disparity, a phrase for reports."""
     semantics_source: str
@@ -223,7 +224,7 @@ class ViewDepth:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """A set of N Gaussians as stored and optimised; the kernels apply exp, sigmoid and normalisation."""
+    """A set of N Gaussians with the parameters that a fit optimises; the kernels apply exp, sigmoid and normalisation."""
 
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""
@@ -258,8 +259,8 @@ class Gaussians:
 class ActivatedGaussians:
     """A set of N Gaussians by scales and opacities, for `rasterize` alone; fits and files hold `Gaussians`.
 
-    Opacity 1 and scale 0 render and have finite gradients: alpha is clamped by the rule of the cut-offs, and the pixel filter
-    keeps a flat Gaussian visible edge-on.
+    Opacity 1 and scale 0 are allowed and have finite gradients: the rule clamps alpha, and the pixel filter keeps a flat
+    Gaussian visible edge-on.
     """
 
     means: torch.Tensor
@@ -288,7 +289,10 @@ class ActivatedGaussians:
         return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
 
     def stored(self) -> Gaussians:
-        """Return the same N Gaussians by log scales and logits; scale 0 becomes -inf and opacity 1 inf, which no file takes."""
+        """Return the same N Gaussians by log scales and logits.
+
+        Scale 0 becomes -inf and opacity 1 becomes inf; no file format stores these.
+        """
         means, quats, scales, opacities, sh = self.tensors().values()
         return Gaussians(means, quats, scales.log(), opacities.logit(), sh)
 
@@ -300,9 +304,9 @@ class CovarianceGaussians:
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""
     covars: torch.Tensor
-    """Covariances [u^2], positive semi-definite, shape [N, 3, 3]. Of a matrix that is not symmetric its symmetric part counts.
-    Eigenvalues below 0 count as 0 down to 1e-5 times the largest variance; a matrix with a lower one, or one that is not
-    finite, is not rendered. Zeros render as a point, as wide as the pixel filter."""
+    """Covariances [u^2], positive semi-definite, shape [N, 3, 3]. Only the symmetric part of a matrix is used. Eigenvalues
+    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite one is not rendered. Zeros
+    render as a point with the width of the pixel filter."""
     opacities: torch.Tensor
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
@@ -331,46 +335,47 @@ RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
 class Render:
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C).
 
-    With ``RasterizeOptions.pixels`` images have one axis P in place of H and W.
+    With ``RasterizeOptions.pixels`` images have one axis P instead of H and W.
     """
 
     rgb: torch.Tensor
-    """Colour over the background, shape [..., H, W, 3]; not clamped. Of D channels where ``RasterizeOptions.colors`` has D."""
+    """Colour over the background, shape [..., H, W, 3]; not clamped. It has D channels if ``RasterizeOptions.colors`` has D."""
     alpha: torch.Tensor
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
-    """Expected z-depth [u], of a fisheye the distance, divided by alpha; 0 where nothing is blended. Shape [..., H, W]."""
+    """Expected z-depth [u] (for a fisheye the distance): the mean under the blending weights; 0 where nothing is blended. Shape
+    [..., H, W]."""
     projected: torch.Tensor
     """Projected Gaussians in the layout of kernels/project.py, shape [C, N, 12]; keeps gradients after ``retain_grad()``."""
     tile_counts: torch.Tensor
     """Number of tiles that a Gaussian touches, int32, shape [C, N]; 0 where it is culled."""
     weight_sums: torch.Tensor | None = None
-    """Sum over pixels of a Gaussian's blending weight, shape [C, N]; only where contributions were requested. To take a
-    gradient of it is an error."""
+    """Sum over pixels of a Gaussian's blending weight, shape [C, N]; only with ``RasterizeOptions.contributions``. It has no
+    gradient: a backward pass through it is an error."""
     weight_maxima: torch.Tensor | None = None
-    """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only where contributions were requested. To take a
-    gradient of it is an error."""
+    """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only with ``RasterizeOptions.contributions``. It has
+    no gradient: a backward pass through it is an error."""
     overflow: torch.Tensor | None = None
-    """1 where the instances did not fit into the capacity, and the images must not be used; else 0. Int32, shape [1]; only
-    where a capacity was given."""
+    """1 if the instances exceeded ``RasterizeOptions.capacity``; then do not use the images. Else 0. Int32, shape [1]; only
+    with a capacity."""
     median_depth: torch.Tensor | None = None
-    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2.
-    To take a gradient of it is an error; only where it was requested."""
+    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. Only
+    if requested. It has no gradient: a backward pass through it is an error."""
     error_bound: torch.Tensor | None = None
     """Upper bound of the error of ``rgb`` against rule `exact`, over all channels, shape [..., H, W]; see
-    ``RasterizeOptions.error_bound``. To take a gradient of it is an error; only where it was requested."""
+    ``RasterizeOptions.error_bound``. Only if requested. It has no gradient: a backward pass through it is an error."""
     features: torch.Tensor | None = None
-    """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only where those were given."""
+    """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only with features."""
 
     heaviest_ids: torch.Tensor | None = None
-    """Numbers of the Gaussians of largest blending weight in each pixel, the heaviest first, the nearer one of a tie; -1 where
-    there are fewer. Int32, shape [..., H, W, k]; only where ``RasterizeOptions.heaviest`` is k."""
+    """Indices of the k Gaussians of largest blending weight in each pixel, heaviest first, the nearer first if equal; -1 if
+    there are fewer. Int32, shape [..., H, W, k]; only with ``RasterizeOptions.heaviest``."""
     heaviest_weights: torch.Tensor | None = None
-    """Blending weights of ``heaviest_ids``, 0 where there is none, shape [..., H, W, k]. To take a gradient of them is an
-    error."""
+    """Blending weights of ``heaviest_ids``, 0 for missing ones, shape [..., H, W, k]. They have no gradient: a backward pass
+    through them is an error."""
     blend_counts: torch.Tensor | None = None
-    """Number of Gaussians blended in each pixel, whose weights sum to ``alpha``; int32, shape [..., H, W]; only where
-    ``RasterizeOptions.heaviest`` is set."""
+    """Number of Gaussians blended in each pixel; their weights sum to ``alpha``. Int32, shape [..., H, W]; only with
+    ``RasterizeOptions.heaviest``."""
     absgrad: bool = False
     """True where ``RasterizeOptions.absgrad`` was set."""
 
@@ -378,12 +383,12 @@ class Render:
     def means2d(self) -> torch.Tensor:
         """Projected means [px], shape [C, N, 2]; read them before the backward pass.
 
-        After it ``means2d.grad`` holds their gradients, shape [C, N, 2], and ``means2d.absgrad``, with
-        ``RasterizeOptions.absgrad``, the sums over pixels of the gradients' magnitudes. They are a copy for a strategy to hold:
-        to take a gradient of them is an error.
+        The backward pass sets ``means2d.grad``, shape [C, N, 2]. With ``RasterizeOptions.absgrad`` it also sets
+        ``means2d.absgrad``, the sums over pixels of the gradients' magnitudes. The means are a copy for density strategies: a
+        backward pass through them is an error.
 
         Raises:
-            UsageError: A backward pass went through the render already.
+            UsageError: The backward pass of the render has already run.
         """
         from warpgs.means2d import projected_means
 

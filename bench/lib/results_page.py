@@ -6,7 +6,7 @@ import statistics
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 
-from bench.lib import result_file
+from bench.lib import result_file, strategy_runs
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
@@ -195,6 +195,12 @@ def mcmc() -> str:
     return table(["program", "PSNR / SSIM", "Gaussians"], body) + source
 
 
+def strategies() -> str:
+    """Return the table of gsplat's strategies on its rasterizer and on ours."""
+    result, source = _result("strategies_fern_h100")
+    return strategy_runs.table(result["rows"]) + source
+
+
 def objects() -> str:
     """Return the table on objects cut out, by the format of the scene."""
     result, source = _result("objects_h200")
@@ -272,8 +278,8 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ladder, ablation, views, few_views, smooth_depth, coverage, mcmc, objects, poses, same_image, antialiasing, meshes,
-    repeats,
+    ladder, ablation, views, few_views, smooth_depth, coverage, mcmc, strategies, objects, poses, same_image, antialiasing,
+    meshes, repeats,
 )  # fmt: skip
 
 

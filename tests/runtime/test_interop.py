@@ -336,6 +336,23 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
     assert [v.array().shape for v in empty] == [(0, 0), (0, 3)]
 
 
+@wp.kernel(enable_backward=False)
+def second_of_row(begin: int, entries: wp.array(dtype=wp.float32), step: int, found: wp.array(dtype=wp.float32)):
+    i = begin + wp.tid()
+    found[i] = wp.float32(entries.shape[0]) + 1000.0 * entries[i * step + 1]
+
+
+def test_an_argument_of_one_axis_spans_what_lies_between_rows():
+    """Slices at the same address, of the same shape, whose rows lie at other distances; and those without rows."""
+    memory = torch.arange(60, dtype=torch.float32)
+    for width in (5, 10, 5):
+        part, found = memory.view(-1, 2, width)[:3][..., :3], torch.zeros(6)
+        arguments = [interop.span(part, wp.float32), part.stride(-2), interop.flat(found, wp.float32)]
+        interop.launch(second_of_row, 6, arguments, torch.device("cpu"))
+        assert torch.equal(found, 5 * width + 3 + 1000 * part.reshape(6, 3)[:, 1]), width
+    assert interop.span(part[:0], wp.float32).array().shape == (0,)
+
+
 def test_pairs_are_sorted_in_place_where_they_lie():
     """Stably, by tensors that come and go at the same address, too."""
     for seed in range(3):

@@ -35,7 +35,7 @@ reports encryption as RuntimeError, methods it does not know as NotImplementedEr
 
 
 class Format:
-    """A file format of Gaussians. One of your own derives from this and defines `encode`, `decode` or both."""
+    """A file format of Gaussians. To write one, derive a class that defines `encode`, `decode` or both."""
 
     name: ClassVar[str] = ""
     """Name in the registry."""
@@ -44,19 +44,19 @@ class Format:
     description: ClassVar[str] = ""
     """One line about it for the help."""
     Config: ClassVar[type | None] = None
-    """Frozen dataclass of its options for writing, None for none. They become flags, grouped under the format's name."""
+    """Frozen dataclass of the options for writing; None for none. They become flags, grouped under the format's name."""
     cleaned: ClassVar[bool] = True
-    """True where exports are cleaned of floaters and needles unless asked otherwise."""
+    """True to remove floaters and needles by default."""
     sorted: ClassVar[bool] = False
-    """True where Gaussians that are near each other in space should be so in the file."""
+    """True to sort the Gaussians along a space-filling curve, so that neighbours in space are near each other in the file."""
     archive: ClassVar[bool] = False
-    """True where `decode` gets the open file instead of its bytes, because it holds other files."""
+    """True for an archive of several files: `decode` then receives the open file instead of its bytes."""
     max_degree: ClassVar[int] = 3
-    """Highest degree of spherical harmonics that it holds."""
+    """Highest degree of spherical harmonics that it supports."""
     note: ClassVar[str] = ""
-    """Sentence for users on its axes, where programs disagree on them."""
+    """Note for users on its axes, if programs disagree on them."""
     declares: ClassVar[bool] = False
-    """True where a file can say that its Gaussians are antialiased (`RasterizeOptions.antialiased`)."""
+    """True if a file can declare that its Gaussians are antialiased (`RasterizeOptions.antialiased`)."""
 
     def __init__(self, config: Any = None):
         """Take its options, an instance of ``Config``; None for their defaults."""
@@ -90,7 +90,7 @@ class Format:
         raise UsageError(f"{path}: {self.suffix} files are written here, not read: {type(self).__name__} defines no decode")
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether a file says that its Gaussians are antialiased; never where the format does not declare it.
+        """Return whether a file declares that its Gaussians are antialiased; False if the format cannot.
 
         Raises:
             DataError: The file is missing or malformed.
@@ -98,14 +98,14 @@ class Format:
         return False
 
     def fits(self, path: str | os.PathLike[str]) -> bool:
-        """Return whether a file's name ends as those of the format."""
+        """Return whether a file name has the suffix of the format."""
         return Path(path).name.lower().endswith(self.suffix)
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
-        """Write Gaussians as `warpgs.export.formats.write_gaussians` is asked to.
+        """Write Gaussians, with the arguments of `warpgs.export.formats.write_gaussians`.
 
         Raises:
-            DataError: There is none, or a number is not finite or cannot be held, or harmonics are of a higher degree.
+            DataError: There are no Gaussians, a number is not finite or cannot be stored, or the degree is too high.
         """
         if not len(gaussians):
             raise DataError(f"{path}: not written, the model holds no Gaussian. Use .ply for an empty model")
@@ -124,7 +124,7 @@ class Format:
         write_bytes(path, *self.encode(arrays))
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-        """Read Gaussians as `warpgs.export.formats.read_gaussians` is asked to.
+        """Read Gaussians, with the arguments of `warpgs.export.formats.read_gaussians`.
 
         Raises:
             DataError: The file is missing or malformed.

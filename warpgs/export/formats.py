@@ -82,7 +82,7 @@ def write_gaussians(
 ) -> None:
     """Write Gaussians to a file, in the format of its suffix and in the units of the scene's files.
 
-    The order is kept, and the file appears whole or not at all.
+    The order of the Gaussians is kept. The write is atomic.
 
     Args:
         path: The file; an existing one is replaced.
@@ -90,14 +90,13 @@ def write_gaussians(
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
         units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
         format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
-            ``path/to/file.py:Class``. None for the one that the suffix says.
-        antialiased: True for Gaussians that are rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG say so.
+            ``path/to/file.py:Class``. None for the format of the suffix.
+        antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
 
     Raises:
-        warpgs.errors.DataError: A tensor holds a NaN or an infinity, or a number that the format cannot hold.
-        warpgs.errors.ResourceError: The folder or the disk does not take the file.
-        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units come without a
-            normalization.
+        warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store.
+        warpgs.errors.ResourceError: The file cannot be written. warpgs.errors.UsageError: The suffix, the format or the units
+        are unknown, or scene units come without a normalization.
     """
     chosen = copy.copy(format_of(path, format))
     chosen.antialiased = antialiased
@@ -113,7 +112,7 @@ def read_gaussians(
 ) -> Gaussians:
     """Read Gaussians from a file, in the format of its suffix; a .ply file may be compressed.
 
-    A file that declares antialiasing warns: render it with `RasterizeOptions.antialiased`.
+    A file that declares antialiasing causes a warning: render it with `RasterizeOptions.antialiased`.
 
     Args:
         path: The file.
@@ -125,10 +124,9 @@ def read_gaussians(
         N Gaussians, torch float32 tensors on the CPU.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, truncated, announces more than its size can hold, or holds a
-            NaN, an infinity or a rotation of zero length.
-        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units come without a
-            normalization.
+        warpgs.errors.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
+            a NaN, an infinity or a rotation of zero length. warpgs.errors.UsageError: The suffix, the format or the units are
+            unknown, or scene units come without a normalization.
     """
     gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)
     if antialiased:

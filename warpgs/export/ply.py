@@ -44,27 +44,26 @@ def write_ply(
     path: str | os.PathLike[str], gaussians: Gaussians, normalization: Normalization | None = None, *, units: str = "scene",
     antialiased: bool = False,
 ) -> None:  # fmt: skip
-    """Write Gaussians to a PLY file, which is in the units of the scene's files.
+    """Write Gaussians to a PLY file in the units of the scene's files.
 
     Means become ``mean / scale + offset`` [file units] and log scales ``log_scale - log(scale)``, computed in float64 and
-    stored as float32; rotations, logit opacities and spherical harmonics are stored as they are. The file appears whole
-    or not at all: it is written beside ``path`` and moved there once it is on the disk.
+    stored as float32; rotations, logit opacities and spherical harmonics are stored unchanged. The write is atomic: the file is
+    written under a temporary name beside ``path`` and then renamed.
 
     Args:
         path: The file; an existing one is replaced.
         gaussians: N Gaussians, on any device: means [N, 3], quats wxyz of any length [N, 4], log scales [N, 3], logit opacities
             [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
-        normalization: Similarity from file to scene units, ``x_scene = scale * (x_file - offset)``: that of the scene that was
-            fitted; needed where ``units`` is scene.
-        units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
-        antialiased: True for Gaussians that are rendered with `RasterizeOptions.antialiased`; the header says so.
+        normalization: Similarity from file to scene units of the fitted scene, ``x_scene = scale * (x_file - offset)``;
+            required if ``units`` is scene.
+        units: Units of ``gaussians``: scene, or file to write them unchanged.
+        antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`; the header declares it.
 
     Raises:
-        warpgs.errors.DataError: A tensor holds a NaN or an infinity, or would after the change of coordinates; or the
-            normalization is no similarity. Nothing is written.
-        warpgs.errors.ResourceError: The folder or the disk does not take the file.
-        TypeError: The Gaussians are given by other parameters: ``stored()`` of `ActivatedGaussians` converts them.
-        warpgs.errors.UsageError: The units are unknown, or scene units come without a normalization.
+        warpgs.errors.DataError: A tensor is not finite, before or after the change of coordinates; or the normalization is not
+            a similarity. Nothing is written. warpgs.errors.ResourceError: The file cannot be written. TypeError: The Gaussians
+            have other parameters; ``stored()`` of `ActivatedGaussians` converts them. warpgs.errors.UsageError: The units are
+            unknown, or scene units are given without a normalization.
     """
     path = Path(path)
     normalization = checked_normalization(normalization, units, f"{path}: not written")
@@ -84,13 +83,13 @@ def write_ply(
 def read_ply(path: str | os.PathLike[str], normalization: Normalization | None = None, *, units: str = "file") -> Gaussians:
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary little endian.
 
-    Properties and elements that are not part of the layout are ignored. Other programs write opacities of 0 and 1 as infinite
-    logits, and axes of no length as infinite log scales: these become `OPAQUE` and `FLAT`, which look the same. The number of
-    rows is checked against the size of the file before memory is allocated. A file that declares antialiasing warns: render it
-    with `RasterizeOptions.antialiased`.
+    Properties and elements outside the layout are ignored. Other programs write opacities of 0 and 1 as infinite logits, and
+    axes of length 0 as infinite log scales; these become `OPAQUE` and `FLAT`, which look the same. The number of rows is
+    checked against the file size before memory is allocated. A file that declares antialiasing causes a warning: render it with
+    `RasterizeOptions.antialiased`.
 
     Args:
-        path: The file, written by `write_ply` or by another program of that layout.
+        path: The file, written by `write_ply` or by another program with the same layout.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
         units: Units of the result: file as stored, or scene to go with a scene's cameras.
 
@@ -99,9 +98,9 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, truncated, or holds a NaN, another infinity or a rotation
-            of zero length; the message names the place.
-        warpgs.errors.UsageError: The units are unknown, or scene units are asked for without a normalization.
+        warpgs.errors.DataError: The file is missing, malformed, truncated, or contains a NaN, another infinity or a rotation of
+            zero length; the message names the place. warpgs.errors.UsageError: The units are unknown, or scene units are
+            requested without a normalization.
     """
     path = Path(path)
     gaussians = _read(path, normalization, units)

@@ -60,9 +60,9 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
 
 
 def view_name(name: str) -> str:
-    """Return the name of the view of a file name, in its plainest form: "./a//b.png" gives "a/b.png".
+    """Return the normalised name of a view from a file name: "./a//b.png" gives "a/b.png".
 
-    Renders are stored under these names, so none is absolute or climbs: "../a.png" gives "outside/a.png".
+    Renders are stored under these names, so no name is absolute or contains "..": "../a.png" gives "outside/a.png".
     """
     plain = posixpath.normpath(name)
     kept = [part for part in plain.split("/") if part not in ("", "..")]
@@ -76,7 +76,7 @@ def view_name_of(path: Path, root: Path) -> str:
 
 
 class SceneFolder:
-    """A scene folder and the wishes it is read with: readers open all images and masks of a scene through it."""
+    """A scene folder with the options for reading it. Readers open all images and masks through it."""
 
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
@@ -84,15 +84,15 @@ class SceneFolder:
         self._maps = GivenMaps(options.maps, options.max_pixels, options.allow_outside)
 
     def inside(self, path: Path) -> Path:
-        """Return a path after a check that no link on it leads out of the scene folder, unless that is allowed.
+        """Return a path after a check that no link in it points outside the scene folder, unless this is allowed.
 
         Raises:
-            DataError: It leads out.
+            DataError: A link points outside.
         """
         return path if self.options.allow_outside else inside(path, self.root, "the scene folder")
 
     def child(self, folder: Path, name: object, where: str, *, root: Path | None = None) -> Path:
-        """Return the path of a file that the scene names, as the function `child` does."""
+        """Return the path of a file that the scene names (see the function `child`)."""
         return child(folder, name, where, root=root, allow_outside=self.options.allow_outside)
 
     def image(
@@ -109,9 +109,9 @@ class SceneFolder:
 
         Args:
             path: The image file.
-            lens: Its intrinsics, or a function that makes them from width and height [px].
-            downscale: Factor by which both sides shrink, where a ready-made folder leaves another than the user's.
-            mask: How far a pixel is kept, in [0, 1], shape [H, W], as the method `mask` reads it.
+            lens: Its intrinsics, or a function that returns them for width and height [px].
+            downscale: Factor by which both sides shrink, if a folder such as `images_4` leaves another factor than the user's.
+            mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`.
             background: Colour in [0, 1] behind transparent pixels.
             named: Maps that the scene names for it.
 
@@ -119,7 +119,7 @@ class SceneFolder:
             The image, float32, shape [H, W, 3], with intrinsics for its size.
 
         Raises:
-            DataError: It lies outside, or `load_image` refuses it.
+            DataError: The file is outside the folder, or `load_image` rejects it.
         """
         if self.options.on_image is not None:
             self.options.on_image(path)
@@ -132,13 +132,14 @@ class SceneFolder:
         return self._maps.attached(loaded, path, named)
 
     def mask(self, path: Path) -> np.ndarray:
-        """Return a mask file of the scene, how far it keeps each pixel: float32 [H, W], 0 not at all, 1 wholly."""
+        """Return the weights of a mask file of the scene: float32 [H, W], 1 to keep a pixel, 0 to mask it out."""
         return read_mask(self.inside(path), self.options.mask_keeps, self.options.max_pixels)
 
     def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
-        """Return the mask [H, W] of an image, None where it has none.
+        """Return the mask [H, W] of an image, or None without one.
 
-        It lies in ``folder``, by default `masks` beside the image folder: same name as .png, name plus .png, or same name.
+        It is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
+        photo.jpg.
         """
         folder = folder or images_root.parent / "masks"
         if not image.is_relative_to(images_root) or not folder.is_dir():
@@ -150,24 +151,24 @@ class SceneFolder:
         return None
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
-        """Choose the image folder: the ready-made `images_N` of the factor, else the full one, to be resampled.
+        """Choose the image folder: `images_N` of the factor, else the full-size folder, whose images are resampled.
 
         Returns:
-            The folder, the factor left to resample by, and a note for the user (empty where nothing was chosen).
+            The folder, the remaining factor for resampling, and a note for the user (empty without a choice).
 
         Raises:
-            DataError: There is no image folder, or it is a link that leads out of the scene folder.
+            DataError: There is no image folder, or it is a link that points outside the scene folder.
         """
         folder, factor, note = _image_folder(self.root, self.options.downscale, base)
         return self.inside(folder), factor, note
 
     def pixel_source(self, by_folder: bool) -> str:
-        """Return the source of a scene's pixels, for result files: the folder, and "as stored" or what resampled them.
+        """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the kind of resampling.
 
-        To be called after all images are read: only then is it known whether one was longer than ``max_side``.
+        Call it after all images are read, because ``max_side`` may have reduced any of them.
 
         Args:
-            by_folder: The format takes a ready-made `images_N` (`images`); others always read what the scene names.
+            by_folder: True if the format supports folders `images_N` (`images`); others read the files that the scene names.
         """
         name, factor = "images", self.options.downscale
         if by_folder:
@@ -209,7 +210,7 @@ def resampling_note(downscale: int) -> list[str]:
 
 
 class ViewList:
-    """Views of a scene in the order they are read, and counts of the changes to their pixels."""
+    """Views of a scene in the order of reading, and counts of changes to their pixels."""
 
     def __init__(self) -> None:
         self.views: list[View] = []
@@ -218,10 +219,10 @@ class ViewList:
         self._names: set[str] = set()
 
     def claim(self, name: str, where: str) -> str:
-        """Return the name of a view that is about to be read: its image need not be decoded to know that it is there twice.
+        """Return and reserve the name of a view before its image is decoded.
 
         Raises:
-            DataError: A view has this name already.
+            DataError: Another view has this name.
         """
         if name in self._names:
             raise DataError(f"{where}: the image {name!r} is listed twice; remove one of its cameras")

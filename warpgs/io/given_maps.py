@@ -20,14 +20,14 @@ DEPTHS, NORMALS = "--depths", "--normals"
 
 @dataclass(frozen=True)
 class NamedMaps:
-    """Maps that a scene itself names for an image."""
+    """Maps that the files of a scene name for an image."""
 
     depth: Path | None = None
     """Depth map."""
     normals: Path | None = None
     """Normal map."""
     unit: float | None = None
-    """Length of one unit of the depth map in units of the cameras, where the scene has it."""
+    """Length of one unit of the depth map in units of the cameras, if the scene specifies it."""
 
 
 NOTHING_NAMED = NamedMaps()

@@ -32,7 +32,7 @@ MIN_FOLD = 1e-9
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of an image as its file has them, and the distortion to undo."""
+    """Intrinsics and distortion of an image file."""
 
     K: np.ndarray
     """Intrinsics [px] for ``width`` x ``height``, pixel centres at +0.5, shape [3, 3]."""
@@ -45,13 +45,13 @@ class Lens:
     model: str = "PINHOLE"
     """Name of the camera model, for notes."""
     fisheye: bool = False
-    """The model is OpenCV's fisheye."""
+    """True for OpenCV's fisheye model."""
 
     def checked(self, where: str) -> Lens:
-        """Return this lens after a check of its numbers; ``where`` is file and image, for errors.
+        """Return this lens after a check of its numbers; ``where`` names file and image in errors.
 
         Raises:
-            DataError: A number is not finite, not positive or absurdly large.
+            DataError: A number is not finite, not positive or too large.
         """
         f, c = self.K[[0, 1], [0, 1]], self.K[:2, 2]
         if not (1 <= self.width <= MAX_INTRINSIC and 1 <= self.height <= MAX_INTRINSIC):
@@ -79,9 +79,9 @@ class LoadedImage:
     K: np.ndarray
     """Intrinsics [px], shape [3, 3]."""
     done: tuple[str, ...] = ()
-    """Changes of the pixels that a user should know of, in words that continue "1 image ..."."""
+    """Changes of the pixels to report, as phrases that continue "1 image ..."."""
     alpha: np.ndarray | None = None
-    """Opacity in [0, 1], float32, shape [H, W]; None where the image is opaque."""
+    """Opacity in [0, 1], float32, shape [H, W]; None if the image is opaque."""
     kept: float | None = None
     """Fraction of the pixels that a mask file keeps, in [0, 1]; None without one."""
     camera_model: str = "pinhole"
@@ -89,15 +89,15 @@ class LoadedImage:
     distortion: np.ndarray | None = None
     """Coefficients of the camera model, as `Camera.distortion`."""
     orientation: int = 1
-    """EXIF orientation by which the stored raster was turned, 1 to 8; 1 for not at all."""
+    """EXIF orientation by which the stored image was rotated, 1 to 8; 1 for no rotation."""
     full_size: tuple[int, int] = (0, 0)
     """Height and width [px] before the image was resized, upright."""
     undone: Lens | None = None
-    """Lens whose distortion was undone at that size; None for none."""
+    """Lens whose distortion was removed at ``full_size``; None without distortion."""
     depth: GivenDepth | None = None
-    """Given depth of its pixels, a metric one in units of the file; None for none."""
+    """Given depth of its pixels, metric depth in file units; None without."""
     normals: np.ndarray | None = None
-    """Given normals of its pixels, as `View.normals`; None for none."""
+    """Given normals of its pixels, as `View.normals`; None without."""
 
 
 def list_images(folder: Path) -> list[Path]:

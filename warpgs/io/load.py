@@ -48,36 +48,35 @@ def load_scene(
 ) -> Scene:
     """Read a scene folder of any supported format.
 
-    Views come sorted by name, downscaled and, unless lenses are kept, undistorted, in coordinates that are recentred and
-    rescaled in float64 (`Scene.normalization` leads back). Everything that was chosen on the way is in `Scene.notes`.
+    Views are sorted by name, downscaled and, with ``lenses="undistort"``, undistorted. Coordinates are recentred and rescaled
+    in float64; `Scene.normalization` stores the similarity. `Scene.notes` lists all automatic choices.
 
     Args:
         path: The scene folder.
         reader: Name of a format (colmap, transforms, llff, dtu, middlebury), or a `Reader` of your own: an object, a class,
-            ``module:Class`` or ``path/to/file.py:Class``. None asks every built-in reader whether the folder has its format.
-        downscale: Factor by which both image sides shrink; a ready-made folder `images_N` is used where there is one. None for
-            1.
-        max_side: Longest side that an image keeps [px], 0 for no limit; larger ones are reduced to it, and the intrinsics with
-            them. None for 1600 where ``downscale`` is None too, else for no limit.
-        strict: A frame without an image file is an error instead of a note.
-        allow_outside: Let names and links of the scene lead to files outside its folder.
-        masks: Treatment of masked-out pixels: ignore (they do not count, in fit and score) or cutout
-            (they are transparent, gray ones in part: `View.alpha`).
+            ``module:Class`` or ``path/to/file.py:Class``. None for the built-in reader that recognises the folder.
+        downscale: Factor by which both image sides shrink; a folder `images_N` is used if it exists. None for 1.
+        max_side: Largest image side [px], 0 for no limit; larger images are reduced to it, and the intrinsics with them. None
+            for 1600 if ``downscale`` is None too, else for no limit.
+        strict: True to treat a frame without an image file as an error instead of a note.
+        allow_outside: True to allow names and links that point to files outside the scene folder.
+        masks: Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent, gray pixels partly:
+            `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
-        black_is_empty: Dark pixels around an object and in its holes are transparent, where every image shows one on black and
-            none has an alpha channel or a mask.
-        score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder where
-            there is one.
+        black_is_empty: True to make dark pixels around an object and in its holes transparent, if every image shows an object
+            on black and none has an alpha channel or a mask.
+        score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder, if it
+            exists.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
-        lenses: Treatment of lens distortion: undistort (images become those of a pinhole) or native (images stay as they are,
-            and ``Camera.model`` is opencv or fisheye with ``Camera.distortion``; the only way to read fisheyes).
-        depths: Folder of depth maps, 16-bit PNG or NPY, named as the images are (docs/scenes.md, "Depth and normals"); None
-            for those that transforms.json names, ``none`` for none at all.
-        normals: Folder of normal maps, likewise.
+        lenses: Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (images are unchanged, and
+            ``Camera.model`` is opencv or fisheye with ``Camera.distortion``). Fisheyes need native.
+        depths: Folder of depth maps, 16-bit PNG or NPY, with the names of the images (docs/scenes.md, "Depth and normals");
+            None for those named in transforms.json, ``none`` to ignore these.
+        normals: Folder of normal maps, as for ``depths``.
         depth_kind: Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths up to a scale and a
             shift of each view) or disparity (inverse lengths up to a scale and a shift).
-        depth_unit: Length of one unit of a metric depth map in units of the cameras; None for 0.001 in whole numbers and 1 in
-            others.
+        depth_unit: Length of one unit of a metric depth map in units of the cameras; None for 0.001 for integers and 1 for
+            floats.
         normal_axes: Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera.
         progress: Called with a line for the user before each image is decoded; None for nothing.
 
@@ -85,10 +84,10 @@ def load_scene(
         The scene.
 
     Raises:
-        DataError: Anything in the folder is missing or malformed; the message names file, reason and remedy.
+        DataError: A file of the folder is missing or malformed; the message names file, reason and fix.
         ResourceError: There is not enough memory to decode an image.
         UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``depth_unit`` is not above 0, a choice
-            is another word, or there is no such reader.
+            or the reader is unknown.
     """
     root, (factor, side) = Path(path), image_scale(downscale, max_side)
     given = [None if p is None else Path(p) for p in (depths, normals)]

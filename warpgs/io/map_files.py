@@ -36,18 +36,18 @@ MAX_STRAY = 0.05
 
 @dataclass(frozen=True)
 class MapOptions:
-    """The user's maps and what their numbers mean."""
+    """Given maps of depth and normals, and the meaning of their numbers."""
 
     depths: Path | None = None
-    """Folder of depth maps; None for those that the scene names, ``none`` for none at all."""
+    """Folder of depth maps; None for those that the scene names, ``none`` to ignore these."""
     normals: Path | None = None
-    """Folder of normal maps; None for those that the scene names, ``none`` for none at all."""
+    """Folder of normal maps; None for those that the scene names, ``none`` to ignore these."""
     depth_kind: str = "metric"
     """Meaning of the depth maps, one of `DEPTH_KINDS`."""
     depth_unit: float | None = None
-    """Length of one unit of a depth map in units of the cameras; None for 0.001 in whole numbers and 1 in others."""
+    """Length of one unit of a depth map in units of the cameras; None for 0.001 for integers and 1 for floats."""
     normal_axes: str = "opencv"
-    """Axes of the normals: those of the camera as OpenCV (y down, z forward) or OpenGL (y up, z back) has them."""
+    """Axes of the normals: camera axes of OpenCV (y down, z forward) or OpenGL (y up, z back)."""
 
     def __post_init__(self) -> None:
         if self.depth_kind not in DEPTH_KINDS:

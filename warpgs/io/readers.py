@@ -31,26 +31,26 @@ def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """The user's wishes on how a scene folder is read."""
+    """Options for reading a scene folder."""
 
     downscale: int = 1
     """Factor, at least 1, by which both image sides shrink."""
     strict: bool = False
-    """A frame without an image file is an error instead of a note."""
+    """True to treat a frame without an image file as an error instead of a note."""
     allow_outside: bool = False
-    """Names and links of the scene may lead to files outside its folder."""
+    """True to allow names and links that point to files outside the scene folder."""
     masks: str = "ignore"
-    """Treatment of masked-out pixels: ignore (they do not count) or cutout (they are transparent)."""
+    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
-    """Dark pixels around an object are transparent, where every image shows one on black."""
+    """True to make dark pixels around an object transparent, if every image shows an object on black."""
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels that an image or a mask may have."""
     max_side: int = 0
-    """Longest side that an image keeps [px], after ``downscale``; 0 for no limit."""
+    """Largest image side [px], after ``downscale``; 0 for no limit."""
     lenses: str = "undistort"
-    """Treatment of lens distortion: undistort (images become those of a pinhole) or native (`Camera.model` keeps the lens)."""
+    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (`Camera.model` has the lens)."""
     maps: MapOptions = NO_MAPS
     """Given maps of depth and normals."""
     on_image: Callable[[Path], object] | None = None
@@ -73,23 +73,23 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class Probe:
-    """Traces of a format in a folder."""
+    """Files of a format in a folder."""
 
     found: str
-    """Files of the format that are there, as the subject of a sentence, such as ``poses_bounds.npy``."""
+    """Files of the format that were found, such as ``poses_bounds.npy``, as the subject of a sentence."""
     missing: str = ""
-    """Parts that the format needs and the folder lacks; empty where it is complete."""
+    """Missing files; empty if the folder is complete."""
 
 
 class Reader(abc.ABC):
     """Base class of the readers of scene formats."""
 
     name: ClassVar[str] = ""
-    """Name of the format: set by `register`, else declared by the class, else the name of the class."""
+    """Name of the format: the one given to `register`, else that of the class attribute, else the name of the class."""
     description: ClassVar[str] = ""
-    """Files that make the format, then its name in brackets, on one line: for the message on an unknown folder."""
+    """Files of the format, then its name in brackets, on one line, for the error message on an unknown folder."""
     priority: ClassVar[int] = 100
-    """Order in which complete formats of one folder are preferred, lowest first; the built-in ones have 10 to 50."""
+    """Priority if a folder has several complete formats, lowest first; the built-in ones have 10 to 50."""
 
     _declared_name: ClassVar[str] = ""
 
@@ -99,10 +99,10 @@ class Reader(abc.ABC):
 
     @abc.abstractmethod
     def probe(self, folder: Path) -> Probe | None:
-        """Look for the format in a folder, by file names alone.
+        """Look for the format in a folder, by file names only.
 
         Returns:
-            What was found and what is missing; None where nothing points to the format.
+            The found and missing files; None if no file belongs to the format.
         """
 
     @abc.abstractmethod
@@ -111,15 +111,15 @@ class Reader(abc.ABC):
 
         Returns:
             The scene in file coordinates: cameras as camera_from_world with OpenCV axes, images at their final size, notes on
-            every choice made for the user. `warpgs.io.load.load_scene` sorts the views, normalises the coordinates, adds
-            score masks and the fingerprint.
+            automatic choices. `warpgs.io.load.load_scene` sorts the views, normalises the coordinates, and adds score masks and
+            the fingerprint.
 
         Raises:
-            warpgs.errors.DataError: A file is missing or malformed; the message names file, reason and remedy.
+            warpgs.errors.DataError: A file is missing or malformed; the message names file, reason and fix.
         """
 
     def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:
-        """Return a `Scene` of this format with further ``fields`` (points, background, pixels) as given."""
+        """Return a `Scene` of this format; ``fields`` are further fields (points, background, pixels)."""
         return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
 
 

@@ -126,8 +126,8 @@ def composite(
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(backgrounds, real),
-        interop.rows(rgb, real),
+        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, wp.types.vector(9 + channels, real)),
+        interop.view(backgrounds, real), interop.span(rgb, real), rgb.stride(-2),
         *(interop.flat(t, real) for t in (alpha, depth, transmittances, weights)),
         interop.flat(ends, wp.int32),
     ]  # fmt: skip
@@ -144,12 +144,13 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     v_projected = allocator.output(projected.shape, projected.dtype, device).zero_()
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     deep = v_alpha is not None or v_depth is not None
-    upstream = [interop.rows(v_rgb, real)]
+    upstream = [interop.span(v_rgb, real), v_rgb.stride(-2)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
         upstream.append(interop.flat(v, real))
+    record = wp.types.vector(projected.shape[-1], real)
     inputs = [
-        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
+        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, record), interop.view(tiles.slots, wp.int32),
         interop.view(backgrounds, real),
         *(interop.flat(t, real) for t in (transmittances, weights, depth)), interop.flat(ends, wp.int32),
         *upstream, interop.view(v_slots, real),

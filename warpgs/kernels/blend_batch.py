@@ -21,6 +21,7 @@ def make_batches(real, tile_size: int, channels: int):
     neighbours, since an ellipse is convex: the first row and one past the last say which they are.
     """
     f = make_functions(real)
+    record = wp.types.vector(9 + channels, real)
     batch_reals = wp.types.vector(BATCH, real)
     batch_channels = wp.types.vector(channels * BATCH, real)
     batch_rows = wp.types.vector((tile_size // STRIP) * BATCH, wp.int32)
@@ -72,34 +73,34 @@ def make_batches(real, tile_size: int, channels: int):
         return entry
 
     @wp.func(inline=True)
-    def load_channels(projected: wp.array2d(dtype=real), i: wp.int32, j: wp.int32, b: wp.ref[Batch]):
+    def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, b: wp.ref[Batch]):
         """Load the channels of a Gaussian."""
         for c in range(wp.static(channels)):
-            b.color[c * batch + j] = projected[i, 6 + c]
+            b.color[c * batch + j] = projected[i][6 + c]
 
     @wp.func(inline=True)
     def load(
-        projected: wp.array2d(dtype=real), gaussian_ids: wp.array(dtype=int), last: wp.int32, count: wp.int32,
+        projected: wp.array(dtype=record), gaussian_ids: wp.array(dtype=int), last: wp.int32, count: wp.int32,
         whole_tiles: wp.int32, b: wp.ref[Batch],
     ):  # fmt: skip
         """Load the Gaussians of ``count`` instances, from the last on backwards."""
         for j in range(count):
-            b.x[j & bits] = projected[gaussian_ids[last - j], 0]  # apart, so that many loads are under way at once
+            b.x[j & bits] = projected[gaussian_ids[last - j]][0]  # apart, so that many loads are under way at once
         j = int(0)
         while j < count:
             i = gaussian_ids[wp.max(last - j, 0)]
             if i < 0:
                 break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
-            b.y[j & bits] = projected[i, 1]
-            b.u11[j & bits] = projected[i, 2]
-            b.u12[j & bits] = projected[i, 3]
-            b.u22[j & bits] = projected[i, 4]
-            b.opacity[j & bits] = projected[i, 5]
+            b.y[j & bits] = projected[i][1]
+            b.u11[j & bits] = projected[i][2]
+            b.u12[j & bits] = projected[i][3]
+            b.u22[j & bits] = projected[i][4]
+            b.opacity[j & bits] = projected[i][5]
             load_channels(projected, i, j & bits, b)
-            b.z[j & bits] = projected[i, place_z]
+            b.z[j & bits] = projected[i][place_z]
             bounds = f.bounds_of(
-                at(b.x[j & bits]), projected[i, 1], projected[i, 2], projected[i, 4],
-                projected[i, place_z + 1], projected[i, place_z + 2], whole_tiles,
+                at(b.x[j & bits]), projected[i][1], projected[i][2], projected[i][4],
+                projected[i][place_z + 1], projected[i][place_z + 2], whole_tiles,
             )  # fmt: skip
             b.aside[j & bits] = bounds[0]
             b.limit[j & bits] = bounds[1]
@@ -157,6 +158,6 @@ def make_batches(real, tile_size: int, channels: int):
             rows.ramp[lane] = f.apart(u11 * real(lane))
 
     return SimpleNamespace(
-        Batch=Batch, Rows=Rows, strip_ints=strip_ints, at=at, at_int=at_int, load=load, find_rows=find_rows,
+        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, at=at, at_int=at_int, load=load, find_rows=find_rows,
         find_row_values=find_row_values,
     )  # fmt: skip

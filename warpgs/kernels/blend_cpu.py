@@ -17,6 +17,8 @@ from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 BATCH = 64
 """Gaussians that the forward pass takes at a time, strip by strip; a power of 2, since indices are bounded by its bits."""
+TOGETHER = 16
+"""Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
 
 
 @functools.cache
@@ -32,12 +34,15 @@ def make_forward(real, tile_size: int, channels: int):
     batch_reals = wp.types.vector(BATCH, real)
     batch_ints = wp.types.vector(BATCH, wp.int32)
     batch_strips = wp.types.vector(BATCH * STRIP, real)
+    record = wp.types.vector(9 + channels, real)
     # of several channels, one after the other
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
-    strip_channels = wp.types.vector(channels * STRIP, real)
+    strip_channels = wp.types.vector(2 * channels * STRIP, real)
     batch_channels = wp.types.vector(channels * BATCH, real)
     place_z = wp.constant(6 + channels)
     tile_stride = wp.constant(tile_size * (tile_size + 1))
+    per_pixel = wp.constant(channels)
+    per_row = wp.constant(channels * tile_size)
     side = wp.constant(tile_size)
     pixels = wp.constant(tile_size * tile_size)
     strip = wp.constant(STRIP)
@@ -45,7 +50,8 @@ def make_forward(real, tile_size: int, channels: int):
     abreast = wp.constant(ABREAST)
     batch = wp.constant(BATCH)
     bits = wp.constant(BATCH - 1)
-    finished = wp.constant(real(2.0))
+    outside = wp.constant(real(-1.0))
+    together = wp.constant(TOGETHER)
     smallest = wp.constant(real(SMALLEST_WEIGHT))
 
     # Loops over channels are unrolled, because of the static number, and so stand apart from the loops that must not be.
@@ -55,28 +61,28 @@ def make_forward(real, tile_size: int, channels: int):
         return entry
 
     @wp.func(inline=True)
-    def load_channels(projected: wp.array2d(dtype=real), i: wp.int32, j: wp.int32, color: wp.ref[batch_channels]):
+    def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, color: wp.ref[batch_channels]):
         """Load the channels of a Gaussian of the batch."""
         for c in range(wp.static(channels)):
-            color[c * batch + j] = projected[i, 6 + c]
+            color[c * batch + j] = projected[i][6 + c]
 
     @wp.func(inline=True)
     def load_strip(base: wp.int32, lane: wp.int32, sums: wp.ref[tile_channels], strip_sums: wp.ref[strip_channels]):
         """Load the sums of a pixel of a strip."""
         for c in range(wp.static(channels)):
-            strip_sums[c * strip + lane] = at(sums[c * tile_stride + base + lane])
+            strip_sums[2 * c * strip + lane] = at(sums[c * tile_stride + base + lane])
 
     @wp.func(inline=True)
     def store_strip(base: wp.int32, lane: wp.int32, strip_sums: wp.ref[strip_channels], sums: wp.ref[tile_channels]):
         """Store the sums of a pixel of a strip."""
         for c in range(wp.static(channels)):
-            sums[c * tile_stride + base + lane] = at(strip_sums[c * strip + lane])
+            sums[c * tile_stride + base + lane] = at(strip_sums[2 * c * strip + lane])
 
     @wp.func(inline=True)
     def add_channels(w: real, lane: wp.int32, j: wp.int32, color: wp.ref[batch_channels], strip_sums: wp.ref[strip_channels]):
         """Add the channels of a Gaussian to the sums of a pixel of a strip."""
         for c in range(wp.static(channels)):
-            strip_sums[c * strip + lane] = at(strip_sums[c * strip + lane]) + w * at(color[c * batch + j])
+            strip_sums[2 * c * strip + lane] = at(strip_sums[2 * c * strip + lane]) + w * at(color[c * batch + j])
 
     @wp.func(inline=True)
     def add_background(
@@ -87,17 +93,23 @@ def make_forward(real, tile_size: int, channels: int):
             sums[c * tile_stride + p] = at(sums[c * tile_stride + p]) + t * backgrounds[camera, c]
 
     @wp.func(inline=True)
-    def store_channels(o: wp.int32, p: wp.int32, sums: wp.ref[tile_channels], rgb: wp.array2d(dtype=real)):
-        """Store the channels of a pixel."""
+    def join_channels(p: wp.int32, sums: wp.ref[tile_channels], joined: wp.ref[tile_channels]):
+        """Put the channels of a pixel side by side."""
         for c in range(wp.static(channels)):
-            rgb[o, c] = at(sums[c * tile_stride + p])
+            joined[p * per_pixel + c] = at(sums[c * tile_stride + p])
+
+    @wp.func(inline=True)
+    def store_channels(o: wp.int32, p: wp.int32, joined: wp.ref[tile_channels], rgb: wp.array(dtype=real)):
+        """Store the channels of a pixel, whose first has the index ``o``."""
+        for c in range(wp.static(channels)):
+            rgb[o + c] = at(joined[p * per_pixel + c])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def forward(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        begin: int, settings: f.Blending, projected: wp.array(dtype=record), ranges: wp.array2d(dtype=int),
         gaussian_ids: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
-        # outputs
-        rgb: wp.array2d(dtype=real), alpha_out: wp.array(dtype=real), depth: wp.array(dtype=real),
+        # outputs, and the distance of pixels in the first
+        rgb: wp.array(dtype=real), pitch: int, alpha_out: wp.array(dtype=real), depth: wp.array(dtype=real),
         transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), ends: wp.array(dtype=int),
     ):  # fmt: skip
         tile = begin + wp.tid()
@@ -106,10 +118,10 @@ def make_forward(real, tile_size: int, channels: int):
         left = place[1]
         top = place[2]
 
-        # The state of the tile: transmittance; the least that a Gaussian must leave of it to be blended, above 1 once the
-        # pixel is finished; sums; one past the last instance blended.
+        # The state of the tile: transmittance of what was blended, and of all that was visited, which falls below the stop once
+        # the pixel is finished; sums; one past the last instance blended.
         t = tile_reals()
-        floor = tile_reals()
+        passed = tile_reals()
         sums = tile_channels()
         z = tile_reals()
         total = tile_reals()
@@ -118,11 +130,10 @@ def make_forward(real, tile_size: int, channels: int):
             # pixels outside the image are finished before they begin
             inside = top + p // side < settings.height and left + p - (p // side) * side < settings.width
             t[p] = real(1.0)
-            # inclusive: blend, then stop; exclusive: stop instead of blending
-            floor[p] = wp.where(inside, wp.where(settings.inclusive != 0, real(-1.0), settings.stop), finished)
+            passed[p] = wp.where(inside, real(1.0), outside)
         # The same for one strip, in registers.
         strip_t = strip_reals()
-        strip_floor = strip_reals()
+        strip_passed = strip_reals()
         strip_sums = strip_channels()
         strip_z = strip_reals()
         strip_total = strip_reals()
@@ -153,7 +164,7 @@ def make_forward(real, tile_size: int, channels: int):
         while first < last:
             count = wp.min(batch, last - first)
             for j in range(count):
-                mx[j] = projected[gaussian_ids[first + j], 0]  # in a loop of its own, so that many loads are under way at once
+                mx[j] = projected[gaussian_ids[first + j]][0]  # in a loop of its own, so that many loads are under way at once
             for j in range(batch):
                 limit[j] = real(-1.0)  # reaches nothing
             j = int(0)
@@ -161,45 +172,61 @@ def make_forward(real, tile_size: int, channels: int):
                 i = gaussian_ids[wp.max(first + j, 0)]
                 if i < 0:
                     break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
-                my[j] = projected[i, 1]
-                u11[j] = projected[i, 2]
-                u12[j] = projected[i, 3]
-                u22[j] = projected[i, 4]
-                opacity[j] = projected[i, 5]
+                my[j] = projected[i][1]
+                u11[j] = projected[i][2]
+                u12[j] = projected[i][3]
+                u22[j] = projected[i][4]
+                opacity[j] = projected[i][5]
                 load_channels(projected, i, j, color)
-                distance[j] = projected[i, place_z]
+                distance[j] = projected[i][place_z]
                 bounds = f.bounds_of(
-                    mx[j], my[j], u11[j], u22[j], projected[i, place_z + 1], projected[i, place_z + 2], settings.whole_tiles
+                    mx[j], my[j], u11[j], u22[j], projected[i][place_z + 1], projected[i][place_z + 2], settings.whole_tiles
                 )
                 aside[j] = bounds[0]
                 limit[j] = bounds[1]
                 j += 1
-            for j in range(batch):
+            j = int(0)
+            while j < count:
+                o = j & bits
+                j += 1
                 for lane in range(strip):
-                    ramp[j * strip + lane] = f.apart(u11[j] * real(lane))
+                    ramp[o * strip + lane] = f.apart(u11[o] * real(lane))
             left_open = int(0)
             for row in range(side):
                 y = real(settings.origin_y + top + row) + real(0.5)
-                for j in range(batch):
-                    dy = y - my[j]
-                    e2 = u22[j] * dy
-                    e12[j] = f.apart(u12[j] * dy)
-                    e22[j] = f.apart(e2 * e2)
+                group = int(0)
+                while group < count:
+                    o = group & bits
+                    group += together
+                    for lane in range(together):
+                        dy = y - my[o + lane]
+                        e2 = u22[o + lane] * dy
+                        e12[o + lane] = f.apart(u12[o + lane] * dy)
+                        e22[o + lane] = f.apart(e2 * e2)
                 for part in range(parts):
                     base = wp.max(row * side + part * strip, 0)
                     strip_open = int(0)
                     for lane in range(strip):
-                        strip_floor[lane] = floor[base + lane]
-                        strip_open += wp.where(strip_floor[lane] < finished, 1, 0)
+                        strip_passed[lane] = passed[base + lane]
+                        strip_open += wp.where(strip_passed[lane] >= settings.stop, 1, 0)
                     if strip_open > 0:
                         x = real(settings.origin_x + left + part * strip) + real(0.5)
-                        for j in range(batch):
-                            start[j] = f.apart(u11[j] * (x - mx[j])) + e12[j]
-                            hits[j] = wp.where(f.reaches(start[j], u11[j], e22[j], aside[j], limit[j]), 1, 0)
+                        group = int(0)
+                        while group < count:
+                            o = group & bits
+                            group += together
+                            for lane in range(together):
+                                j = o + lane
+                                start[j] = f.apart(u11[j] * (x - mx[j])) + e12[j]
+                                hits[j] = wp.where(f.reaches(start[j], u11[j], e22[j], aside[j], limit[j]), 1, 0)
                         reaching = int(0)
-                        for j in range(batch):  # without a branch, which would be mispredicted once for each Gaussian
-                            list[reaching & bits] = j
-                            reaching += hits[j]
+                        group = int(0)
+                        while group < count:
+                            o = group & bits
+                            group += together
+                            for lane in range(together):  # without a branch, which would be mispredicted once for each Gaussian
+                                list[reaching & bits] = o + lane
+                                reaching += hits[o + lane]
                         k = int(0)
                         while k < reaching:
                             o = wp.max(k, 0)
@@ -228,19 +255,20 @@ def make_forward(real, tile_size: int, channels: int):
                             number = first + j + 1
                             for lane in range(strip):
                                 alpha = alphas[o * strip + lane]
-                                before = strip_t[lane]
+                                before = strip_passed[lane]
                                 after = before * (real(1.0) - alpha)
-                                blended = after >= strip_floor[lane]
+                                # inclusive: blend, then stop; exclusive: stop instead of blending
+                                blended = wp.where(settings.inclusive != 0, before, after) >= settings.stop
                                 w = wp.where(blended, alpha, real(0.0)) * before
-                                strip_t[lane] = wp.where(blended, after, before)
-                                strip_floor[lane] = wp.where(after < settings.stop, finished, strip_floor[lane])
+                                strip_t[lane] = wp.where(blended, after, strip_t[lane])
+                                strip_passed[lane] = after
                                 strip_end[lane] = wp.where(w > real(0.0), number, strip_end[lane])
                                 add_channels(w, lane, j, color, strip_sums)
                                 strip_z[lane] = strip_z[lane] + w * distance[j]
                                 strip_total[lane] = strip_total[lane] + w
                         for lane in range(strip):
                             t[base + lane] = strip_t[lane]
-                            floor[base + lane] = strip_floor[lane]
+                            passed[base + lane] = strip_passed[lane]
                             store_strip(base, lane, strip_sums, sums)
                             z[base + lane] = strip_z[lane]
                             total[base + lane] = strip_total[lane]
@@ -250,8 +278,10 @@ def make_forward(real, tile_size: int, channels: int):
             if left_open == 0:
                 first = last
 
+        joined = tile_channels()
         for p in range(pixels):
             add_background(camera, p, t[p], backgrounds, sums)
+            join_channels(p, sums, joined)
             z[p] = wp.where(total[p] >= smallest, z[p] / total[p], real(0.0))
         rows = wp.min(side, settings.height - top)
         across = wp.min(side, settings.width - left)
@@ -277,13 +307,17 @@ def make_forward(real, tile_size: int, channels: int):
                     weights[o + lane] = total[p + lane]
                     ends[o + lane] = end[p + lane]
                     lane += 1
-            lane = int(0)
-            while lane < across:
-                at_pixel = first_pixel + lane
-                if at_pixel < 0:
-                    break  # never; but vectorised, these stores would be slow scatters
-                store_channels(at_pixel, wp.max(p + lane, 0), sums, rgb)
-                lane += 1
+            if across == side and pitch == per_pixel:
+                for k in range(per_row):  # few wide stores: a core waits for the cache lines of no more than 64
+                    rgb[o * per_pixel + k] = joined[p * per_pixel + k]
+            else:
+                lane = int(0)
+                while lane < across:
+                    at_pixel = (first_pixel + lane) * pitch
+                    if at_pixel < 0:
+                        break  # never; but vectorised, these stores would be slow scatters
+                    store_channels(at_pixel, wp.max(p + lane, 0), joined, rgb)
+                    lane += 1
 
     return forward
 

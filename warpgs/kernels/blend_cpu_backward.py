@@ -35,10 +35,10 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
     at_int = b.at_int
 
     @wp.func(inline=True)
-    def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]):
-        """Load the upstream gradient of a pixel's channels."""
+    def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array(dtype=real), pixels: wp.ref[r.Pixels]):
+        """Load the upstream gradient of a pixel's channels, whose first has the index ``o``."""
         for c in range(wp.static(channels)):
-            pixels.g[c * stride + p] = v_rgb[o, c]
+            pixels.g[c * stride + p] = v_rgb[o + c]
 
     @wp.func(inline=True)
     def behind_of(
@@ -68,7 +68,7 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
     def load_pixels(
         place: wp.vec3i, settings: f.Blending, backgrounds: wp.array2d(dtype=real), transmittances: wp.array(dtype=real),
         weights: wp.array(dtype=real), depth: wp.array(dtype=real), ends: wp.array(dtype=int),
-        v_rgb: wp.array2d(dtype=real), v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        v_rgb: wp.array(dtype=real), pitch: wp.int32, v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
         pixels: wp.ref[r.Pixels], until: wp.ref[b.strip_ints],
     ) -> wp.int32:  # fmt: skip
         """Load the pixels, and for each strip one past the last instance that it blended; return the largest of these."""
@@ -97,7 +97,7 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
                     if across < side:
                         pixels.t[p] = transmittances[q]
                         pixels.end[p] = ends[q]
-                    load_channels(q, p, v_rgb, pixels)
+                    load_channels(q * pitch, p, v_rgb, pixels)
                     load_depth(q, p, weights, depth, v_alpha, v_depth, pixels)
             row += 1
         for p in range(pixels_of_tile):
@@ -320,14 +320,17 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     side = wp.constant(tile_size)
     batch = wp.constant(BATCH)
     bits = wp.constant(BATCH - 1)
+    # values of a row of gradients that are at most 64 bytes apart
+    apart = wp.constant(max(1, 64 // ((4 if real is wp.float32 else 8) * channels)))
+    touches = wp.constant(-(-(tile_size - 1) // max(1, 64 // ((4 if real is wp.float32 else 8) * channels))) + 1)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
     def backward(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: wp.array2d(dtype=int),
         gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
         transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
-        ends: wp.array(dtype=int),
-        v_rgb: wp.array2d(dtype=real), v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        ends: wp.array(dtype=int), v_rgb: wp.array(dtype=real), pitch: int,
+        v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
         # outputs, zero on entry
         v_slots: wp.array2d(dtype=real),
     ):  # fmt: skip
@@ -341,8 +344,19 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         rows = b.Rows()
         shades = r.Shades()
         first = ranges[tile, 0]
+        # One value of each cache line in a loop of its own, so that many loads are under way at once; it is overwritten.
+        corner = (place[0] * settings.height + place[2]) * settings.width + place[1]
+        across = wp.min(side, settings.width - place[1])
+        for row in range(side):
+            o = corner + wp.min(row, settings.height - place[2] - 1) * settings.width
+            if o < 0:
+                break  # never; but vectorised, these loads would be slow gathers
+            until[row] = ends[o]
+            shades.w[row * (touches + 1) + touches] = transmittances[o]
+            for part in range(touches):
+                shades.w[row * (touches + 1) + part] = v_rgb[(o + wp.min(part * apart, across - 1)) * pitch]
         last = load_pixels(
-            place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, v_alpha, v_depth, pixels, until
+            place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
         )
         while last > first:
             count = wp.min(batch, last - first)

@@ -216,16 +216,16 @@ def _check(image: torch.Tensor, target: torch.Tensor) -> None:
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the structural similarity at every pixel and channel, in the variant of the 3DGS papers.
 
-    Gaussian window of 11 x 11 px with sigma 1.5, zeros outside the image, data range 1, images of any size. Differentiable in
-    ``image`` only. A variance that rounding makes negative counts as 0 and passes no gradient. Equal images score exactly 1.
-    Derivation: docs/ssim.md.
+    The window is a Gaussian of 11 x 11 px with sigma 1.5. Pixels outside the image are zero; the data range is 1; images may
+    have any size. Only ``image`` has a gradient. A variance that is negative by rounding counts as 0 and has no gradient. Equal
+    images score exactly 1. Derivation: docs/ssim.md.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
         target: Colours of the image to compare with, shape [H, W, 3] or [B, H, W, 3]; no gradient.
 
     Returns:
-        Similarities in [-1, 1], of the images' shape; their mean is the usual figure.
+        Similarities in [-1, 1], of the images' shape; their mean is the usual score.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

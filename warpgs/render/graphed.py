@@ -381,6 +381,6 @@ def recorder(device: torch.device, gradients: bool = True) -> Recorder:
 
 
 def clear_graph_cache() -> None:
-    """Give back the memory of all captured graphs; loops that go on are captured anew."""
+    """Free the memory of all captured graphs; running loops are captured again."""
     for found in list(_RECORDERS.values()):
         found.clear()

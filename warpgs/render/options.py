@@ -30,71 +30,73 @@ def _is_whole(value: object) -> bool:
 @document_fields
 @dataclass(frozen=True)
 class RasterizeOptions:
-    """Options of `rasterize`; the defaults are exact."""
+    """Options of `rasterize`."""
 
     rule: str | Rule = "exact"
     """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     near: float | None = None
-    """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. A Gaussian
-    has the depth of its mean, along the camera's z axis or, of a fisheye, the distance, and is left out as a whole."""
+    """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. Whole
+    Gaussians are culled by the depth of their mean: along the camera's z axis or, for a fisheye, the distance."""
     far: float | None = None
     """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the rule's, 1e10."""
     sh_degree: int | None = None
-    """Spherical-harmonics degree used; None for all that is stored."""
+    """Spherical-harmonics degree to use; None for the stored degree."""
     background: torch.Tensor | None = None
-    """Colour behind the scene, shape [3] or [C, 3], with ``colors`` [D] or [C, D]; None for black. Gradients flow into it."""
+    """Background colour, shape [3] or [C, 3], with ``colors`` [D] or [C, D]; None for black. Differentiable."""
     colors: torch.Tensor | None = None
-    """Colours instead of those of the spherical harmonics, shape [N, D], or [C, N, D] for each camera its own: any number of
-    channels D, finite values of any sign and size, never clamped. `Render.rgb` then has D channels. Gradients flow into it,
-    and none into ``sh``. None for the spherical harmonics."""
+    """Colours that replace the spherical harmonics, shape [N, D], or [C, N, D] for different ones per camera. Any number of
+    channels D and finite values of any sign and size are allowed; they are never clamped. `Render.rgb` then has D channels.
+    Differentiable; ``sh`` has no gradient then. None for the spherical harmonics."""
     features: torch.Tensor | None = None
-    """Channels to render beside the colours, shape [N, D] or [C, N, D], as free as ``colors``: `Render.features` holds them,
-    blended with the same weights. Gradients flow into it."""
+    """Channels to render besides the colours, shape [N, D] or [C, N, D], with any values as in ``colors``. `Render.features`
+    has the result, blended with the same weights. Differentiable."""
     feature_background: torch.Tensor | None = None
-    """Features behind the scene, shape [D] or [C, D]; None for zeros. Gradients flow into it."""
+    """Background of the features, shape [D] or [C, D]; None for zeros. Differentiable."""
     tile_size: int = 16
     """Side of a tile [px]: 8 or 16. The image does not depend on it."""
     contributions: bool = False
-    """True to report sum and maximum of each Gaussian's blending weight, too."""
+    """True to also return sum and maximum of each Gaussian's blending weight."""
     median_depth: bool = False
-    """True to render the depth at which transmittance falls to one half, too."""
+    """True to also render the depth at which transmittance falls to one half."""
     heaviest: int = 0
-    """Number k of the Gaussians to report for each pixel, those of largest blending weight: ``Render.heaviest_ids``,
-    ``heaviest_weights`` and ``blend_counts``. 0 for none."""
+    """Number k of Gaussians of largest blending weight to return for each pixel: ``Render.heaviest_ids``, ``heaviest_weights``
+    and ``blend_counts``. 0 for none."""
     error_bound: bool = False
-    """True to bound the error of ``rgb`` against rule `exact`, too: for each pixel the distance of this render from one under
-    `exact` in float64, plus the rounding of float64. So it covers cut-offs and float32 together. It costs a render in float64,
-    several times the time of one in float32 (docs/trade.md). Not with ``capacity``."""
+    """True to also bound the error of ``rgb`` against rule `exact`. The bound of a pixel is its difference from a float64
+    render under `exact`, plus the rounding of float64. So it covers both cut-offs and float32 rounding. The float64 render
+    takes several times as long as one in float32 (docs/trade.md). Not with ``capacity``."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
     """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
     absgrad: bool = False
-    """True to sum magnitudes of the gradients of projected means over pixels, too: ``Render.means2d.absgrad``. At most 11
-    channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
+    """True to also sum the magnitudes of the gradients of projected means over pixels: ``Render.means2d.absgrad``. It supports
+    at most 11 channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
     antialiased: bool = False
-    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting: Gaussians
-    below a pixel lose the brightness that widening by ``Rule.low_pass`` adds. For models that were trained so."""
+    """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting. It removes
+    the brightness that widening by ``Rule.low_pass`` adds to Gaussians smaller than a pixel. Use it for models trained with
+    it."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
-    """Number of (Gaussian, tile) instances to allocate memory for; None for as many as there are. With a number nothing is read
-    back from the device, so the call can be captured in a CUDA graph; check `Render.overflow` before using the result."""
+    """Number of (Gaussian, tile) instances to allocate memory for; None for the actual number. With a capacity nothing is read
+    back from the device, so the call can be captured in a CUDA graph. Check `Render.overflow` before you use the result."""
     window: tuple[int, int, int, int] | None = None
-    """Left, top, width and height [px] of the part to render: the images are the crop of the whole ones, to the bit. Edges lie
-    at multiples of ``tile_size`` or at the image's edges. None for all."""
+    """Left, top, width and height [px] of the part to render. The result equals the crop of the whole image bit for bit. Edges
+    must be multiples of ``tile_size`` or edges of the image. None for the whole image."""
     pixels: torch.Tensor | None = None
-    """Pixels to render instead of an image: columns and rows, whole numbers, shape [P, 2], or [C, P, 2] for each camera its
-    own. Images of `Render` then have P in place of H, W: the values of the whole image, to the bit, with gradients. Only tiles
-    that hold such a pixel are blended. Not with ``window``, ``contributions`` or ``capacity``. None for the image."""
+    """Pixels to render instead of an image: integers (column, row), shape [P, 2], or [C, P, 2] for different ones per camera.
+    Images of `Render` then have P instead of H, W. Their values equal those of the whole image bit for bit, with gradients.
+    Only tiles with a listed pixel are blended. Not with ``window``, ``contributions`` or ``capacity``. None for the whole
+    image."""
     max_instances: int | None = None
-    """Most (Gaussian, tile) instances at a time: an image of more is rendered in chunks, and each chunk again for its
-    gradients. That is the same image in less memory and more time. None for all at once. Not with ``capacity``."""
+    """Largest number of (Gaussian, tile) instances at a time. An image with more is rendered in chunks, and each chunk again
+    for its gradients. This gives the same image with less memory and more time. None for no limit. Not with ``capacity``."""
     record: bool = True
-    """True to let CUDA graphs replay the calls that a loop repeats: the same bits in half the time. It applies to calls with
+    """True to replay repeated calls of a loop as CUDA graphs, with the same bits in half the time. It applies to calls with
     gradients in a fixed order and, in the main thread, to calls without gradients. It does not apply with colors, features,
-    opacity factors, contributions, median depth, heaviest, error bound and limits (docs/decisions/010-recorded-calls.md).
-    Choose False where other threads wait for the whole device, as torch.cuda.synchronize does."""
+    opacity factors, contributions, median depth, heaviest, error bound and limits (docs/decisions/010-recorded-calls.md). Use
+    False if other threads wait for the whole device, as torch.cuda.synchronize does."""
 
     def __post_init__(self) -> None:
         """Check the types of switches and numbers; other ranges are checked in `rasterize`.

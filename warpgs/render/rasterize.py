@@ -229,33 +229,33 @@ def rasterize(
     gaussians: RasterizedGaussians | Sequence[RasterizedGaussians], camera: Camera | Sequence[Camera],
     options: RasterizeOptions | Sequence[RasterizeOptions] = RasterizeOptions(),
 ) -> Render | list[Render]:  # fmt: skip
-    """Render Gaussians as one camera, or each camera of a batch, sees them; for a list of cameras, one by one.
+    """Render Gaussians from one camera, from each camera of a batch, or from a list of cameras one by one.
 
-    Differentiable in the tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` where those are tensors that
-    require gradients, and in the colours, features and backgrounds of ``options``. Float32 or float64, CPU or CUDA, as the
-    tensors are; the same inputs give the same bits every time, unless ``options.deterministic`` is False. Cameras and
-    backgrounds are moved to the type and device of ``gaussians.means``. There are no second derivatives, torch.func is refused,
-    and torch.compile breaks its graph here.
+    Differentiable in the tensors of ``gaussians``, in ``camera.viewmat`` and ``camera.K`` (as tensors that require
+    gradients), and in the colours, features and backgrounds of ``options``. Type (float32 or float64) and device (CPU or
+    CUDA) are those of ``gaussians.means``; cameras and backgrounds are converted to them. The same inputs give the same
+    bits every time, unless ``options.deterministic`` is False. There are no second derivatives, torch.func is not
+    supported, and torch.compile breaks its graph here.
 
     Args:
         gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
             covariances and opacities (`CovarianceGaussians`).
-        camera: One camera ([4, 4], [3, 3]), or C of them with images of one size ([C, 4, 4], [C, 3, 3]). Or a list of such, of
-            any sizes: ``gaussians`` and ``options`` are then one for all, or lists of the same length.
+        camera: One camera ([4, 4], [3, 3]), or a batch of C cameras with one image size ([C, 4, 4], [C, 3, 3]). Or a list of
+            these, of any sizes; then ``gaussians`` and ``options`` are shared by all, or lists of the same length.
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera; a list of renders for a list of cameras. ``render.means2d``,
-        read before the backward pass, holds the gradients of the projected means after it.
+        The images, without a leading axis for a single camera; a list of renders for a list of cameras. If you read
+        ``render.means2d`` before the backward pass, it holds the gradients of the projected means after it.
 
     Raises:
-        ResourceError: The images, or the tiles that the Gaussians touch, need more memory than there is.
-        TypeError: An argument is of another type; a scalar type is neither float32 nor float64, or they differ.
-        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each
-            other, a transform of torch.func is active, or a second derivative is asked for.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found. Or ``camera.K``, unless it is on
-            a GPU, has a skew, another last row than 0, 0, 1 or a number that is not finite. Or the near or the far plane is
-            outside its range, or a pixel outside the image. Or lists differ in length.
+        ResourceError: The images, or the tiles that the Gaussians touch, need more memory than is available.
+        TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
+        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other, a
+            transform of torch.func is active, or a second derivative is requested.
+        ValueError: A shape or device is wrong (the message names argument, expected and found); ``camera.K``, unless it is on a
+            GPU, has a skew, a last row other than 0, 0, 1, or a non-finite number; the near or far plane is out of range; a
+            pixel is outside the image; or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")

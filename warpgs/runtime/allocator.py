@@ -124,7 +124,9 @@ def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.d
 
 
 @functools.cache
-def _make_fetch():
+def make_fetch():
+    """Make the kernel of `fetch`."""
+
     @wp.func_native(source("allocator_fetch.cu"))
     def body(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
 
@@ -144,4 +146,4 @@ def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
         second: Count of numbers at the first two; the rest is at the third.
         out: Result, float32, contiguous, any shape.
     """
-    interop.launch(_make_fetch(), out.numel(), [table, first, second, interop.flat(out, wp.float32)], out.device)
+    interop.launch(make_fetch(), out.numel(), [table, first, second, interop.flat(out, wp.float32)], out.device)

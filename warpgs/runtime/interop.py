@@ -85,12 +85,16 @@ class View(NamedTuple):
     tensor: torch.Tensor
     dtype: object
     axes: int | None = None
-    """1 for a flat array, 2 for rows of the last axis, None for the axes of the tensor."""
+    """1 for a flat array, 2 for rows of the last axis, 0 for a flat array with what lies between the rows, None for the axes of
+    the tensor."""
 
     def shape(self) -> tuple[int, ...]:
         """Return the sizes of the axes that a kernel sees, those of a vector type included."""
         if self.axes is None:
             return tuple(self.tensor.shape)
+        if self.axes == 0:
+            last = sum((n - 1) * step for n, step in zip(self.tensor.shape, self.tensor.stride()))
+            return (last + 1 if self.tensor.numel() else 0,)
         count, width = self.tensor.numel(), self.tensor.shape[-1]
         return (count,) if self.axes == 1 else (count // max(width, 1), width)
 
@@ -98,7 +102,7 @@ class View(NamedTuple):
         """Return the same memory as a Warp array of the shape [...], without a copy and without gradient."""
         tensor = self.tensor.detach()
         if self.axes is not None:
-            tensor = tensor.view(self.shape())
+            tensor = tensor.view(self.shape()) if self.axes else tensor.as_strided(self.shape(), (1,))
         for size in tensor.shape:
             _check_size(size)
         return wp.from_torch(tensor, dtype=self.dtype, requires_grad=False)
@@ -125,6 +129,14 @@ def flat(tensor: torch.Tensor, dtype) -> View:
 def rows(tensor: torch.Tensor, dtype) -> View:
     """Return a tensor [..., K] as an argument of two axes. Rows are contiguous, and one stride leads from each to the next."""
     return View(tensor, dtype, 2)
+
+
+def span(tensor: torch.Tensor, dtype) -> View:
+    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with what lies between them.
+
+    Rows are contiguous, and ``tensor.stride(-2)`` leads from each to the next.
+    """
+    return View(tensor, dtype, 0)
 
 
 def warp_device(device: torch.device) -> wp.Device:
@@ -252,7 +264,7 @@ class _Recorded:
             if type(value) is View:
                 tensor = value.tensor
                 address, shape, before = tensor.data_ptr(), tensor.shape, known[i]
-                strided = value.axes == 2 and value.row_stride()  # others are contiguous
+                strided = value.axes in (0, 2) and value.row_stride()  # others are contiguous
                 if before is not None and before[0] == address and before[1] == shape and before[2] == strided:
                     continue
                 packed = command.params[i + 2]  # after the bounds and ``begin``

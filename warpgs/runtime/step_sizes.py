@@ -19,7 +19,7 @@ STEP = (BINNING, LOSS, BLENDING, PROJECTION)
 
 @dataclass(frozen=True)
 class StepSizes:
-    """Sizes that decide the bytes of a training step."""
+    """Sizes that determine the memory of a training step."""
 
     width: int
     """Width of the largest view [px]."""
@@ -30,11 +30,11 @@ class StepSizes:
     views: int = 1
     """Number of views."""
     masked: bool = False
-    """True where a view has a mask."""
+    """True if a view has a mask."""
     cutout: bool = False
     """True if the images have an alpha channel."""
     depth: bool = False
-    """True where a loss term reads depth."""
+    """True if a loss term reads depth."""
     cuda: bool = False
     """True on a CUDA device."""
     count: int = 0
@@ -42,7 +42,7 @@ class StepSizes:
     instances: int = 0
     """Number of (Gaussian, tile) instances of the image or, if ``chunked``, of its heaviest chunk."""
     chunked: bool = False
-    """True where the image is rendered in chunks."""
+    """True if the image is rendered in chunks."""
 
     @property
     def pixels(self) -> int:

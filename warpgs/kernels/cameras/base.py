@@ -10,12 +10,12 @@ from warpgs.scene import Camera
 
 
 class CameraModel:
-    """A camera model: the Warp functions that take a point in camera coordinates to a pixel, and their gradients."""
+    """A camera model: Warp functions that map a point in camera coordinates to a pixel, and their gradients."""
 
     name: str
-    """Name that `Camera.model` selects the model by."""
+    """Name of the model in `Camera.model`."""
     coefficients: int = 0
-    """Number P of the coefficients that `Camera.distortion` holds for this model."""
+    """Number P of coefficients in `Camera.distortion`."""
 
     @staticmethod
     def make_functions(real: type) -> SimpleNamespace:
@@ -25,14 +25,14 @@ class CameraModel:
         ``lens`` the coefficients of distortion, a Warp array [P], ``pixel`` the result of ``pixel_of`` and J the Jacobian of
         ``pixel_of`` by the position, 2 x 3. The namespace has:
 
-        ``in_range(position, lens, near) -> bool``: True where the model can project this position. A NaN must give False.
+        ``in_range(position, lens, near) -> bool``: True if the model can project this position. A NaN must give False.
 
-        ``depth_of(position) -> real``: The depth [u], above 0 in range: it orders the Gaussians, and is rendered.
+        ``depth_of(position) -> real``: The depth [u], above 0 in range. It orders the Gaussians and is rendered.
 
         ``pixel_of(position, K, lens) -> vec2``: The projected position [px].
 
-        ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is taken [px]: ``pixel`` itself, clamped
-        to somewhat more than the image, since far outside of it a first-order expansion errs too much.
+        ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is evaluated [px]: ``pixel``, clamped to the
+        image plus a margin, because a first-order expansion is too inaccurate far outside the image.
 
         ``project_axes(position, K, lens, point, axes) -> Rows``: J times ``axes`` [3, 3], with J at the expansion point
         ``point``. ``Rows`` is a struct with two vec3, ``first`` and ``second``.

@@ -195,28 +195,28 @@ def render_path(
     background: tuple[float, float, float] | None = None,
     coverage: bool | Sequence[View] = False,
 ) -> list[Path]:
-    """Render a model along a path of cameras to PNG files and, where all images have one size, to a film.
+    """Render a model along a camera path to PNG files and, if all images have one size, to a film.
 
-    Images of a model whose scene knows its opacity are transparent, with straight alpha, unless a background is named; a film
-    never is. What was chosen, and frames that show nothing, are said on stderr.
+    If the scene has alpha channels, the PNG files are transparent, with straight alpha, unless a background is given. Films
+    are never transparent. Automatic choices, and warnings about empty frames, are printed on stderr.
 
     Args:
         model: Result of `fit` or `open_run`.
-        path: views (every view of the scene); turntable, spiral or interpolate (through the training views); auto for what
-            suits how the training cameras stand; the name of a JSON file of keyframes; or cameras of your own.
-        out: Folder to write, which may exist; or a film, .mp4, .webm, .webp or .gif, which is then all that is written.
+        path: views (every view of the scene); turntable, spiral or interpolate (through the training views); auto for the
+            choice by the positions of the training cameras; the name of a JSON file of keyframes; or your own cameras.
+        out: Folder to write, which may exist; or a film file (.mp4, .webm, .webp or .gif), to write only the film.
         units: Units of your own cameras: scene or file.
         frames: Number of frames; None for ``seconds`` times ``fps``.
         fps: Frames per second of the film.
-        seconds: Duration of the film; None for what suits the path.
-        size: Width and height of the frames [px]; None for those of the photographs. Not of your own cameras.
-        fov_y: Vertical field of view [rad]; None for that of the photographs. Not of your own cameras.
+        seconds: Duration of the film; None for the default of the path.
+        size: Width and height of the frames [px]; None for those of the photographs. Not supported with your own cameras.
+        fov_y: Vertical field of view [rad]; None for that of the photographs. Not supported with your own cameras.
         background: Colour behind the scene, in [0, 1]; None for that of the fit.
-        coverage: Whether to write, into the subfolder coverage, each image with what no training view saw striped in magenta
-            and what one saw in amber; or the training views, whose masks then count.
+        coverage: True to also write images into the subfolder coverage, with magenta stripes on pixels that no training view
+            saw and amber ones on pixels that one saw. Or the training views, to respect their masks.
 
     Returns:
-        The files written: a PNG for each camera in order, then the film, if any; the images of coverage are not among them.
+        The files written: a PNG for each camera in order, then the film, if any; without the coverage images.
 
     Raises:
         DataError: A file of keyframes cannot be read.

@@ -53,12 +53,12 @@ class ViewMetrics:
     region: str
     """Pixels that count: all, mask, score mask, or foreground (the object on a black background)."""
     lpips: dict[str, float] = field(default_factory=dict)
-    """LPIPS by variant (`lpips_vgg_legacy`); empty where no weights were given, NaN where the image is too small."""
+    """LPIPS by variant (`lpips_vgg_legacy`); empty without weights, NaN if the image is too small."""
     opacity: dict[str, float] = field(default_factory=dict)
     """Scores by the names of `ALPHA_VARIANTS`, NaN without such pixels; empty if the view is opaque."""
 
     def row(self) -> dict[str, Any]:
-        """Return every score by name, flat, as result files have it."""
+        """Return all scores by name, flat, as in result files."""
         plain: dict[str, Any] = asdict(self)
         return {k: v for k, v in plain.items() if k not in ("lpips", "opacity")} | self.opacity | self.lpips
 
@@ -128,13 +128,13 @@ def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> 
 def evaluate(
     gaussians: Gaussians, views: Sequence[View], options: RasterizeOptions | None = None, lpips: Lpips | None = None
 ) -> list[ViewMetrics]:
-    """Render views and score each against its image, as every fit is scored.
+    """Render views and score each against its image, as a fit does.
 
     Args:
         gaussians: N Gaussians in the units of the views' cameras: scene units for the views of a `Scene`.
-        views: Views with images, held-out ones where the score is to mean something.
-        options: Options of the rasterizer, as `FitResult.options` gives them; None for the defaults.
-        lpips: Network for LPIPS (`load_lpips`), or None to leave it out.
+        views: Views with images; use held-out views for a meaningful score.
+        options: Options of the rasterizer, such as `FitResult.options`; None for the defaults.
+        lpips: Network for LPIPS (`load_lpips`); None to skip LPIPS.
 
     Returns:
         The scores of each view, in order; `summarize` gives their means.

@@ -27,7 +27,7 @@ SH_COUNTS = (1, 4, 9, 16, 25)
 
 @dataclass(frozen=True)
 class Model:
-    """A set of Gaussians that knows both systems of units."""
+    """A set of Gaussians in scene units, with the conversion to file units."""
 
     scene_gaussians: Gaussians
     """The Gaussians in scene units [u]."""
@@ -35,7 +35,7 @@ class Model:
     """Similarity from file to scene units."""
 
     def gaussians(self, units: str = "scene") -> Gaussians:
-        """Return the Gaussians in ``scene`` units, as cameras of a `Scene` are, or in those of the scene's ``file``."""
+        """Return the Gaussians in ``scene`` units, those of a `Scene`, or in ``file`` units, those of the scene's files."""
         return convert_gaussians(self.scene_gaussians, self.normalization, "scene", units)
 
 
@@ -75,21 +75,21 @@ class FittedModel(Model):
 
 
 def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | None = None, units: str = "scene") -> None:
-    """Write a model to a safetensors file, which appears whole or not at all.
+    """Write a model to a safetensors file, atomically.
 
-    Tensors are stored as they are; the header names their units and holds the normalization.
+    Tensors are stored unchanged; the header contains their units and the normalization.
 
     Args:
         path: File to write; an existing one is replaced.
         gaussians: N Gaussians, on any device.
-        normalization: Similarity from file to scene units; None for Gaussians in file units that belong to no scene.
-        units: Units that ``gaussians`` are in: scene or file.
+        normalization: Similarity from file to scene units; None for Gaussians in file units without a scene.
+        units: Units of ``gaussians``: scene or file.
 
     Raises:
-        DataError: A number is not finite, or the normalization is no similarity.
+        DataError: A number is not finite, or the normalization is not a similarity.
         ResourceError: The file cannot be written.
-        TypeError: The Gaussians are given by other parameters: ``stored()`` of `ActivatedGaussians` converts them.
-        UsageError: The units are unknown, or scene units come without a normalization.
+        TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
+        UsageError: The units are unknown, or scene units are given without a normalization.
     """
     from safetensors.torch import save as to_bytes
 
@@ -109,14 +109,14 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
-    """Read a model that `save` wrote; `Model.gaussians` gives its Gaussians in either system of units.
+    """Read a model that `save` wrote; `Model.gaussians` returns its Gaussians in either units.
 
     Args:
         path: The file.
         device: Device of the tensors.
 
     Raises:
-        DataError: The file is missing, damaged, or no model.
+        DataError: The file is missing, damaged, or not a model.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load as from_bytes

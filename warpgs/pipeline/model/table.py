@@ -21,14 +21,14 @@ from warpgs.scene import Gaussians
 
 @dataclass(frozen=True)
 class Column:
-    """A value that each row has beside its parameters."""
+    """An additional value of each row, besides its parameters."""
 
     fill: float
-    """Value of rows of which nothing is known."""
+    """Initial value of a row without a parent."""
     dtype: torch.dtype = torch.float32
     """Type of the values."""
     inherited: bool = True
-    """A row that grew from another takes its value; else it starts from ``fill``."""
+    """True if a new row takes the value of its parent; else it starts with ``fill``."""
 
 
 @dataclass(frozen=True)
@@ -40,23 +40,22 @@ class DensityUpdate:
     added: Mapping[str, torch.Tensor]
     """New rows of each parameter, shape [A, ...]; their moments start at zero."""
     parents: torch.Tensor
-    """Row that each new row grew from, before the change, -1 for none, int64, shape [A]."""
+    """Parent of each new row, by its number before the change, -1 for none, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
-    """Values of columns for new rows without a parent, and of columns that are not inherited; a column that is not named takes
-    its ``fill``."""
+    """Values for new rows without a parent, and for columns that are not inherited; columns left out take their ``fill``."""
     overwritten: torch.Tensor | None = None
-    """Numbers of rows, before the change, whose parameters are replaced and whose moments start again at zero, int64, shape
-    [R]; None for none."""
+    """Numbers, before the change, of the rows to overwrite: parameters are replaced, and moments start again at zero. Int64,
+    shape [R]; None for none."""
     values: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    """Parameters of the overwritten rows, shape [R, ...]; a parameter that is not named stays as it is."""
+    """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
 
 class Table:
     """Parameters with Adam moments and columns, kept row by row in step."""
 
     batch: int = 1
-    """Number of views that gradients are the mean of. With B, learning rates are those of one view times the square root of B,
-    and the decay rates of the moments their B-th power (Zhao et al. 2024, Grendel-GS, arXiv 2406.18533)."""
+    """Number B of views over which gradients are averaged. Learning rates are multiplied by the square root of B, and decay
+    rates of the moments are raised to the power B (Zhao et al. 2024, Grendel-GS, arXiv 2406.18533)."""
 
     def __init__(self, params: Mapping[str, torch.Tensor], columns: Mapping[str, Column], device: torch.device, count: int):
         """Begin with zero moments and filled columns.
@@ -96,11 +95,11 @@ class Table:
         return sum(t.element_size() * t[0].numel() for t in self.params.values())
 
     def lasting_bytes(self) -> int:
-        """Return the bytes of a row that last from step to step: parameters, two moments and columns."""
+        """Return the bytes of a row that persist between steps: parameters, two moments and columns."""
         return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
 
     def growth_bytes(self, before: int, after: int) -> int:
-        """Return the bytes while rows are added: the new ones, one tensor before and after, and numbers of rows and parents."""
+        """Return the bytes needed to add rows: the new rows, one tensor before and after, and numbers of rows and parents."""
         added = min(2 * (after - before), after)  # a split replaces one row by two
         largest = max(t.element_size() * t[0].numel() for t in self.params.values())
         return self.row_bytes * added + largest * (before + after) + 8 * after
@@ -116,12 +115,12 @@ class Table:
         return BETAS[0] ** self.batch, BETAS[1] ** self.batch
 
     def lr_row(self, lrs: Mapping[str, float], step: int, head_lrs: Mapping[str, float]) -> list[float]:
-        """Return the numbers that `adam_step` reads at a step, 3 for each parameter, in order.
+        """Return the numbers for `adam_step` in a step, 3 for each parameter, in order.
 
         Args:
-            lrs: Learning rate of each parameter, for one view a step.
+            lrs: Learning rate of each parameter, for steps of one view.
             step: Number of the step, from 1.
-            head_lrs: Learning rate of the first 3 numbers of each row, for parameters where it differs.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters with a different one.
         """
         row, factor = [], math.sqrt(self.batch)
         for name in self.params:
@@ -133,14 +132,14 @@ class Table:
     def adam_step(
         self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor, factors: torch.Tensor | None = None
     ) -> None:
-        """Update all parameters; nothing changes where ``skip`` [1] is not 0.
+        """Update all parameters, unless ``skip`` [1] is not 0.
 
         Args:
             gradients: Gradient of each parameter, in the order of the table.
             lrs: A row of `lr_row`, float32, shape [3 P].
-            skip: 0, or the reason why the step is not taken, int32, shape [1].
-            factors: Fraction of its step that each mean takes, shape [N]; None for all of it. Adam makes the size of a step
-                independent of the gradient's, so the fraction is taken of the step.
+            skip: 0, or the reason for skipping the step, int32, shape [1].
+            factors: Fraction of its step that each mean takes, shape [N]; None for 1. It scales the step, because Adam's step
+                does not depend on the scale of the gradient.
         """
         before = None if factors is None else self.params["means"].detach().clone()
         for i, (name, gradient) in enumerate(gradients.items()):
@@ -155,7 +154,7 @@ class Table:
         """Apply a change of the set: kept rows keep everything, new rows start with zero moments.
 
         Raises:
-            UsageError: The change is not whole: a parameter is missing, or there are more or fewer new rows than parents.
+            UsageError: A parameter is missing, or the numbers of new rows and parents differ.
         """
         rows = {n: len(update.added[n]) if n in update.added else None for n in self.params}
         if any(count != len(update.parents) for count in rows.values()):
@@ -188,7 +187,7 @@ class Table:
 
     @torch.no_grad()
     def reorder(self, order: torch.Tensor) -> None:
-        """Make row i what row ``order[i]`` was; ``order`` is int64, shape [N]."""
+        """Move row ``order[i]`` to row i; ``order`` is int64, shape [N]."""
         for group in (self.params, self.exp_avg, self.exp_avg_sq, self.columns):
             for name in group:
                 group[name] = group[name].detach()[order]
@@ -200,7 +199,7 @@ class Table:
         self.reorder(torch.argsort(morton_codes(self.params["means"].detach()), stable=True))
 
     def reset_opacities(self, opacity: float) -> None:
-        """Lower every opacity to at most this, in (0, 1), and forget the moments of all opacities (the classic reset)."""
+        """Limit every opacity to this value in (0, 1), and reset the moments of all opacities (the reset of 3DGS)."""
         limit = logit(opacity)  # in float64: the smallest float32 opacity would be 0
         self.params["logit_opacities"] = self.params["logit_opacities"].detach().clamp(max=limit).requires_grad_()
         self.exp_avg["logit_opacities"].zero_()
@@ -210,14 +209,14 @@ class Table:
         return {"params": self.params, "exp_avg": self.exp_avg, "exp_avg_sq": self.exp_avg_sq, "columns": self.columns}
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Return everything by flat names, ``params.means`` for one, as a checkpoint stores it."""
+        """Return all tensors by flat names, such as ``params.means``, for a checkpoint."""
         return {f"{group}.{n}": t.detach() for group, tensors in self._groups().items() for n, t in tensors.items()}
 
     def load(self, state: Mapping[str, torch.Tensor]) -> None:
         """Load what `state` returned.
 
         Raises:
-            DataError: Columns or parameters are missing, there are others, or their shapes or types are others.
+            DataError: Columns or parameters are missing, unknown, or of the wrong shape or type.
         """
         own, stored = set(self.state()), {n for n in state if n.partition(".")[0] in self._groups()}
         if own != stored:

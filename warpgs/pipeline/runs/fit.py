@@ -72,13 +72,13 @@ class FitResult(FittedModel):
     """A finished fit."""
 
     config: FitConfig
-    """All settings, those chosen by the time budget included."""
+    """All settings, including those chosen by the time budget."""
     metrics: dict[str, Any]
-    """Scores, sizes and times, as metrics.json holds them."""
+    """Scores, sizes and times, as in metrics.json."""
     notes: tuple[str, ...]
-    """Choices made for the user, assumptions, and anything missing."""
+    """Automatic choices, assumptions and missing parts."""
     folder: Path | None
-    """The run folder; None where none was asked for."""
+    """The run folder; None without ``out``."""
 
 
 def fit(
@@ -98,25 +98,26 @@ def fit(
     ranks: Ranks = ALONE,
     **overrides: object,
 ) -> FitResult:
-    """Fit Gaussians to a scene: the same code as `warpgs fit`.
+    """Fit Gaussians to a scene, as `warpgs fit` does.
 
-    Prints every choice made for the user, progress, and where the results are, unless ``verbose`` is False.
+    Prints automatic choices, progress and the location of the results, unless ``verbose`` is False.
 
     Args:
-        scene: A scene, its folder, or a folder with the options it is read with.
-        preset: Settings to start from: the name of a preset; the path of a .toml file; a `FitConfig` or a mapping, itself or as
-            ``module:NAME`` or ``file.py:NAME``, which runs that code; None for the default preset.
-        split: Views to fit and to hold out, as in `warpgs fit --split`; None for all to fit.
+        scene: A scene, its folder, or a folder with options for reading.
+        preset: Settings to start from: the name of a preset; the path of a .toml file; a `FitConfig` or a mapping, as an
+            object, ``module:NAME`` or ``file.py:NAME`` (this runs the code of the module); None for the default preset.
+        split: Views to fit and to hold out, as in `warpgs fit --split`; None to fit all.
         out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
         device: auto, cpu, cuda, or one of torch's.
         on_step: Called after every step with its number, loss, PSNR, number of Gaussians and time.
         resume: Continue the run in ``out`` from its last checkpoint.
         lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
-        time_budget: Time that the fit may take [s], by which its steps are chosen; None for those of the settings.
-        notes: Choices made before, to be printed and recorded with the fit's own.
-        verbose: True to print, False to print nothing, "progress" to print what is being done and no choice or result.
-        on_model: Called after every step with the model as it is, for those who look on: the next step overwrites its tensors.
-        ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. The first alone
+        time_budget: Time that the fit may take [s], which determines the number of steps; None to use the number in the
+            settings.
+        notes: Earlier choices, which are printed and recorded with those of the fit.
+        verbose: True to print everything, False to print nothing, "progress" to print progress only.
+        on_model: Called after every step with the current model, for viewers: the next step overwrites its tensors.
+        ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. Only the first
             prints, writes and scores; the others return a result without metrics.
         **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
             ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` lists
@@ -124,9 +125,9 @@ def fit(
 
     Raises:
         DataError: The file of a preset cannot be read.
-        UsageError: A setting is unknown, of another type or out of range, a preset or a split cannot be, ``out`` holds
-            something already, or ``resume`` comes without it.
-        WarpgsError: Anything else that a user can fix; before the first step wherever it can be known by then.
+        UsageError: A setting is unknown, of the wrong type or out of range, a preset or a split is invalid, ``out`` is not
+            empty, or ``resume`` is given without ``out``.
+        WarpgsError: Any other error that a user can fix, before the first step if possible.
     """
     out = None if out is None else Path(out)
     if resume and out is None:

@@ -229,21 +229,22 @@ class StoredRun(FittedModel):
     """Contents of its config.json."""
 
     def notes(self) -> list[str]:
-        """Return a note for the user where the fit has not ended; nothing for a finished or a pruned run."""
+        """Return a note for the user if the fit has not ended; nothing for a finished or a pruned run."""
         if "pruned" in self.record or (self.folder / METRICS_FILE).is_file():
             return []
         why = f"unfinished, the fit stopped after step {self.step:,}"
         return [f"{self.folder}: {why}; to finish it, repeat its command with --resume"]
 
     def scene_request(self, reader: str | None = None) -> SceneRequest:
-        """Return the scene that was fitted, as it was read.
+        """Return the fitted scene with the options for reading it.
 
         Args:
-            reader: A reader from outside warpgs, which must be named again: a run folder never decides which code is loaded.
+            reader: A user-defined reader, if the scene was read with one. It must be named again, because a run folder never
+                selects code.
 
         Raises:
-            DataError: The scene was passed from Python and lies in no folder.
-            UsageError: The scene was read with another reader from outside warpgs.
+            DataError: The scene was passed from Python and has no folder.
+            UsageError: The scene was read with another user-defined reader.
         """
         return _stored_scene(self.folder, self.record, reader)
 
@@ -293,8 +294,8 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
         device: Device of the tensors: auto, cpu, cuda, or one of torch's.
 
     Raises:
-        DataError: The folder is no run folder, another version of warpgs wrote it, or its checkpoint is not whole.
-        ResourceError: The device is not there.
+        DataError: The folder is not a run folder, another version of warpgs wrote it, or its checkpoint is incomplete.
+        ResourceError: The device is missing.
     """
     folder = Path(folder)
     where, _ = choose_device(device)

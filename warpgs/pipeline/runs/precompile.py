@@ -37,7 +37,7 @@ from warpgs.kernels import (
 )
 from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
-from warpgs.runtime import interop
+from warpgs.runtime import allocator, interop
 from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.load_module import load_module
 from warpgs.runtime.terminal import say
@@ -83,7 +83,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         (project_cuda.make_backward(wp.float32, CAMERA_MODEL), BLOCK),
     ]
     own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
-    own += [(blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
+    own += [(allocator.make_fetch(), THREADS), (blending.order_tiles, 1024), (blending.contributions, TILE_SIZE * TILE_SIZE)]
     own += [(blend.make_segments(real).gather_weights, THREADS), (scanlines.make_kernel(), scanlines.BLOCK)]
     for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
         passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)

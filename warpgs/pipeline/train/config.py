@@ -34,63 +34,63 @@ class FitConfig:
     """All settings of a fit."""
 
     preset: str = "3dgs"
-    """Preset that the other settings start from: a name; a .toml file of settings; or module:NAME or path/to/file.py:NAME of a
-    FitConfig or a mapping of your own."""
+    """Preset that the other settings start from: a name, a .toml file of settings, or your own FitConfig or mapping as
+    module:NAME or path/to/file.py:NAME."""
     steps: int | None = 7000
-    """Number of optimisation steps; early stopping may end the fit before. None: by the number of views."""
+    """Number of optimisation steps; early stopping may end the fit sooner. None: by the number of views."""
     max_steps: int = 30_000
-    """Largest number of steps where they follow from the number of views."""
+    """Largest number of steps that the number of views may set."""
     batch: int = 1
-    """Views that each step renders; its gradient is their mean. Learning rates are those of one view times the square root of
-    this (docs/many-gpus.md). Several GPUs share the views of a step."""
+    """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
+    this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """Take no more steps on a CPU than two cores do in 1 to 20 minutes, where the steps follow from the number of views."""
+    """Limit the steps on a CPU to the work of two cores in 1 to 20 minutes, if the number of views sets the steps."""
     seed: int = 0
-    """Seed of every random choice; the same seed, data and kind of device give the same bytes."""
+    """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
     """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
     antialiased: bool = False
-    """Antialiased model, for renders at other sizes than that of the photos (Mip-Splatting, Yu et al. 2024): opacities are
-    reduced below the size of a pixel, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of
-    the run are antialiased, too; other programs need their antialiased mode."""
+    """Antialiased model, for renders at other sizes than the photos (Mip-Splatting, Yu et al. 2024). Gaussians smaller than a
+    pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run
+    are antialiased, too; other programs need their antialiased mode."""
     half_resolution: float | None = 0.0
-    """Fraction of the steps, from the first, in which views are fitted at half their size (docs/trade.md). None: by the number
-    of views."""
+    """Fraction of the steps, from the start of the fit, with views of half size (docs/trade.md). None: by the number of
+    views."""
     sh_degree: int | None = 3
-    """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files hold degree 4. None: by the number of
+    """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: by the number of
     views."""
     sh_every: int = 1000
-    """Number of steps after which the spherical-harmonics degree in use rises by one."""
+    """Number of steps after which the spherical-harmonics degree rises by one."""
     dropout: float = 0.0
-    """Probability, at the last step, that a Gaussian is hidden for a step; it grows linearly from 0 (DropGaussian, Park et
-    al. 2025)."""
+    """Dropout: probability that a Gaussian is hidden in a step. It grows linearly from 0 to this value at the last step
+    (DropGaussian, Park et al. 2025)."""
     dropout_views: int = 3
-    """Number of training views up to which dropout has its full probability; with more it is lower in proportion."""
+    """Number of training views up to which dropout has its full probability; with more views it falls in proportion."""
     checkpoint_every: int = 1000
     """Number of steps between checkpoints; one is always written at the end."""
     checkpoint_seconds: float = 20.0
-    """Least time from one checkpoint to the next [s], since writing takes time. No result depends on it."""
+    """Least time between checkpoints [s], because writing takes time. It does not affect results."""
     memory_limit: int | None = None
-    """Bytes that the tensors of the fit may take on its device during steps; None for no limit. With one, densification stops
-    before a step would exceed it, and images are rendered in chunks where a whole one would."""
+    """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
+    a step would exceed the limit, and images are rendered in chunks if a whole image would exceed it."""
     cuda_graph: bool = True
-    """CUDA graphs: a step is captured once and replayed; the same kernels and the same bytes as without, in less time."""
+    """CUDA graphs: each step is captured once and replayed, which is faster and gives the same bytes."""
     max_gaussians: int = 1_000_000
     """Largest number of Gaussians, from the start on."""
     background: str = "scene"
-    """Colour behind the scene, where no Gaussian lies: auto (the mean colour of the training views where they are opaque and
-    show no object on black, else as scene), mean, scene (that of the files: white for Blender, else black), black, white,
+    """Background colour, where no Gaussian is: mean (mean colour of the training views), scene (colour of the files: white for
+    Blender, else black), auto (mean if the training views are opaque and show no object on black, else scene), black, white,
     #rrggbb, or r,g,b in [0, 1]."""
     strategy: str = "clone_split"
     """Density strategy, which adds and removes Gaussians: a name, or your own as module:Class or path/to/file.py:Class."""
     strategy_config: Any = None
-    """Own settings of the strategy, an instance of its ``Config``; None for their defaults. Those of clone_split
-    and importance_sampling are the groups ``density`` and ``method``."""
+    """Settings of the strategy, an instance of its ``Config``; None for the defaults. Settings of clone_split and
+    importance_sampling are the groups ``density`` and ``method``."""
     loss_terms: tuple[LossTerm, ...] = ()
-    """Loss terms beside those of ``loss``; the class of each is registered by a name."""
+    """Additional loss terms, besides those of ``loss``; each class is registered by a name."""
     view_modules: tuple[ViewModule, ...] = ()
-    """View modules, which learn parameters of each training view with the Gaussians (docs/your-photos.md); the class of each is
-    registered by a name, and each of ours has a flag of its name."""
+    """View modules, which learn parameters of each training view together with the Gaussians (docs/your-photos.md); each class
+    is registered by a name. A built-in module also has a flag of its name."""
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
     """Early stopping by left-out blocks of the training views, with any strategy (docs/decisions/020)."""
     init: InitConfig = field(default_factory=InitConfig)
@@ -108,7 +108,7 @@ class FitConfig:
     method: MethodConfig = field(default_factory=MethodConfig)
     """Settings of strategy importance_sampling."""
     priors: PriorConfig = field(default_factory=PriorConfig)
-    """Networks that priors of the views come from."""
+    """Networks that compute the priors of the views."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "max_steps", "batch", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
@@ -138,15 +138,15 @@ class FitConfig:
         self.own_code()  # the file as it is now: the user may edit it while a study runs
 
     def groups(self) -> Settings:
-        """Return the groups of settings by their class, as parts of a fit read them."""
+        """Return the groups of settings by their class."""
         return Settings(value for value in vars(self).values() if dataclasses.is_dataclass(value))
 
     def own_code(self) -> dict[str, str]:
-        """Return the SHA-256 of the source file of each class of the user's own, by its name."""
+        """Return the SHA-256 of the source file of each user-defined class, by its name."""
         return own_code(self.plugged_in())
 
     def plugged_in(self) -> list[type]:
-        """Return the classes of the strategy, loss terms and view modules; no strategy that this process has not loaded."""
+        """Return the classes of the strategy (if this process has loaded it), loss terms and view modules."""
         strategy = [find_strategy(self.strategy)] if STRATEGIES.knows(self.strategy) else []
         return [*strategy, *(type(part) for name in _PARTS for part in getattr(self, name))]
 
@@ -160,8 +160,8 @@ class FitConfig:
         """Return the configuration that `to_json` stored.
 
         Raises:
-            SchemaError: A value is of another kind than its field.
-            UsageError: A field is unknown, a value is out of range, or a class of the user's own was not loaded here.
+            SchemaError: A value has the wrong type for its field.
+            UsageError: A field is unknown, a value is out of range, or a user-defined class is not loaded.
         """
         mapping(anything)(values, "config")
         try:
@@ -195,7 +195,7 @@ def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
     """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn.
 
     Raises:
-        SchemaError: A value is of another kind than its field.
+        SchemaError: A value has the wrong type for its field.
     """
     mapping(anything)(values, place)
     kinds, composed = typing.get_type_hints(kind), {}

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class Settings:
-    """Groups of the settings of a fit, each found by its class: a strategy reads its own, and knows no others."""
+    """Groups of the settings of a fit, indexed by their class."""
 
     def __init__(self, groups: Iterable[object]):
         """Keep the groups, one of each class."""
@@ -34,25 +34,25 @@ class Growth(NamedTuple):
     """Times at which a strategy adds Gaussians, in steps done."""
 
     begins: int
-    """None are added before."""
+    """Step before which none are added."""
     ends: int
-    """None are added after."""
+    """Step after which none are added."""
     events: tuple[int, ...] = ()
-    """Times, ascending, at which many are added at once: the model is best measured right before. Empty where any time is as
-    good."""
+    """Times, ascending, at which many are added at once. Early stopping measures the model right before them. Empty if any time
+    is equally good."""
 
 
 @dataclass
 class StrategyContext:
-    """Parts of a fit that a strategy works with. The trainer keeps them up to date.
+    """Parts of a fit for a strategy. The trainer keeps them up to date.
 
-    A strategy writes into columns of the table and takes random numbers from the generator; all else it only reads.
+    A strategy may write to columns of the table and take random numbers from the generator. All else is read-only.
     """
 
     settings: Settings
     """Settings of the fit by group."""
     own: Any
-    """Settings of the strategy's own class; None for their defaults."""
+    """Settings of the strategy (its ``Config``); None for the defaults."""
     table: Table
     """The Gaussians, with the strategy's columns."""
     generator: torch.Generator
@@ -60,7 +60,7 @@ class StrategyContext:
     seed: int
     """Seed of the fit."""
     phases: Phases
-    """Phases of the fit as they are now: growth may end before its time."""
+    """Current phases of the fit; early stopping may change them."""
     extent: float
     """Size of the scene [u]."""
     rule: str
@@ -68,11 +68,11 @@ class StrategyContext:
     background: torch.Tensor
     """Colour behind the scene, shape [3]."""
     views: list[TrainingView] = field(default_factory=list)
-    """Views that are trained on; empty before `Strategy.setup`."""
+    """Training views; empty before `Strategy.setup`."""
     capacity: int = 0
     """Number of Gaussians that settings and memory limit allow; 0 before `Strategy.setup`."""
     max_instances: int | None = None
-    """(Gaussian, tile) instances that a render may have at a time; None for no limit."""
+    """Largest number of (Gaussian, tile) instances of a render at a time; None for no limit."""
     antialiased: bool = False
     """True in an antialiased fit (`RasterizeOptions.antialiased`)."""
 
@@ -92,7 +92,7 @@ class StrategyContext:
         return self.phases.steps
 
     def render_options(self) -> RasterizeOptions:
-        """Return the settings with which training views are rendered whole, with all harmonics."""
+        """Return the settings for rendering whole training views with all harmonics."""
         return RasterizeOptions(
             rule=self.rule, background=self.background, max_instances=self.max_instances, antialiased=self.antialiased
         )

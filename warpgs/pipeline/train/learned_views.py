@@ -22,14 +22,14 @@ def seen(modules: Sequence[ViewModule], rgb: torch.Tensor, values: Tensors) -> t
 
 @dataclass(frozen=True)
 class LearnedView:
-    """Camera and values of one training view, by view modules."""
+    """Camera and learned values of one training view."""
 
     modules: tuple[ViewModule, ...]
     """View modules of the fit."""
     given: Camera
-    """Camera as given, which modules start from."""
+    """Given camera, from which modules start."""
     values: Tensors
-    """Values as they are now, by name, [...], overwritten in place."""
+    """Current values, by name, [...], overwritten in place."""
 
 
 class LearnedViews:

@@ -29,8 +29,8 @@ class Target:
     maps: Mapping[str, torch.Tensor]
     """Maps that loss terms asked for (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
-    """Opacity of what was photographed, in [0, 1], shape [H, W]; None where no training view has one. ``image`` and the render
-    are over the same colour, another one at each step where `LossConfig.random_background` says so."""
+    """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
+    background; with `LossConfig.random_background` it changes at each step."""
 
 
 class _Outputs(dict[str, torch.Tensor]):
@@ -46,55 +46,55 @@ class _Outputs(dict[str, torch.Tensor]):
 
 @dataclass(frozen=True)
 class LossInputs:
-    """Render, view and Gaussians of a step, from which a loss term is computed; all tensors are on the device of the fit."""
+    """Render, view and Gaussians of a step, for computing a loss term; all tensors are on the device of the fit."""
 
     outputs: Mapping[str, torch.Tensor]
-    """Images of the render, by name, those of `LossTerm.needs_outputs` alone: ``rgb`` [H, W, 3], the colour over the
-    background, as the view shows it (view modules); ``alpha`` [H, W], the accumulated opacity in [0, 1];
-    ``depth`` [H, W], the expected z-depth [u], 0 where nothing is blended. Differentiable."""
+    """Images of the render named in `LossTerm.needs_outputs`: ``rgb`` [H, W, 3], the colour over the background, after view
+    modules; ``alpha`` [H, W], the accumulated opacity in [0, 1]; ``depth`` [H, W], the expected z-depth [u], 0 where nothing is
+    blended. Differentiable."""
     target: Target
     """Image, mask and maps of the view."""
     gaussians: Gaussians
-    """The Gaussians, parameters as stored; differentiable."""
+    """The Gaussians; differentiable."""
     camera: Camera
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
     tensors. Where poses are refined, the pose is that of the step and differentiable."""
     step: torch.Tensor
-    """Number of the step, from 1: a whole number as float32, shape []. It is a tensor, since a captured step is replayed with
-    the numbers of others; `LossTerm.active` has the number on the host."""
+    """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed with
+    other numbers; `LossTerm.active` has the number on the host."""
 
     def of(self, term: LossTerm) -> LossInputs:
-        """Return the inputs of one term, with the outputs alone that it needs."""
+        """Return the inputs of one term, with only the outputs that it needs."""
         return replace(self, outputs=_Outputs(term, self.outputs))
 
 
 @dataclass(frozen=True)
 class LossTerm:
-    """One term of the loss. A term of your own is a frozen dataclass that derives from this; its fields are its settings."""
+    """One term of the loss. To write one, derive a frozen dataclass; its fields are its settings."""
 
     name: ClassVar[str] = ""
     """Name in the registry."""
     needs_outputs: ClassVar[tuple[str, ...]] = ("rgb",)
-    """Images of the render that the term reads (`LossInputs.outputs`). Gradients are computed for those that a term reads."""
+    """Images of the render that the term reads (`LossInputs.outputs`). Other images have no gradient."""
     needs_priors: ClassVar[bool] = False
-    """True where `needs` reads the priors of the views, which are then computed before the fit."""
+    """True if `needs` reads the priors of the views; they are then computed before the fit."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
-        """Return the maps of a view that the term compares with, by name, each of shape [H, W] or [H, W, C].
+        """Return the maps of a view that the term reads, by name, each of shape [H, W] or [H, W, C].
 
         No two terms of a fit may use the same name.
         """
         return {}
 
     def active(self, step: int, steps: int) -> bool:
-        """Return whether a step, from 1 to ``steps``, has the term."""
+        """Return whether the term is active in a step, from 1 to ``steps``."""
         return True
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes that the term takes at the moments of a step.
+        """Return the bytes that the term needs at the moments of a step.
 
-        By default four maps at the loss for a term that reads depth, enough for a correlation of two maps with its gradient,
-        and none for others: override it in a term that takes more.
+        The default is four maps at the loss for a term that reads depth, which suffices for a correlation of two maps with
+        its gradient, and none for other terms. Override it in a term that needs more.
         """
         return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 
@@ -130,9 +130,9 @@ def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
 
 
 def total(values: torch.Tensor) -> torch.Tensor:
-    """Return the sum of values [H, ...], shape [], whose bits do not depend on the number of CPU threads.
+    """Return the sum of values [H, ...], shape [], with the same bits for any number of CPU threads.
 
-    That of a whole tensor does on a CPU; there rows are summed first.
+    torch's sum of a whole tensor depends on it on a CPU, so rows are summed first.
     """
     return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
 

@@ -129,12 +129,12 @@ class Phases:
     events: tuple[int, ...]
     """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
     planned: int
-    """Steps of the fit as planned, by which learning rates fall up to phase 3."""
+    """Planned number of steps, which sets the decay of learning rates up to phase 3."""
     steps: int
-    """Steps of the fit: fewer than planned once phase 3 began early."""
+    """Number of steps; fewer than planned if phase 3 begins early."""
 
     def progress(self, step: int) -> float:
-        """Return the fraction of the fit that is done before a step counted from 1, in [0, 1]; phase 3 ends with 1."""
+        """Return the finished fraction of the fit before a step counted from 1, in [0, 1]; phase 3 ends with 1."""
         planned = max(1, self.planned - 1)
         if self.steps == self.planned or step <= self.stable_start:
             return (step - 1) / planned
@@ -142,7 +142,7 @@ class Phases:
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
     def stable_from(self, step: int, planned_start: int) -> Phases:
-        """Return the phases of which the third begins after ``step``, not ``planned_start``, and is as much shorter."""
+        """Return the phases if the third begins after ``step`` instead of ``planned_start``, and is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 

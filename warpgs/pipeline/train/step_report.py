@@ -10,9 +10,9 @@ class StepReport:
     step: int
     """Steps done, from 1."""
     loss: float
-    """Loss on the step's view, the mean over its views where it has several."""
+    """Loss on the view of the step; with several views, the mean."""
     psnr: float
-    """PSNR on the step's view before the update, of the mean squared error over its views where it has several [dB]."""
+    """PSNR on the view of the step before the update [dB]; with several views, that of their mean squared error."""
     count: int
     """Number of Gaussians after the step."""
     seconds: float

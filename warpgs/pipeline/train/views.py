@@ -24,7 +24,7 @@ class TrainingView:
     """A training view on the device of the fit."""
 
     camera: Camera
-    """Camera with float32 tensors on the device, as it is now; overwritten in place where it is learned."""
+    """Current camera with float32 tensors on the device; a learned camera is overwritten in place."""
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None = None
@@ -32,23 +32,23 @@ class TrainingView:
     semantic: torch.Tensor | None = None
     """S_semantic in [0, 1], shape [H, W]; None for a view without a semantic score."""
     geometry: torch.Tensor | None = None
-    """S_geometry in [0, 1], shape [H, W]; None where no strategy samples by it."""
+    """S_geometry in [0, 1], shape [H, W]; None if the strategy does not use it."""
     consistent: torch.Tensor | None = None
-    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None for none at all."""
+    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None without any."""
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
-    """Maps that loss terms asked for, by name, each of shape [H, W] or [H, W, C]."""
+    """Maps for loss terms (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one (`with_alpha`)."""
     depth: torch.Tensor | None = None
-    """Given z-depth [u] that no other view contradicts, 0 where there is none, shape [H, W]; for `LossTerm.needs` alone, then
-    None, as where no depth is given."""
+    """Given z-depth [u] that agrees with the other views, 0 for missing values, shape [H, W]. Only available in
+    `LossTerm.needs`; None later, or without given depth."""
     depth_weight: torch.Tensor | None = None
-    """Confidence in it, in [0, 1], shape [H, W]; None for 1 everywhere, or without it."""
+    """Confidence in ``depth``, in [0, 1], shape [H, W]; None for 1 everywhere, or without depth."""
     normals: torch.Tensor | None = None
-    """Given unit normals in the axes of the camera, 0 where there is none, shape [H, W, 3]; for `LossTerm.needs` alone, then
-    None, as where no normals are given."""
+    """Given unit normals in camera axes, 0 for missing values, shape [H, W, 3]. Only available in `LossTerm.needs`; None later,
+    or without given normals."""
     learned: LearnedView | None = None
-    """Part of the view in the view modules of the fit; None without view modules."""
+    """Values of the view in the view modules of the fit; None without view modules."""
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
@@ -65,21 +65,21 @@ class TrainingView:
 
     @property
     def kind(self) -> Kind:
-        """Width, height, presence of a mask and camera model, which the views of one stack share."""
+        """Width, height, presence of a mask and camera model, which are equal for the views of a stack."""
         return self.camera.width, self.camera.height, self.mask is not None, self.camera.model
 
     @property
     def given(self) -> Camera:
-        """Camera before anything was learned of it."""
+        """Camera before view modules changed it."""
         return self.camera if self.learned is None else self.learned.given
 
     def seen(self, rgb: torch.Tensor) -> torch.Tensor:
-        """Return rendered colours [H, W, 3] as the view shows them, by what its view modules have learned."""
+        """Return rendered colours [H, W, 3] after the view modules of the fit."""
         return rgb if self.learned is None else seen(self.learned.modules, rgb, self.learned.values)
 
     @property
     def countable(self) -> torch.Tensor | None:
-        """Mask of the pixels that show something which counts, 1 or 0, shape [H, W]; None where all do."""
+        """Mask of the pixels that count and are opaque, 1 or 0, shape [H, W]; None for all pixels."""
         if self.alpha is None:
             return self.mask
         opaque = (self.alpha > OPAQUE).to(self.image.dtype)

@@ -19,20 +19,21 @@ from warpgs.schema import anything
 class Strategy:
     """Rules by which Gaussians are added, moved and removed.
 
-    A strategy of your own is a class that derives from this one and overrides what it needs; nothing else has to change. The
-    trainer calls, for each step: `phase` on the host; then, as part of the step, `statistics` for each of its views,
-    `lr_factors` and `after_step`; then `due` and, where that is true, `update` on the host.
+    To write a strategy, derive a class and override the methods that it needs. For each step the trainer calls `phase` on the
+    host. As part of the step it then calls `statistics` for each view, `lr_factors` and `after_step`. After the step it calls
+    `due` on the host and, if that returns True, `update`.
 
-    What is part of a step is captured once as a CUDA graph and replayed, so it must not read back from the device, must write
-    its results into tensors that are there already, and may depend on the host only by `phase`.
+    The methods that are part of a step are captured once as a CUDA graph and replayed. So they must not read back from the
+    device, must write their results into existing tensors, and may depend on the host only through `phase`.
     """
 
     name: ClassVar[str] = ""
     """Name in the registry."""
     Config: ClassVar[type | None] = None
-    """Frozen dataclass of its own settings, None for none. They become flags, grouped under the strategy's name."""
+    """Frozen dataclass of the strategy's settings; None for none. They become flags, grouped under the strategy's name."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
-    """Schema (`warpgs.schema`) of the plain values that `state` returns: `load` gets no others, whatever a file holds."""
+    """Schema (`warpgs.schema`) of the plain values that `state` returns; values from files are checked against it before
+    `load`."""
 
     def __init__(self, context: StrategyContext):
         """Keep the context, which the strategy works with; nothing is trained yet.
@@ -46,36 +47,36 @@ class Strategy:
 
     @classmethod
     def samples(cls, settings: Settings) -> bool:
-        """Return whether it places Gaussians behind pixels, for which depths of views are compared; settings are the fit's."""
+        """Return whether it places Gaussians at pixels, which needs consistent depth; ``settings`` are those of the fit."""
         return False
 
     @classmethod
     def needs_priors(cls, settings: Settings) -> bool:
-        """Return whether it reads scores that priors of the views give; settings are those of the fit."""
+        """Return whether it reads scores from the priors of the views; ``settings`` are those of the fit."""
         return False
 
     @classmethod
     def warmup_config(cls, own: Any) -> Any:
-        """Return the own settings for a warm-up of three steps, in which everything that a fit uses should come once."""
+        """Return the strategy's settings for a warm-up of three steps, which should run each part of a fit once."""
         return own
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes that the strategy takes at the moments of a step, or in an event; columns are counted apart."""
+        """Return the bytes that the strategy needs at the moments of a step, or in an event, without its columns."""
         return {}
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the columns that the strategy keeps of each Gaussian, by name; they are saved with every checkpoint."""
+        """Return the columns that the strategy adds to the table, by name; checkpoints save them."""
         return {}
 
     def setup(self) -> None:
-        """Begin; the table, the training views and the memory plan exist by now."""
+        """Set up the strategy; the table, the training views and the memory plan exist already."""
 
     def growth(self) -> Growth:
-        """Return when Gaussians are added, by which early stopping measures; up to phase 3 if not overridden."""
+        """Return the times at which Gaussians are added, for early stopping; up to phase 3 by default."""
         return Growth(self.context.phases.refine, self.context.phases.stable_start)
 
     def phase(self, step: int) -> Hashable:
-        """Return a value for what the strategy does in a step; steps of equal phases share a CUDA graph."""
+        """Return a value that determines what the strategy does in a step; steps with equal values share a CUDA graph."""
         return None
 
     def regularisation(self, phase: Hashable, gaussians: Gaussians) -> torch.Tensor | None:
@@ -88,7 +89,7 @@ class Strategy:
         return None
 
     def lr_factors(self, phase: Hashable) -> torch.Tensor | None:
-        """Return the fraction of its step that each mean takes, shape [N]; None for all of it."""
+        """Return the fraction of its Adam step that each mean takes, shape [N]; None for 1."""
         return None
 
     def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
@@ -97,45 +98,46 @@ class Strategy:
         Args:
             phase: Value of `phase` for the step.
             settings: Settings of the step, by the columns of `warpgs.kernels.step_buffers.Setting`, float32, shape [7].
-            going: Whether the step is taken, bool, shape [1]; where it is not, nothing may change.
+            going: True if the step is taken, bool, shape [1]; if False, nothing may change.
         """
 
     def statistics(
         self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
     ) -> Mapping[str, torch.Tensor]:
-        """Return what a view of a step adds to columns, by name of the column, shape [N] each.
+        """Return the values that a view of a step adds to columns, by name of the column, shape [N] each.
 
-        It depends on this view alone, as a step may have several, in other processes too, and it must be 0 where ``visible`` is
-        False: gradients of a step that is not taken may be no numbers.
+        They must depend on this view only, because other views of the step may be in other processes. They must be 0 where
+        ``visible`` is False, because gradients of a skipped step may be NaN.
 
         Args:
             phase: Value of `phase` for the step.
-            v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two are of the mean [1/px].
-            visible: Gaussians that touch a tile, bool, shape [1, N]; none where the step is not taken.
+            v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two values are that of the mean
+                [1/px].
+            visible: Gaussians that touch a tile, bool, shape [1, N]; all False if the step is skipped.
             size: Width and height of the view [px].
         """
         return {}
 
     def due(self, step: int) -> bool:
-        """Return whether `update` has anything to do after a step; not asked once early stopping has ended growth."""
+        """Return whether `update` changes anything after a step; not called after early stopping has ended growth."""
         return False
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Yield changes of the set of Gaussians after a step; each has been applied to the table when the next is asked for."""
+        """Yield changes of the Gaussians after a step; each is applied to the table before the next is requested."""
         return iter(())
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Yield changes for pixels that early stopping has held out so far, when it ends growth.
+        """Yield changes for the pixels that early stopping held out, when it ends growth.
 
         Args:
             step: Steps done.
-            views: Training views, masked so that nothing but those pixels counts.
-            held: Number of those pixels, over all views.
+            views: Training views, masked to these pixels.
+            held: Number of these pixels, over all views.
         """
         return iter(())
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return tensors by name, of any shape [...], and plain values from which the strategy continues with the same bits.
+        """Return tensors by name, of any shape [...], and plain values, with which the strategy resumes with the same bits.
 
         The table is saved by the trainer.
         """

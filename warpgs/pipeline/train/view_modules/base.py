@@ -22,7 +22,7 @@ Tensors = Mapping[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class FittedViews:
-    """A finished fit, as `ViewModule.figures` describes it."""
+    """A finished fit, for `ViewModule.figures`."""
 
     params: Tensors
     """Parameters of the module, by name, shape [V, ...]."""
@@ -39,28 +39,28 @@ class FittedViews:
     gaussians: Gaussians
     """The fitted model."""
     options: RasterizeOptions
-    """Options that it is rendered with."""
+    """Options for rendering it."""
 
 
 @dataclass(frozen=True)
 class ViewModule:
-    """Something that a fit learns of each training view.
+    """Parameters of each training view that a fit learns together with the Gaussians.
 
-    One of your own is a frozen dataclass that derives from this; its fields are its settings.
+    To write a module, derive a frozen dataclass; its fields are its settings.
 
-    A module has no state: its parameters have a row for each training view, under dense Adam as in `torch.optim.Adam`. A step
-    has a gradient in the row of its own view and zeros in the others, which still move by their decaying momentum. Checkpoints
-    hold parameters and moments.
+    The parameters have a row for each training view. Dense Adam updates them, as in `torch.optim.Adam`: a step has a
+    gradient only in the row of its own view, and the other rows move by their decaying momentum. Checkpoints store
+    parameters and moments; a module has no other state.
 
-    `values`, `before_render`, `after_render` and `regularisation` are part of the captured step: they read nothing back from
-    the device, and their tensors have the same shapes at each call.
+    `values`, `before_render`, `after_render` and `regularisation` are part of the captured step: they must not read back
+    from the device, and their tensors must have the same shapes at each call.
     """
 
     name: ClassVar[str] = ""
     """Name in the registry."""
 
     def check(self, views: Sequence[View]) -> None:
-        """Check, before anything takes time, that the training views can have the parameters.
+        """Check at the start of a fit that the training views can have the parameters.
 
         Raises:
             UsageError: They cannot.
@@ -83,11 +83,11 @@ class ViewModule:
         return {}
 
     def values(self, params: Tensors, numbers: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return what `before_render` and `after_render` get for some views: by default their rows; differentiable.
+        """Return the values of some views for `before_render` and `after_render`: by default their rows; differentiable.
 
         Args:
             params: Parameters of all training views, by name, shape [V, ...].
-            numbers: Number of each of the views among them, int64, shape [B].
+            numbers: Indices of the B views among them, int64, shape [B].
 
         Returns:
             Tensors by the names of the parameters, shape [B, ...].
@@ -95,7 +95,7 @@ class ViewModule:
         return {n: t.index_select(0, numbers) for n, t in params.items()}  # not t[numbers], which reads them back
 
     def before_render(self, camera: Camera, values: Tensors) -> Camera:
-        """Return the camera that views are rendered from; viewmat and intrinsics may change, and are differentiable.
+        """Return the camera for rendering the views; viewmat and intrinsics may change, and are differentiable.
 
         Args:
             camera: Camera of B views as given, viewmat [B, 4, 4] and K [B, 3, 3]; at half the size in some steps.
@@ -104,7 +104,7 @@ class ViewModule:
         return camera
 
     def after_render(self, rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
-        """Return rendered colours [H, W, 3] as one view shows them, differentiable; ``values`` are of that view, [...]."""
+        """Return the rendered colours [H, W, 3] of one view after the module; differentiable. ``values`` are [...]."""
         return rgb
 
     def regularisation(self, values: Tensors) -> torch.Tensor | None:
@@ -112,18 +112,18 @@ class ViewModule:
         return None
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes that the module takes at the moments of a step; none by default.
+        """Return the bytes that the module needs at the moments of a step; none by default.
 
-        A module that learns `before_render` takes `CAMERA_BYTES` for each Gaussian in the backward pass of projection.
+        A module with `before_render` needs `CAMERA_BYTES` for each Gaussian in the backward pass of projection.
         """
         return {}
 
     def cameras(
         self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str], params: Tensors
     ) -> Mapping[str, Camera]:
-        """Return the cameras of all views after the fit, from which they are scored and rendered; by default as given.
+        """Return the cameras of all views after the fit, for scores and renders; by default the given ones.
 
-        The images of held-out views are not there: nothing may be learned from them.
+        The images of held-out views are not available, so that nothing is learned from them.
 
         Args:
             given: Camera of each view, numpy, in scene units [u], by name.
@@ -134,7 +134,7 @@ class ViewModule:
         return given
 
     def figures(self, fitted: FittedViews) -> dict[str, Any]:
-        """Return the learned values, plain, for metrics.json; ``summary`` is a note for output and report."""
+        """Return the learned values as plain numbers for metrics.json; ``summary`` is a note for output and report."""
         return {"summary": f"view module {self.name}: {', '.join(fitted.params)} of {len(fitted.train)} training views learned"}
 
 
