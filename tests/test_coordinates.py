@@ -1,5 +1,7 @@
 """Units: the similarity between scene and file coordinates, forth and back."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -109,3 +111,38 @@ def test_only_stored_gaussians_are_written(tmp_path, write):
     assert not path.exists()
     write(path, activated.stored(), units="file")
     assert path.exists()
+
+
+@pytest.mark.parametrize("write", [save, write_ply, write_gaussians])
+@pytest.mark.parametrize(
+    ("name", "part", "said"),
+    [
+        ("means", (slice(None), slice(2)), r"means must have shape \[N, 3\] \(N=6\), not \[6, 2\]"),
+        ("means", (0, 0), r"means must have shape \[N, 3\] \(N=0\), not \[\]"),
+        ("quats", (slice(None), slice(3)), r"quats must have shape \[N, 4\] \(N=6\), not \[6, 3\]"),
+        ("log_scales", (slice(5),), r"log_scales must have shape \[N, 3\] \(N=6\), not \[5, 3\]"),
+        ("logit_opacities", (slice(None), None), r"logit_opacities must have shape \[N\] \(N=6\), not \[6, 1\]"),
+        ("sh", (slice(None), slice(3)), r"sh must have shape \[N, K, 3\] \(N=6\), where K is 1, 4, .*, not \[6, 3, 3\]"),
+        ("sh", (slice(5),), r"sh must have shape .* not \[5, 4, 3\]"),
+    ],
+)  # fmt: skip
+def test_tensors_that_do_not_go_together_are_not_written(tmp_path, write, name, part, said):
+    """No file is there afterwards that no reader takes."""
+    g = cloud(6, degree=1)
+    with pytest.raises(ValueError, match=said):
+        write(tmp_path / "m.ply", dataclasses.replace(g, **{name: g.tensors()[name][part]}), units="file")
+    with pytest.raises(TypeError, match="quats must be a torch tensor, not list"):
+        write(tmp_path / "m.ply", dataclasses.replace(g, quats=g.quats.tolist()), units="file")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "types", [{"sh": torch.float64}, {"means": torch.float64}, dict.fromkeys(cloud(1).tensors(), torch.half)]
+)
+def test_what_load_refuses_is_not_saved(tmp_path, types):
+    """A model has one type, float32 or float64."""
+    g = cloud(6)
+    g = dataclasses.replace(g, **{name: g.tensors()[name].to(kind) for name, kind in types.items()})
+    with pytest.raises(TypeError, match=r"is torch\.float.*; give all tensors as float32 or all as float64"):
+        save(tmp_path / "m", g, units="file")
+    assert not list(tmp_path.iterdir())

@@ -17,6 +17,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.scene import Camera, Gaussians, Mesh, Normalization
 
 UNITS = ("scene", "file")
+SH_COUNTS = (1, 4, 9, 16, 25)
+"""Numbers of spherical-harmonics coefficients that Gaussians may have."""
 
 
 def check_units(units: str) -> None:
@@ -56,14 +58,25 @@ def checked_normalization(normalization: Normalization | None, units: str, where
 
 
 def check_stored(gaussians: object) -> None:
-    """Check that Gaussians are given by log scales and logits, as files hold them.
+    """Check that Gaussians are given by log scales and logits, as files hold them, in tensors whose shapes agree.
 
     Raises:
-        TypeError: They are of another kind.
+        TypeError: They are of another kind, or one is no tensor.
+        ValueError: A shape disagrees.
     """
     if not isinstance(gaussians, Gaussians):
         how = "give gaussians.stored()" if hasattr(gaussians, "stored") else "files hold quats, log scales and logits"
         raise TypeError(f"gaussians must be of Gaussians, not {type(gaussians).__name__}; {how}")
+    for name, tensor in gaussians.tensors().items():
+        if not hasattr(tensor, "detach"):
+            raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
+    count = gaussians.means.shape[0] if gaussians.means.ndim else 0
+    for name, rest in {"means": [3], "quats": [4], "log_scales": [3], "logit_opacities": []}.items():
+        if (found := list(getattr(gaussians, name).shape)) != [count, *rest]:
+            raise ValueError(f"{name} must have shape [{', '.join(map(str, ['N', *rest]))}] (N={count}), not {found}")
+    found = list(gaussians.sh.shape)
+    if len(found) != 3 or found[1] not in SH_COUNTS or found != [count, found[1], 3]:
+        raise ValueError(f"sh must have shape [N, K, 3] (N={count}), where K is 1, 4, 9, 16 or 25, not {found}")
 
 
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
@@ -81,6 +94,7 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     Raises:
         TypeError: The Gaussians are given by other parameters.
         UsageError: A name of units is unknown.
+        ValueError: A shape disagrees.
     """
     check_stored(gaussians)
     check_units(source)

@@ -363,9 +363,9 @@ def test_changed_data_are_noticed(scene, run, tmp_path, capsys):
 
 
 def test_demo_command_tells_the_next_step(tmp_path, capsys):
-    """The printed command is short, and is one that reads."""
-    assert main(["demo", str(tmp_path / "d"), "--views", "8", "--width", "48", "--height", "36"]) == 0
-    assert "--split every:8 --out run" in capsys.readouterr().out
+    """The printed command is short, and is one that reads; a shell takes it as it is."""
+    assert main(["demo", str(tmp_path / "a d"), "--views", "8", "--width", "48", "--height", "36"]) == 0
+    assert f"next: warpgs fit '{tmp_path / 'a d'}' --split every:8 --out run" in capsys.readouterr().out
     size = ["--views", "9", "--width", "32", "--height", "32"]
     assert main(["demo", str(tmp_path / "o"), "--object", "--format", "colmap", *size]) == 0
     assert "--split llff:8 --masks cutout --out" in capsys.readouterr().out

@@ -78,27 +78,28 @@ def run(tmp_path_factory):
 def test_prune_keeps_its_promise(run, tmp_path, capsys):
     """Smaller by more than a little, no more than the allowed loss, the old run untouched, the new one whole and usable."""
     before = {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
-    assert main(["prune", str(run), "--keep-psnr", "0.2", "--out", str(tmp_path / "small"), "--device", "cpu"]) == 0
+    assert main(["prune", str(run), "--keep-psnr", "0.2", "--out", str(tmp_path / "a small one"), "--device", "cpu"]) == 0
     words = capsys.readouterr().out
     assert "Gaussians, mean SH degree" in words and "times smaller" in words and "held-out PSNR" in words
+    assert f"`warpgs eval '{tmp_path}/a small one'` scores it" in words and f"`warpgs render '{tmp_path}/a small one'`" in words
     assert "trying smaller models: number 1" in words and "scoring the smaller model" in words
     assert before == {p: p.read_bytes() for p in run.rglob("*") if p.is_file()}
-    record = json.loads((tmp_path / "small" / "config.json").read_text())["pruned"]
-    whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "small"))
+    record = json.loads((tmp_path / "a small one" / "config.json").read_text())["pruned"]
+    whole, small = (open_run(f, CPU).gaussians() for f in (run, tmp_path / "a small one"))
     assert record["count"] == [len(whole), len(small)] and record["bytes"][1] < 0.6 * record["bytes"][0]
     assert record["train_psnr"][1] >= record["train_psnr"][0] - 0.2
     assert json.loads((run / "metrics.json").read_text())["train"]["psnr"] == pytest.approx(record["train_psnr"][0])
 
     degrees = stored_degrees(small.sh)
     assert bool((degrees.diff() >= 0).all()), "not sorted by degree"
-    tensors, _ = load_checkpoint(tmp_path / "small")
+    tensors, _ = load_checkpoint(tmp_path / "a small one")
     stored = sum(t.numel() * t.element_size() for n, t in tensors.items() if n.startswith("params."))
     assert stored == record["bytes"][1]
-    ply = read_ply(tmp_path / "small" / "point_cloud.ply")
+    ply = read_ply(tmp_path / "a small one" / "point_cloud.ply")
     assert len(ply) == len(small) and torch.equal(ply.sh, small.sh)
 
-    assert main(["eval", str(tmp_path / "small"), "--device", "cpu"]) == 0
-    scores = json.loads((tmp_path / "small" / "eval.json").read_text())
+    assert main(["eval", str(tmp_path / "a small one"), "--device", "cpu"]) == 0
+    scores = json.loads((tmp_path / "a small one" / "eval.json").read_text())
     assert scores["train"]["psnr"] == pytest.approx(record["train_psnr"][1], abs=1e-9)
     assert scores["test"]["psnr"] == pytest.approx(record["test_psnr"][1], abs=1e-9)
 

@@ -70,10 +70,12 @@ def test_nothing_personal_is_written(found, photographs):
 
 def test_the_command_gives_the_same_bits_on_another_number_of_threads(found, photographs, tmp_path, capsys):
     """It prints the report that poses.txt holds."""
-    assert main(["poses", str(photographs), "--out", str(tmp_path / "again"), "--threads", "1"]) == 0
-    assert (tmp_path / "again" / "poses.txt").read_text("utf-8") in capsys.readouterr().out
+    assert main(["poses", str(photographs), "--out", str(tmp_path / "a 2nd"), "--threads", "1"]) == 0
+    printed = capsys.readouterr().out
+    assert (tmp_path / "a 2nd" / "poses.txt").read_text("utf-8") in printed
+    assert f"next: warpgs fit '{tmp_path / 'a 2nd'}' --out run" in printed
     for path in (p for p in found[0].rglob("*") if p.is_file()):
-        assert path.read_bytes() == (tmp_path / "again" / path.relative_to(found[0])).read_bytes(), path
+        assert path.read_bytes() == (tmp_path / "a 2nd" / path.relative_to(found[0])).read_bytes(), path
 
 
 def noise(path, seed, smooth=0):

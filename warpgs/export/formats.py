@@ -96,7 +96,7 @@ def write_gaussians(
     Raises:
         warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store.
         warpgs.errors.ResourceError: The file cannot be written. warpgs.errors.UsageError: The suffix, the format or the units
-        are unknown, or scene units come without a normalization.
+        are unknown, or scene units come without a normalization. ValueError: A shape disagrees.
     """
     chosen = copy.copy(format_of(path, format))
     chosen.antialiased = antialiased

@@ -63,7 +63,7 @@ def write_ply(
         warpgs.errors.DataError: A tensor is not finite, before or after the change of coordinates; or the normalization is not
             a similarity. Nothing is written. warpgs.errors.ResourceError: The file cannot be written. TypeError: The Gaussians
             have other parameters; ``stored()`` of `ActivatedGaussians` converts them. warpgs.errors.UsageError: The units are
-            unknown, or scene units are given without a normalization.
+            unknown, or scene units are given without a normalization. ValueError: A shape disagrees.
     """
     path = Path(path)
     normalization = checked_normalization(normalization, units, f"{path}: not written")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import io
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -158,5 +159,5 @@ def export_matcher(out: Path) -> list[str]:
     return [
         f"{out}: xfeat, images of 96 to {32 * LARGEST} px, {out.stat().st_size / 2**20:.1f} MiB; onnxruntime finds {same:.1%} "
         "of torch's keypoints",
-        f"next: warpgs poses PHOTOGRAPHS --matcher {out} --out scene",
+        f"next: warpgs poses PHOTOGRAPHS --matcher {shlex.quote(str(out))} --out scene",
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import shlex
 import threading
 import time
 from collections.abc import Iterator
@@ -173,7 +174,7 @@ def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
     """
     server = open_server(port)
     try:
-        say(f"watch the fit at {address(server)} (afterwards with `warpgs view {folder}`)")
+        say(f"watch the fit at {address(server)} (afterwards with `warpgs view {shlex.quote(str(folder))}`)")
         live = LiveView(server, folder.resolve().name, folder)
         try:
             yield live

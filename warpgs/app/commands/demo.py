@@ -1,5 +1,6 @@
 """`warpgs demo`: write a synthetic scene. Parses, calls, prints; no logic."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -56,5 +57,5 @@ def run(arguments: list[str], about: str) -> int:
         flags = "--split every:8"
     form = "transforms.json" if a.object and a.format == "transforms" else "COLMAP"
     say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a {form} folder")
-    say(f"next: warpgs fit {a.folder} {flags} --out run")
+    say(f"next: warpgs fit {shlex.quote(str(a.folder))} {flags} --out run")
     return 0

@@ -1,5 +1,6 @@
 """`warpgs poses`: find the poses of photographs or of a video. Parses, calls, prints; no logic."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,5 +47,5 @@ def run(arguments: list[str], about: str) -> int:
     for line in report_lines(record):
         say(line)
     say(f"{a.out}: a COLMAP scene; the lines above are also in {a.out / TEXT}")
-    say(f"next: warpgs fit {a.out} --out run")
+    say(f"next: warpgs fit {shlex.quote(str(a.out))} --out run")
     return 0

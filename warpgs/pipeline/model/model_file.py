@@ -21,8 +21,6 @@ from warpgs.scene import Camera, Gaussians, Normalization
 from warpgs.version import __version__
 
 FORMAT = "warpgs-model-1"
-SH_COUNTS = (1, 4, 9, 16, 25)
-"""Numbers of coefficients that a set of Gaussians may have."""
 
 
 @dataclass(frozen=True)
@@ -88,12 +86,15 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     Raises:
         DataError: A number is not finite, or the normalization is not a similarity.
         ResourceError: The file cannot be written.
-        TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
+        TypeError: The Gaussians have other parameters (``stored()`` of `ActivatedGaussians` converts them), or tensors differ
+            in type.
         UsageError: The units are unknown, or scene units are given without a normalization.
+        ValueError: A shape disagrees.
     """
     from safetensors.torch import save as to_bytes
 
     check_stored(gaussians)
+    _check_type(gaussians)
     normalization = checked_normalization(normalization, units, f"{path}: not written")
     tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     for name, t in tensors.items():
@@ -158,17 +159,20 @@ def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussi
     missing = [n for n in names if n not in tensors]
     if missing:
         raise DataError(f"{where}: lacks {', '.join(missing)}; restore it, or write it again")
-    count, kind, sh = len(tensors["means"].reshape(-1)) // 3, tensors["means"].dtype, tensors["sh"].shape
-    coefficients = sh[1] if len(sh) == 3 and sh[1] in SH_COUNTS else "K"
-    shapes = {"means": (count, 3), "quats": (count, 4), "log_scales": (count, 3), "logit_opacities": (count,)}
-    for name, shape in {**shapes, "sh": (count, coefficients, 3)}.items():
-        t = tensors[name]
-        if tuple(t.shape) != shape or t.dtype != kind or kind not in (torch.float32, torch.float64):
-            raise DataError(
-                f"{where}: {name} has shape {list(t.shape)} and type {t.dtype}, where {count} Gaussians have "
-                f"{str(list(shape)).replace(chr(39), '')} and one type of float32 and float64, with K of 1, 4, 9, 16 or 25; "
-                "restore it, or write it again"
-            )
+    gaussians = Gaussians(**{n: tensors[n] for n in names})
+    try:
+        check_stored(gaussians)
+        _check_type(gaussians)
+    except (TypeError, ValueError) as e:
+        raise DataError(f"{where}: {e}; restore it, or write it again") from e
+    for name, t in gaussians.tensors().items():
         if not bool(torch.isfinite(t).all()):
             raise DataError(f"{where}: {name} holds numbers that are not finite; restore it, or write it again")
-    return Gaussians(**{n: tensors[n] for n in names})
+    return gaussians
+
+
+def _check_type(gaussians: Gaussians) -> None:
+    """Raise TypeError where tensors are not all float32 or all float64."""
+    for name, t in gaussians.tensors().items():
+        if t.dtype not in (torch.float32, torch.float64) or t.dtype != gaussians.means.dtype:
+            raise TypeError(f"{name} is {t.dtype}; give all tensors as float32 or all as float64")

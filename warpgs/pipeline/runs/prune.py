@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 import os
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -124,7 +125,8 @@ def prune(
     ]
     if test:
         lines.append(f"held-out PSNR {scores[1][0]:.2f} -> {scores[1][1]:.2f} dB over {len(test)} views")
-    return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {out}` scores it, `warpgs render {out}` renders it"]
+    run = shlex.quote(str(out))
+    return [*lines, f"in {out}: checkpoint, PLY; `warpgs eval {run}` scores it, `warpgs render {run}` renders it"]
 
 
 def _pruned(
