@@ -126,7 +126,7 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
             )
         stored.scene_cameras.update(kept)
         assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
-        assert ("may lie on its side" in capsys.readouterr().out) == upside_down
+        assert ("may be rotated in a viewer" in capsys.readouterr().out) == upside_down
 
 
 @pytest.mark.parametrize(

@@ -99,7 +99,7 @@ def test_a_fit_from_coincident_points(device):
 def test_an_empty_cloud_is_an_error_or_a_random_start():
     """Zero rows: an error that names the way out, or by itself a random start that says why."""
     views = photos(3)
-    with pytest.raises(DataError, match=r"no 3D points .* --init.source random"):
+    with pytest.raises(DataError, match=r"needs 3D points .* --init.source random"):
         initial_points(views, gray([]), POINTS, np.random.default_rng(0))
     start = initial_points(views, gray([]), InitConfig(random_count=50), np.random.default_rng(0))
     assert len(start.cloud) == 50 and "only 0 points" in start.how

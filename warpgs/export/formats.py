@@ -95,8 +95,10 @@ def write_gaussians(
 
     Raises:
         warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store.
-        warpgs.errors.ResourceError: The file cannot be written. warpgs.errors.UsageError: The suffix, the format or the units
-        are unknown, or scene units come without a normalization. ValueError: A shape disagrees.
+        warpgs.errors.ResourceError: The file cannot be written.
+        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+            normalization.
+        ValueError: A tensor has the wrong shape.
     """
     chosen = copy.copy(format_of(path, format))
     chosen.antialiased = antialiased
@@ -125,8 +127,9 @@ def read_gaussians(
 
     Raises:
         warpgs.errors.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
-            a NaN, an infinity or a rotation of zero length. warpgs.errors.UsageError: The suffix, the format or the units are
-            unknown, or scene units come without a normalization.
+            a NaN, an infinity or a rotation of zero length.
+        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+            normalization.
     """
     gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)
     if antialiased:

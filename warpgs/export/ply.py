@@ -61,9 +61,11 @@ def write_ply(
 
     Raises:
         warpgs.errors.DataError: A tensor is not finite, before or after the change of coordinates; or the normalization is not
-            a similarity. Nothing is written. warpgs.errors.ResourceError: The file cannot be written. TypeError: The Gaussians
-            have other parameters; ``stored()`` of `ActivatedGaussians` converts them. warpgs.errors.UsageError: The units are
-            unknown, or scene units are given without a normalization. ValueError: A shape disagrees.
+            a similarity. Nothing is written.
+        warpgs.errors.ResourceError: The file cannot be written.
+        TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
+        warpgs.errors.UsageError: The units are unknown, or scene units are given without a normalization.
+        ValueError: A tensor has the wrong shape.
     """
     path = Path(path)
     normalization = checked_normalization(normalization, units, f"{path}: not written")
@@ -99,8 +101,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
 
     Raises:
         warpgs.errors.DataError: The file is missing, malformed, truncated, or contains a NaN, another infinity or a rotation of
-            zero length; the message names the place. warpgs.errors.UsageError: The units are unknown, or scene units are
-            requested without a normalization.
+            zero length; the message names the place.
+        warpgs.errors.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
     path = Path(path)
     gaussians = _read(path, normalization, units)
