@@ -71,8 +71,8 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
             total = record()
             for k in range(wp.static(values)):
                 total[k] = totals[lane * count + k]
-            for slot in range(starts[i] + 1, starts[i] + counts[i]):
-                v = v_slots[slot]
+            for later in range(1, counts[i]):  # without slots a start may be any number
+                v = v_slots[starts[i] + later]
                 for k in range(wp.static(values)):
                     total[k] += v[k]
             v_projected[i] = total
