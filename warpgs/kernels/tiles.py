@@ -15,6 +15,7 @@ from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, 
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
+from warpgs.runtime.sorting import sort_pairs
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
 
 LIST_BYTES = 20
@@ -177,7 +178,7 @@ def _depth_order(
         sums_view, bits = interop.view(packed, wp.int64), sum_bits(count)
         inputs = [projected_view, counts_view, sums_view, bits, visible, depths_view, order_view]
         interop.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
-    interop.sort_pairs(depths_view, order_view, visible)
+    sort_pairs(depths_view, order_view, visible)
     return order, visible, total
 
 
@@ -198,7 +199,7 @@ def _sort_by_tile(
     """
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
     keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
-    interop.sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
+    sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
     inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
     native = keys.is_cuda
     interop.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)

@@ -184,21 +184,6 @@ _SORTING = threading.RLock()
 """Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
 
 
-@functools.lru_cache(maxsize=64)
-def _array_at(address: int, size: int, dtype: object, device: torch.device) -> wp.array:
-    """Return memory at an address as a Warp array, which does not own it: whoever reads it holds the tensor."""
-    return wp.array(ptr=address, shape=size, dtype=dtype, device=warp_device(device))
-
-
-def sort_pairs(keys: View, values: View, count: int, **bits: int) -> None:
-    """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace.
-
-    On a GPU it runs on the stream of `stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
-    """
-    arrays = (_array_at(t.data_ptr(), t.numel(), dtype, t.device) for t, dtype, _ in (keys, values))
-    wp.utils.radix_sort_pairs(*arrays, count, **bits)
-
-
 @contextlib.contextmanager
 def stream_of(device: torch.device):
     """Run Warp's own work (sorts, scans) on torch's current stream of that device; does nothing on a CPU.
