@@ -114,6 +114,12 @@ def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.Vie
     ]
 
 
+def _span(image: torch.Tensor, real) -> tuple[interop.View, int]:
+    """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the distance of its pixels there."""
+    found = interop.span(image, real)
+    return found, found.row_stride()
+
+
 def composite(
     projected: torch.Tensor,
     tiles: Tiles,
@@ -152,7 +158,7 @@ def composite(
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, wp.types.vector(9 + channels, real)),
-        interop.view(backgrounds, real), interop.span(rgb, real), rgb.stride(-2),
+        interop.view(backgrounds, real), *_span(rgb, real),
         *(interop.flat(t, real) for t in (alpha, depth, transmittances, weights)),
         interop.flat(ends, wp.int32),
     ]  # fmt: skip
@@ -169,7 +175,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     v_projected = allocator.output(projected.shape, projected.dtype, device)
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     deep = v_alpha is not None or v_depth is not None
-    upstream = [interop.span(v_rgb, real), v_rgb.stride(-2)]
+    upstream: list = [*_span(v_rgb, real)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
         upstream.append(interop.flat(v, real))

@@ -134,7 +134,7 @@ def rows(tensor: torch.Tensor, dtype) -> View:
 def span(tensor: torch.Tensor, dtype) -> View:
     """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with what lies between them.
 
-    Rows are contiguous, and ``tensor.stride(-2)`` leads from each to the next.
+    Rows are contiguous, and `View.row_stride` leads from each to the next.
     """
     return View(tensor, dtype, 0)
 
