@@ -73,7 +73,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         own = [
             project_cpu.make_forward(real, *variant), project_cpu_backward.make_backward(real, *variant, False),
             blending.forward, blending.backward, without_depth.backward, blending.contributions,
-            blend.make_segments(real).sum_gradients,
+            blend.make_segments(real).sum_gradients, step_buffers.make_errors(),
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
