@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpgs.kernels.blend_batch import TOGETHER
 from warpgs.kernels.falloff import ABREAST, STRIP
 
 COLORS = 3
@@ -32,6 +33,10 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     strip_reals = wp.types.vector(STRIP, real)
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
+
+    count = VALUES + channels - COLORS + 2 * absgrad
+    half_reals = wp.types.vector(TOGETHER * count * (STRIP // 2), real)
+    total_reals = wp.types.vector(TOGETHER * count, real)
 
     @wp.struct
     class Pixels:
@@ -69,4 +74,11 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         color: strip_channels
         z: strip_reals
 
-    return SimpleNamespace(Pixels=Pixels, Shades=Shades, Gradient=Gradient)
+    @wp.struct
+    class Held:
+        """Sums of several instances' gradients, one instance after the other."""
+
+        halves: half_reals  # by place in half a strip
+        totals: total_reals
+
+    return SimpleNamespace(Held=Held, Pixels=Pixels, Shades=Shades, Gradient=Gradient)
