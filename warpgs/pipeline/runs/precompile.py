@@ -35,6 +35,7 @@ from warpgs.kernels import (
     tiles_emit_cpu,
     tiles_order,
 )
+from warpgs.kernels.blend_records import COLORS, VALUES
 from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
 from warpgs.runtime import allocator, interop
@@ -73,7 +74,8 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         own = [
             project_cpu.make_forward(real, *variant), project_cpu_backward.make_backward(real, *variant, False),
             blending.forward, blending.backward, without_depth.backward, blending.contributions,
-            blend.make_segments(real).sum_gradients, step_buffers.make_errors(),
+            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
+            step_buffers.make_errors(),
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
