@@ -12,8 +12,8 @@ from warpgs.kernels import project_cpu, project_cpu_backward, project_cuda, sh
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.functions import make_types
 from warpgs.kernels.native import BLOCK
-from warpgs.kernels.project_cpu import LANES
 from warpgs.kernels.project_inputs import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors
+from warpgs.kernels.project_lanes import LANES
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.derivatives import first_order

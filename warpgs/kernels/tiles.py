@@ -9,7 +9,7 @@ import warp as wp
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.errors import ResourceError
 from warpgs.kernels import tiles_emit_cpu
-from warpgs.kernels.project_cpu import LANES
+from warpgs.kernels.project_lanes import LANES
 from warpgs.kernels.tiles_emit import EACH, make_emit, make_find_ranges
 from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries, sums_fit
 from warpgs.runtime import interop

@@ -79,15 +79,7 @@ def prepare(
     @functools.cache
     def start() -> Start:
         progress("finding start points")
-        # what is searched for along lines is searched for in pinholes; given points need no search
-        views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
-        found = initial_points(views, points, config.init, generator, usable, progress)
-        if found.depths is None and any_given(views):  # a start that searches for none
-            depths, lines = with_given_depth(views, None, seen_points(views, points))
-            found = found._replace(depths=depths, how="\n".join((found.how, *lines)))
-        if found.depths is not None:
-            found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
-        return subsample(found, config.max_gaussians, generator)
+        return _start_of(train, points, config, generator, usable, progress)
 
     notes = []
     if priors is None and needs_priors(config):
@@ -108,6 +100,22 @@ def prepare(
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
     return Preparation(train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
+
+
+def _start_of(
+    train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator,
+    usable: Callable[[], torch.device], progress: Callable[[str], object],
+) -> Start:  # fmt: skip
+    """Return the first points and the depths that come with them; arguments are those of `prepare` and `initial_points`."""
+    # what is searched for along lines is searched for in pinholes; given points need no search
+    views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
+    found = initial_points(views, points, config.init, generator, usable, progress)
+    if found.depths is None and any_given(views):  # a start that searches for none
+        depths, lines = with_given_depth(views, None, seen_points(views, points))
+        found = found._replace(depths=depths, how="\n".join((found.how, *lines)))
+    if found.depths is not None:
+        found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
+    return subsample(found, config.max_gaussians, generator)
 
 
 def _unused_networks(config: FitConfig) -> list[str]:

@@ -250,6 +250,25 @@ def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView
     return DensityUpdate(ids, {n: t[:0] for n, t in gaussians.tensors().items()}, ids[:0])
 
 
+def _sampled(
+    gaussians: Gaussians, views: list[TrainingView], config: MethodConfig, options: RasterizeOptions, generator: torch.Generator
+) -> tuple[dict[str, torch.Tensor], tuple[SampledView, ...]]:
+    """Return the Gaussians that are sampled in the views, by name of the tensor, and the maps that led to them."""
+    numbers = list(range(len(views)))
+    if len(views) > MAX_VIEWS:
+        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
+    before = [render_before(gaussians, views[i], config, options) for i in numbers]
+    residuals: list[Residual] = []
+    if config.importance.residual == "gain" and config.weights()[0] > 0:
+        footprint = config.sampler.footprint
+        residuals = [residual_of(views[i], b.rgb, b.surface, footprint) for i, b in zip(numbers, before, strict=True)]
+    coefficients = gaussians.sh.shape[1]
+    sampled, rows = zip(
+        *(sample_view(views[i], i, b, residuals, config, coefficients, generator) for i, b in zip(numbers, before, strict=True))
+    )
+    return {name: torch.cat([r[name] for r in rows]) for name in rows[0]}, sampled
+
+
 @torch.no_grad()
 def sampling_event(
     gaussians: Gaussians,
@@ -282,21 +301,8 @@ def sampling_event(
     Returns:
         The change, and the maps that led to it.
     """
-    numbers = list(range(len(views)))
-    if len(views) > MAX_VIEWS:
-        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
-    before = [render_before(gaussians, views[i], config, options) for i in numbers]
-    residuals: list[Residual] = []
-    if config.importance.residual == "gain" and config.weights()[0] > 0:
-        footprint = config.sampler.footprint
-        residuals = [residual_of(views[i], b.rgb, b.surface, footprint) for i, b in zip(numbers, before, strict=True)]
-    coefficients = gaussians.sh.shape[1]
-    sampled, rows = zip(
-        *(sample_view(views[i], i, b, residuals, config, coefficients, generator) for i, b in zip(numbers, before, strict=True))
-    )
-    added = {name: torch.cat([r[name] for r in rows]) for name in rows[0]}
+    added, sampled = _sampled(gaussians, views, config, options, generator)
     count = len(added["means"])
-
     coarse_count, fine_count = int((~fine).sum()), int(fine.sum())
     over = max(fine_count + count - int(config.sampler.max_fraction * coarse_count), count - capacity)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)
