@@ -95,7 +95,7 @@ _PANELS: list[Progress] = []
 
 
 class Stages:
-    """Lines on what is being done, such as ``finding depth: view 7 of 24``.
+    """Lines about the current work, such as ``finding depth: view 7 of 24``.
 
     What stands before the last colon names a stage; where numbers follow, ``7 of 24``, there is a bar. In a terminal one line
     is written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`.

@@ -14,7 +14,7 @@ def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | Non
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     rgb = rgb.clamp(0, 1)
     if mask is None:
