@@ -27,7 +27,7 @@ def hidden_stderr() -> Iterator[None]:
 
 @contextlib.contextmanager
 def output_to(descriptor: int) -> Iterator[None]:
-    """Redirect stdout and stderr in the block to an open file, also for native libraries and other threads."""
+    """Send stdout and stderr in the block to an open file, also for native libraries and other threads."""
     open_missing_descriptors()
     _flush(1, 2)
     saved = [os.dup(number) for number in (1, 2)]
