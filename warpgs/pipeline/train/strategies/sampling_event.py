@@ -227,7 +227,7 @@ def least_contributing(
 ) -> torch.Tensor:
     """Return the rows of the ``count`` candidates (bool [N]) with the least sums of blending weights, int64 [count].
 
-    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size: they only have to rank.
+    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size, because they only rank the Gaussians.
     """
     total = torch.zeros(len(gaussians), device=gaussians.means.device)
     for view in views[:: -(-len(views) // MAX_WEIGHED)]:
