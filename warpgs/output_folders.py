@@ -26,11 +26,11 @@ FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 
 SEARCHED = getattr(os, "O_PATH", 0) | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 """Flags that open a folder which may be written and entered, but not listed."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
-"""Errors of file systems that cannot sync a folder; what they keep after a power failure is theirs to say."""
+"""Errors of file systems that cannot sync a folder."""
 
 
 class RefusedError(OSError):
-    """A place that is not used: a link, no regular file, or a folder that was replaced; the text says how to fix it."""
+    """A path that is rejected: a link, not a regular file, or a folder that was replaced; the message contains the fix."""
 
     def __init__(self, message: str):
         """Take the whole message."""
@@ -186,8 +186,8 @@ _LOCK = threading.RLock()
 def output_folder(folder: Path) -> Iterator[None]:
     """Have all that is written below a folder, in this block, go through its descriptor and follow no link.
 
-    The folder itself may be reached through links, unless it lies below another one that is open. Where another folder takes
-    its place meanwhile, the next write is rejected.
+    The folder itself may be reached through links, unless it is below another open one. Where another folder takes its place
+    meanwhile, the next write is rejected.
 
     Raises:
         OSError: It is missing, or is behind a link below an open folder.

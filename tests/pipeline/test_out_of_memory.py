@@ -72,7 +72,7 @@ def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
     failing(monkeypatch, take_steps, "step", {3, 30})
     assert finished(fit, []) == list(range(1, 61))
     assert same(fit, reference)
-    assert len(fit.messages) == 2 and "none was left for step 3" in fit.messages[0]
+    assert len(fit.messages) == 2 and "step 3 ran out of memory" in fit.messages[0]
 
 
 def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):

@@ -56,7 +56,7 @@ def settings_of(kind: type[Settings], flags: Any) -> Settings:
 
 
 def either(flags: Any, name: str) -> bool | None:
-    """Return True for a flag, False for the same with no- before it, None where neither is given.
+    """Return True for a flag, False for its no- form, None if neither is given.
 
     Args:
         flags: Parsed flags with booleans ``name`` and ``no_name``.

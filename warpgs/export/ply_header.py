@@ -1,4 +1,4 @@
-"""Headers of binary PLY files: elements, their properties, and comments that say how Gaussians were trained."""
+"""Headers of binary PLY files: elements, their properties, and comments on the training of Gaussians."""
 
 from __future__ import annotations
 

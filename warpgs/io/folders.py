@@ -23,7 +23,7 @@ MAX_NAME_LENGTH = 4096
 
 
 def has_folder(root: Path, *patterns: str) -> bool:
-    """Return True where a folder of one of the names or glob patterns lies in ``root``."""
+    """Return whether ``root`` contains a folder of one of the names or glob patterns."""
     return any(p.is_dir() for pattern in patterns for p in root.glob(pattern))
 
 

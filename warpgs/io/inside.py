@@ -1,4 +1,4 @@
-"""Files that lie below a folder, with links followed."""
+"""Files below a folder, with links followed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from warpgs.errors import DataError
 
 
 def inside(path: Path, root: Path, noun: str) -> Path:
-    """Return a path after a check that no link on it leads out of ``root``, which messages call ``noun``.
+    """Return a path after a check that no link in it points outside ``root``; ``noun`` is its name in messages.
 
     Raises:
         DataError: One does.

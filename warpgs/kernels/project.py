@@ -201,7 +201,7 @@ def project(
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera model is unknown.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+        ValueError: A shape or device disagrees; the message names argument, expected and found.
     """
     if distortion is None:
         distortion = viewmats.new_empty(len(viewmats), 0)
@@ -224,7 +224,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+        ValueError: A shape or device disagrees; the message names argument, expected and found.
     """
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")

@@ -364,14 +364,14 @@ def _symbols(pattern: str) -> tuple[str | int, ...]:
 def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
 
-    A capital letter stands for a size that must agree wherever it occurs.
+    A capital letter is a size that must agree wherever it occurs.
 
     Returns:
         The sizes by letter.
 
     Raises:
         TypeError: An argument is no tensor, or its scalar type is neither float32 nor float64, or types differ.
-        ValueError: A shape or a device disagrees; the message names the argument, what was wanted and what was found.
+        ValueError: A shape or a device disagrees; the message names the argument, expected and found.
     """
     sizes: dict[str, int] = {}
     first_name, first = "", None

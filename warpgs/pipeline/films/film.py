@@ -97,7 +97,7 @@ def _frames(
         settings: Settings of the film.
         coverage: As in `render_path`; the images lie in a subfolder beside ``files``.
         check: Looks at the frames.
-        tell: Takes a line on each frame before it is rendered.
+        tell: Called with a line for each frame before it is rendered.
     """
     gaussians, options = model.gaussians(), model.options()
     if settings.background is not None:

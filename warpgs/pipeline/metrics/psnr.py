@@ -16,7 +16,7 @@ def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | Non
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     if mask is None:
         return squared_error(rgb, target) / rgb.numel()

@@ -120,7 +120,7 @@ def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
 
 
 def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Return which Gaussians only disturb, each for the first reason that holds, bool [N] by reason.
+    """Return the floaters and needles, each under the first reason that applies, bool [N] by reason.
 
     Args:
         gaussians: N Gaussians.

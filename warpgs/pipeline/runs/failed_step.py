@@ -74,7 +74,7 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
     """Read what `save_failed_step` wrote, tensors of shape [...] on a device.
 
     Raises:
-        DataError: The file is missing or is another.
+        DataError: The file is missing or not a failed step.
     """
     from safetensors import SafetensorError, safe_open
 

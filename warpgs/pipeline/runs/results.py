@@ -145,7 +145,7 @@ def evaluate_run(
         options: Options of the rasterizer.
         lpips: Network for LPIPS, or None.
         names: Names of image files by view, from `image_names` of the whole scene; None for those of these views.
-        tell: Takes a line on each view before it is rendered.
+        tell: Called with a line for each view before it is rendered.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
@@ -263,7 +263,7 @@ def write_report(
         record: Contents of config.json.
         sampling: The part on sampling events, or None.
         overview: Result of the function of `overview_of`.
-        tell: Takes a line on each view before it is rendered.
+        tell: Called with a line for each view before it is rendered.
     """
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     image, why = overview

@@ -15,7 +15,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views at most: where views know their opacity, and where all are opaque."""
+"""Steps of a fit of up to `FEW` views at most: where views have an alpha channel, and where all are opaque."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Views from which steps grow beyond `MIN_STEPS`; the power of their number with which they do; and their bound."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6

@@ -209,7 +209,7 @@ class Stopping:
         return 3 * step < self.marks[-1] or step <= self.earliest
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return the errors of the blocks at every measurement, shape [M, B], and plain values, to go on from."""
+        """Return the errors of the blocks at every measurement, shape [M, B], and plain values, for resuming."""
         tensors = {"stopping.measured": torch.stack([e for _, e in self.measured])} if self.measured else {}
         return tensors, {
             "ended": self.ended, "why": self.why, "measured": [s for s, _ in self.measured],

@@ -54,7 +54,7 @@ class ProtectConfig:
 
     @property
     def logit(self) -> float:
-        """Least opacity as a logit, as it is stored."""
+        """Smallest opacity, as a stored logit."""
         return geometry.logit(self.opacity)
 
 
@@ -165,7 +165,7 @@ class Event:
 
 
 class Rendered(NamedTuple):
-    """A view as it is before an event, and where it can be sampled."""
+    """A render of a view before an event, and the pixels that can be sampled."""
 
     rgb: torch.Tensor
     """Colours as the view shows them, shape [H, W, 3]."""
@@ -227,7 +227,7 @@ def least_contributing(
 ) -> torch.Tensor:
     """Return the rows of the ``count`` candidates (bool [N]) with the least sums of blending weights, int64 [count].
 
-    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size: they only have to rank.
+    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size, because they only rank the Gaussians.
     """
     total = torch.zeros(len(gaussians), device=gaussians.means.device)
     for view in views[:: -(-len(views) // MAX_WEIGHED)]:
