@@ -3,9 +3,10 @@
 import io
 
 import numpy as np
+import pytest
 from PIL import Image
 
-from bench.lib.coverage_fits import measure, picture, renders_of, worst_parts
+from bench.lib.coverage_fits import measure, picture, renders_of, unseen_in_both, worst_parts
 from bench.lib.one_fit import plan
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -26,6 +27,20 @@ def test_the_worst_part_is_unseen_in_both_and_wrong_in_one():
     after["unseen"][:] = False
     after["unseen"][0, :5, :5] = before["unseen"][0, :5, :5] = True
     assert worst_parts(before, after, 2)[0] == [0, 0, 0, 16, 10]
+
+
+def test_two_fits_are_compared_where_both_are_unseen(tmp_path):
+    """A square of 160 levels of error before, none after; what one fit alone does not see is left out."""
+    files, both = (tmp_path / "a.npz", tmp_path / "b.npz"), [views((1, 12, 20), (1, 12, 20)), views((0, 0, 0), (1, 12, 20))]
+    both[1]["render"], both[0]["unseen"][0] = both[1]["photo"] + np.uint8(16), True
+    for file, values in zip(files, both):
+        np.savez(file, **values)
+    found = unseen_in_both(*files)
+    assert found["share_of_pixels"] == 160 / (2 * 30 * 48)
+    assert [found[k] for k in ("before", "after")] == pytest.approx([20 * np.log10(255 / e) for e in (160, 16)])
+    both[1]["unseen"][:] = False
+    np.savez(files[1], **both[1])
+    assert unseen_in_both(*files) == {"share_of_pixels": 0, "before": None, "after": None}
 
 
 def test_a_fit_leaves_its_views_and_the_picture_shows_them(tmp_path):

@@ -141,7 +141,7 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u] as `project_points` has them.
+    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u], as in `project_points`.
 
     A pixel that a lens does not reach gives NaN.
 

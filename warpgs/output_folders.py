@@ -62,7 +62,7 @@ class Folder:
         return name if self.descriptor is not None else str(self.path / name)
 
     def lstat(self, name: str) -> os.stat_result:
-        """Return what the system knows of an entry, which may be a link."""
+        """Return the status of an entry, which may be a link."""
         return os.stat(self._name(name), dir_fd=self.descriptor, follow_symlinks=False)
 
     def is_link(self, name: str) -> bool:
@@ -190,7 +190,7 @@ def output_folder(folder: Path) -> Iterator[None]:
     its place meanwhile, the next write is rejected.
 
     Raises:
-        OSError: It is missing, or lies behind a link below a folder that is open.
+        OSError: It is missing, or is behind a link below an open folder.
     """
     path = folder.absolute()
     with _LOCK:
@@ -210,7 +210,7 @@ def output_folder(folder: Path) -> Iterator[None]:
 
 
 def is_below(path: Path) -> bool:
-    """Return whether a path lies below a folder that is open, so that no link to it is followed."""
+    """Return whether a path is below an open folder, so that no link to it is followed."""
     return _outermost(path.absolute().parent) is not None
 
 
@@ -219,10 +219,10 @@ def open_folder(path: Path, make: bool = False) -> Folder:
 
     Args:
         path: The folder.
-        make: Whether to make folders on the way that are missing; below an open folder alone.
+        make: True to create missing parent folders, only below an open folder.
 
     Raises:
-        OSError: It cannot be opened, or a link lies on the way.
+        OSError: It cannot be opened, or a parent folder is a link.
     """
     path = path.absolute()
     with _LOCK:

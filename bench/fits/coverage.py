@@ -1,5 +1,7 @@
 """Held-out errors by the number of training views that saw a pixel, under two settings and over seeds, with a picture.
 
+The classes follow the depth of each fit, so those of two fits are other pixels. Pixels that are unseen in both fits of a seed,
+the first and the second of --presets, are compared, too.
 --picture draws the parts of held-out views with the largest error that no training view saw, from the fits of the first seed;
 their renders lie in --work. Rows that --out holds are kept when the command is given again.
 """
@@ -11,12 +13,13 @@ import math
 import sys
 from pathlib import Path
 
+from bench.lib import result_file
 from bench.lib.arguments import parse
-from bench.lib.coverage_fits import measure, picture, renders_of
+from bench.lib.coverage_fits import measure, picture, renders_of, unseen_in_both
 from bench.lib.one_fit import Fit, compile_all, plan
 from bench.lib.pool import measure_all
 from bench.lib.scenes import made, row_of, shrunk
-from bench.lib.tables import markdown, mean_sd
+from bench.lib.tables import markdown, mean_sd, named
 from warpgs.errors import WarpgsError
 from warpgs.files import write_bytes
 from warpgs.pipeline.runs.request import choose_device
@@ -49,15 +52,11 @@ def table(rows: list[dict]) -> str:
     return markdown(["row", "preset", "seen by", "fits", *COLUMNS.values()], lines)
 
 
-def draw(path: Path, work: Path, fits: list[Fit], presets: list[str]) -> None:
-    """Write the picture of all rows whose two fits are there."""
-    pairs = {}
-    for row in dict.fromkeys(f.row for f in fits):
-        first = {f.preset: renders_of(work, f) for f in reversed(fits) if f.row == row}
-        if all(first[p].is_file() for p in presets[:2]):
-            pairs[row] = (first[presets[0]], first[presets[1]])
-    if pairs:
-        write_bytes(path, picture(pairs))
+def pairs(work: Path, fits: list[Fit], presets: list[str]) -> dict[tuple[str, int], tuple[Path, Path]]:
+    """Return the files of both fits, before and after, by row and seed, where both are there."""
+    files = {(f.row, f.seed, f.preset): renders_of(work, f) for f in fits}
+    found = {(f.row, f.seed): (files[f.row, f.seed, presets[0]], files[f.row, f.seed, presets[1]]) for f in fits}
+    return {key: pair for key, pair in found.items() if all(file.is_file() for file in pair)}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -81,8 +80,13 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bench.fits.coverage: {e}", file=sys.stderr)
         return e.exit_code
     print(table(found))
-    if a.picture:
-        draw(a.picture, a.work, fits, a.presets)
+    both = pairs(a.work, fits, a.presets)
+    same = [{"row": row, "seed": seed, **unseen_in_both(*files)} for (row, seed), files in both.items()]
+    print("unseen in both fits:", *map(named, same), sep="\n")
+    result_file.keep(a.out, WHAT, device, found, unseen_in_both=same)
+    first_seed = {row: files for (row, seed), files in both.items() if seed == 0}
+    if a.picture and first_seed:
+        write_bytes(a.picture, picture(first_seed))
     return int(any("error" in row for row in found))
 
 

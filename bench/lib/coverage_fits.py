@@ -75,6 +75,23 @@ def worst_parts(before: dict, after: dict, count: int) -> list[tuple[int, int, i
     return [place for _, *place in sorted(found, key=lambda f: (-f[0], f[1]))[:count]]
 
 
+def unseen_in_both(before: Path, after: Path) -> dict:
+    """Return what two fits of the same views score where neither fit's depth shows a point that a training view saw.
+
+    Args:
+        before: File that `measure` wrote.
+        after: The same of another fit.
+
+    Returns:
+        ``share_of_pixels``, and the PSNR [dB] of each fit there, ``before`` and ``after``; None without such pixels.
+    """
+    views = [dict(np.load(file)) for file in (before, after)]
+    unseen = views[0]["unseen"] & views[1]["unseen"]
+    errors = [np.square((v["render"].astype(np.float64) - v["photo"]) / 255).mean(-1)[unseen] for v in views]
+    scores = [psnr_of(float(e.mean())) if len(e) else None for e in errors]
+    return {"share_of_pixels": float(unseen.mean()), "before": scores[0], "after": scores[1]}
+
+
 def picture(rows: dict[str, tuple[Path, Path]], count: int = 2) -> bytes:
     """Return a JPEG of the worst unseen parts: before, after, photograph, and the photograph with unseen pixels striped.
 

@@ -45,7 +45,7 @@ SCENE = (
 
 
 def wants_help(arguments: list[str]) -> bool:
-    """Return whether the words after `fit` ask for the help of one screen."""
+    """Return whether the arguments after `fit` request the short help."""
     return any(word in ("-h", "--help") for word in arguments)
 
 

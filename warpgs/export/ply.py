@@ -31,7 +31,7 @@ CHUNK_ROWS = 65536
 OPAQUE = 30.0
 """Logit of an opacity that is 1 in float32, its negative that of an invisible one: it replaces infinity."""
 FLAT = math.log(1e-37)
-"""Logarithm of an axis without length, as short as float32 holds; it stands for minus infinity."""
+"""Logarithm of an axis of length 0, the smallest in float32, instead of minus infinity."""
 
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -262,7 +262,7 @@ class PLY(Format):
         return _read(path, normalization, units)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header says so.
+        """Return whether the header declares antialiasing.
 
         Raises:
             DataError: The file is missing or no PLY.

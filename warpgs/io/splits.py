@@ -169,7 +169,7 @@ def split_views(scene: Scene, spec: str) -> Split:
     ``train=a,b;test=c``: names, with or without suffix; where one half is missing it is the rest.
 
     Raises:
-        DataError: The scene does not have what the split names, or training and test overlap.
+        DataError: The scene lacks views of the split, or training and test views overlap.
         UsageError: The split is not understood.
     """
     check_spec(spec)

@@ -109,7 +109,7 @@ def project_gradients(
     """Return the gradients of the first seven inputs. Nothing is checked.
 
     Args:
-        inputs: Fields of `ProjectInputs` but for the opacity factors, contiguous.
+        inputs: Fields of `ProjectInputs` without the opacity factors, contiguous.
         settings: The settings of the forward pass.
         projected: First result of `project_tensors`, shape [C, N, 12].
         tile_counts: Second result of `project_tensors`, int32, shape [C, N].

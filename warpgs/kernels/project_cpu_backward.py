@@ -82,7 +82,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
 
     @wp.func(inline=True)
     def store_parts(g: f.ShapeGradient, lane: wp.int32, parts: wp.ref[CameraParts]):
-        """Store what the gradients of the cameras need."""
+        """Store the data for the gradients of the cameras."""
         for j in range(wp.static(3)):
             parts.position[j * lanes + lane] = g.position[j]
             for k in range(wp.static(3)):

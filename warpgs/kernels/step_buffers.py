@@ -94,7 +94,7 @@ def begin_step(
     counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
     viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:  # fmt: skip
-    """Return the inputs of the step whose number is in device memory. Tensors are float32 where nothing else is said.
+    """Return the inputs of the step whose number is in device memory. Tensors are float32 by default.
 
     Args:
         counter: The step's number in its batch, int64, shape [1].

@@ -73,7 +73,7 @@ class InstanceMemory:
     """Memory that the (Gaussian, tile) instances of a render may take."""
 
     budget: int | None = None
-    """Bytes; None for four fifths of what is free."""
+    """Bytes; None for four fifths of the free memory."""
     capacity: int | None = None
     """Number of instances to allocate for, without asking the device how many there are, so that the work can be captured as a
     CUDA graph; None for as many as there are. Unused entries are marked as no tile's."""

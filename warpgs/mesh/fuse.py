@@ -34,7 +34,7 @@ class MeshOptions:
     resolution: int | None = None
     """Voxels along the longest side of the grid; None for 256, or fewer where pixels show no more."""
     max_faces: int = 200_000
-    """Most triangles of the result; what has more is simplified."""
+    """Largest number of triangles; larger meshes are simplified."""
     depth: str = "median"
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
 
@@ -103,16 +103,16 @@ def fuse(
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see of a model.
 
-    What no camera sees stays open, and what cameras do not agree on. Each view is rendered three times, for the extent of the
+    Areas that no camera sees, or on which cameras disagree, stay open. Each view is rendered three times, for the extent of the
     scene, for distances and for colours. One is held in memory at a time, and the depths of all.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, arrays of numpy, at least one; for lenses, pinholes of the same K stand.
+        cameras: Cameras, arrays of numpy, at least one; lenses are replaced by pinholes of the same K.
         render: Settings of the rasterizer, as the fit used them.
         options: Options.
         stage: Function that shows a line of progress.
-        planned: Function that is told the grid, and the memory that it takes as text, before the grid is made.
+        planned: Called with the grid, and its memory as text, before the grid is allocated.
 
     Raises:
         DataError: No camera sees a surface.

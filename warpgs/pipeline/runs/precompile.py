@@ -43,7 +43,7 @@ from warpgs.runtime.load_module import load_module
 from warpgs.runtime.terminal import say
 
 THREADS = 256
-"""Threads of a block where a launch does not say otherwise."""
+"""Default number of threads of a block."""
 CAMERA_MODEL = "pinhole"
 """Model of the cameras of a fit: readers give no other."""
 
@@ -116,7 +116,7 @@ def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
-    """Compile what is not in the cache yet, and yield each module as it is done.
+    """Compile the modules that are not cached, and yield each when it is done.
 
     Args:
         devices: Where; None for the CPU and every CUDA device that torch sees.

@@ -15,7 +15,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, Prior
 
 OUTPUTS = ("rgb", "alpha", "depth")
-"""Images of `warpgs.Render` that a loss term can ask for."""
+"""Images of `warpgs.Render` for loss terms."""
 
 
 @dataclass(frozen=True)

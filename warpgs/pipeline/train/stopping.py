@@ -1,4 +1,4 @@
-"""Early stopping of a fit by the error of left-out blocks of pixels, beside any strategy (docs/decisions/020)."""
+"""Early stopping of a fit by the error of left-out blocks of pixels, for any strategy (docs/decisions/020)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class StoppingConfig:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Held-out blocks at one time, and their gain since the measurement before; plain values as metrics.json has them."""
+    """Left-out blocks at one time, and their gain since the previous measurement; plain values for metrics.json."""
 
     step: int
     """Steps done."""
