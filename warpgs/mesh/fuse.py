@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -45,6 +46,8 @@ class MeshOptions:
         """
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
+        if self.voxel is not None and not 0 < self.voxel < math.inf:
+            raise UsageError(f"--voxel must be a number above 0, not {self.voxel:g}")
         if self.voxel is not None and self.resolution is not None:
             raise UsageError("--voxel and --resolution exclude each other; give one of them")
         if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:

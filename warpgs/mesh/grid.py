@@ -89,8 +89,8 @@ def plan_grid(
         voxel = longest / (RESOLUTION if resolution is None else resolution)
         if resolution is None:
             voxel = max(voxel, float(np.median(footprints)) / 2)
-    if not (math.isfinite(voxel) and voxel > 0 and longest / voxel <= 2**20):
-        raise UsageError(f"--voxel must be above 0 and no smaller than a millionth of the scene, {longest:.3g}; not {voxel:g}")
+    if not (voxel > 0 and longest / voxel <= 2**20):
+        raise UsageError("--voxel must be at least a millionth of the longest side of the scene")
     margin = 2 * TRUNCATION * voxel
     shape = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
     inside = ((points >= low - margin) & (points <= high + margin)).all(1).mean()

@@ -37,8 +37,8 @@ def run(arguments: list[str], about: str) -> int:
 
     a = parse_flags(Demo, arguments, "warpgs demo", about)
     check_range("--views", a.views, 8, 10_000)
-    check_range("--width", a.width, 8, 8192)
-    check_range("--height", a.height, 8, 8192)
+    check_range("--width", a.width, 32, 8192)
+    check_range("--height", a.height, 32, 8192)
     check_range("--seed", a.seed, 0, 2**31 - 1)
     if a.format not in ("transforms", "colmap"):
         raise UsageError(f"--format must be transforms or colmap, not {a.format!r}")
