@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+import torch
 
 from tests.gaussians import camera, cloud
 from warpgs import RasterizeOptions, Rule, rasterize
@@ -73,3 +74,15 @@ def test_a_background_is_numbers():
     for value in ("white", ["a", "b", "c"], None.__class__):
         with pytest.raises(TypeError, match=r"background must be numbers, shape \[3\] or \[C, 3\], not"):
             rasterize(cloud(1), camera(37, 30), RasterizeOptions(background=value))
+
+
+def test_a_full_device_is_not_called_a_wrong_background(monkeypatch):
+    """The default background is made on the device; what fails there keeps its own error."""
+
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("out of memory")
+
+    g, cam = cloud(1), camera(37, 30)
+    monkeypatch.setattr(torch.Tensor, "new_zeros", full)
+    with pytest.raises(torch.OutOfMemoryError):
+        rasterize(g, cam, RasterizeOptions())

@@ -208,8 +208,10 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
         ValueError: The shape of the background is another.
     """
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
+    if background is None:  # outside of the guard: a full GPU must not be called a wrong background
+        background = like.new_zeros(channels)
     try:
-        values = like.new_zeros(channels) if background is None else torch.as_tensor(background)
+        values = torch.as_tensor(background)
     except (RuntimeError, TypeError, ValueError) as e:
         raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
     values = values.to(like)
