@@ -40,8 +40,9 @@ decay of opacities with them; neither was measured elsewhere (docs/decisions/026
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: they are
 too few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
-CPU_PIXELS = 1e6
-"""Pixels that two cores of a processor of 2.5 GHz train a second: 190 ms a step at 504 x 378 px."""
+CPU_PIXELS = 1.35e6
+"""Pixels that two cores of a processor of 2.5 GHz train a second with about as many Gaussians; with fewer it is up to three
+times as many."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
 ONE_LAYER = 1.1
