@@ -65,7 +65,7 @@ def test_the_median_by_weight():
 
 
 def test_a_slanted_surface_has_no_steps():
-    """Wide Gaussians on a slanted plane: depth is the plane's to 0.1 %; the depth of their means is off by a multiple of that."""
+    """Wide Gaussians on a slanted plane: depth is the plane's to 0.1 %; that of their means is off 20 times as far."""
     plane = layer(4.0, 0.4)
     view = surface_view(plane, FRONT, RasterizeOptions())
     true = 4 / (1 - 0.4 * (torch.arange(48) + 0.5 - 24) / 40)

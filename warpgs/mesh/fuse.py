@@ -93,9 +93,9 @@ def fuse(
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see of a model.
 
-    What no camera sees stays open, and what cameras do not agree on. Views are used three times: for the extent of the scene, for
-    distances and for colours. Few small ones are rendered once and kept; else one is held in memory at a time, and the depths
-    of all.
+    What no camera sees stays open, and what cameras do not agree on. Views are used three times: for the extent of the scene,
+    for distances and for colours. Few small ones are rendered once and kept; else one is held in memory at a time, and the
+    depths of all.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.

@@ -29,8 +29,8 @@ def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch
         camera: Camera, arrays of numpy.
 
     Returns:
-        Matrices, shape [N, 3, 3], with entries of at most 1: rows are divided by the ratio of that axis to the shortest one. And
-        the means in camera space [u], shape [N, 3].
+        Matrices, shape [N, 3, 3], with entries of at most 1: rows are divided by the ratio of that axis to the shortest one.
+        And the means in camera space [u], shape [N, 3].
     """
     view = torch.as_tensor(camera.viewmat, dtype=gaussians.means.dtype, device=gaussians.means.device)
     axes = rotation_matrices(torch.nn.functional.normalize(gaussians.quats, dim=1))
