@@ -9,8 +9,8 @@ BENCH = ROOT / "bench"
 BENCHES = sorted(p for name in ("kernels", "fits", "peers", "studies") for p in (BENCH / name).glob("*.py"))
 SHARED = {
     "__init__", "functions", "native", "compiler", "covariance", "falloff",
-    "project_backward", "project_cpu", "project_cpu_backward", "project_cuda", "project_inputs",
-    "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_batch", "blend_cpu_backward",
+    "project_backward", "project_cpu", "project_cpu_backward", "project_cuda", "project_inputs", "project_lanes",
+    "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_batch", "blend_contributions", "blend_cpu_backward",
     "blend_cuda", "blend_records", "blend_settings", "scanlines_cpu", "sh", "tiles_emit", "tiles_emit_cpu", "tiles_order",
 }  # fmt: skip
 

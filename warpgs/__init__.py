@@ -1,8 +1,8 @@
-"""Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or `warpgs.rasterize` for the rasterizer alone.
+"""Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or only the rasterizer, `warpgs.rasterize`.
 
 Units: Gaussians and cameras are in ``scene`` units, those of a `Scene` that `load_scene` returned (recentred and rescaled), or
-in ``file`` units, those of the scene's own files and of PLY. Every function and method through which they enter or leave has an
-argument ``units`` that says which.
+in ``file`` units, those of the scene's own files and of PLY. Every function and method that takes or returns them has an
+argument ``units``.
 """
 
 from __future__ import annotations

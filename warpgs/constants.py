@@ -56,7 +56,7 @@ LARGEST_COEFFICIENT = 1e6
 
 SMALLEST_WEIGHT = 1e-20
 """Smallest sum of blending weights of a pixel that has a depth. The gradient of depth is divided by the sum, and multiplied by
-depths up to `FAR`: 1e30, within float32. Only a rule with an alpha cut of 0 blends less than it."""
+depths up to `FAR`: 1e30, within float32. Smaller sums occur only with an alpha cut of 0."""
 
 FRUSTUM_MARGIN = 0.15
 """Margin around the image, as a fraction of its size on every side. The Jacobian is taken at the projected mean, clamped to the

@@ -41,7 +41,7 @@ def checked_normalization(normalization: Normalization | None, units: str, where
 
     Raises:
         DataError: The normalization is not finite, or its scale is not above 0.
-        UsageError: The units are unknown, or scene units come without a normalization.
+        UsageError: The units are unknown, or scene units are given without a normalization.
     """
     check_units(units)
     if normalization is None:

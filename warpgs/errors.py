@@ -4,7 +4,7 @@
 class WarpgsError(Exception):
     """Base of every error shown to a user without a traceback.
 
-    A message says what is wrong, where, why it matters, and how to fix it.
+    A message names the problem, the place, the reason and the fix.
     """
 
     exit_code = 5

@@ -38,13 +38,13 @@ def replacing(
 ) -> Iterator[Path]:
     """Give the path of a temporary file beside ``path``; once the block has written it, it takes the place of ``path``.
 
-    It is synced to the disk and checked first, and the folder is synced after. Where anything fails, an error of the block
-    included, the temporary file goes and what was there before stays. Where ``path`` is a link, the link is replaced.
+    It is synced to the disk and checked first, and the folder is synced after. On any error, also of the block, the temporary
+    file is removed and an old file stays unchanged. Where ``path`` is a link, the link is replaced.
 
     Args:
         path: File to write or to replace.
         check: Function that reads the temporary file back and raises where it is incomplete.
-        size: Bytes that will be written, which must be there at the end; None where nobody knows.
+        size: Number of bytes that must be in the file at the end; None if unknown.
         suffix: End of the temporary file's name, for libraries that take the format from it: none, .mp4 or .webm.
 
     Raises:
@@ -102,7 +102,7 @@ def filling(folder: Path) -> Iterator[Path]:
     """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
 
     Where anything fails, an error of the block included, the temporary folder goes and nothing is left of it. It is locked
-    meanwhile, and what killed writers left beside it is removed.
+    meanwhile. Left-overs of killed writers beside it are removed.
 
     Args:
         folder: Folder to make; it may exist if it is empty.
@@ -185,7 +185,7 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
     """Replace a file by chunks of bytes, once all of them are on disk.
 
     Raises:
-        ResourceError: The disk is full or the folder not writable; what was there before is untouched.
+        ResourceError: The disk is full or the folder is not writable; an old file is unchanged.
     """
     with writing(path, sum(map(len, chunks))) as f:
         for chunk in chunks:
@@ -275,7 +275,7 @@ def make_folder(folder: Path) -> bool:
     """Make a folder, and those above it, where it is missing; return whether it was made.
 
     Raises:
-        ResourceError: It cannot be made, or lies behind a link that is not followed.
+        ResourceError: It cannot be created, or is behind a link that is not followed.
     """
     try:
         made = not os.path.exists(folder)  # False for what Path.exists raises an error about
@@ -298,7 +298,7 @@ def writing_into(folder: Path) -> Iterator[bool]:
     """Make a folder where it is missing, and follow no link below it in this block; gives whether it was made.
 
     Raises:
-        ResourceError: It cannot be made or opened, or lies behind a link that is not followed.
+        ResourceError: It cannot be created or opened, or is behind a link that is not followed.
     """
     made = make_folder(folder)
     with contextlib.ExitStack() as stack:

@@ -75,7 +75,7 @@ def pinhole_of(camera: Camera) -> Camera:
     """Return the pinhole of the same pose, K and size, which renders without distortion; it sees less than a wide fisheye.
 
     Raises:
-        UsageError: The camera is orthographic, or its model is known to the kernels alone.
+        UsageError: The camera is orthographic, or its model is only supported by the kernels.
     """
     if camera.model not in lenses.CENTRAL:
         check_pinhole(camera)
@@ -125,7 +125,7 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
     Depths are those of a render: z, of a fisheye the distance. Where a lens other than a pinhole cannot see, depth is 0.
 
     Raises:
-        UsageError: The camera model is known to the kernels alone.
+        UsageError: The camera model is only supported by the kernels.
     """
     in_camera = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = in_camera[:, 2]
@@ -141,12 +141,12 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u] as `project_points` has them.
+    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u], as in `project_points`.
 
     A pixel that a lens does not reach gives NaN.
 
     Raises:
-        UsageError: The camera model is known to the kernels alone.
+        UsageError: The camera model is only supported by the kernels.
     """
     if camera.model == "pinhole":
         homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
@@ -171,7 +171,7 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
         World points [u], shape [S, 3].
 
     Raises:
-        UsageError: The camera model is known to the kernels alone.
+        UsageError: The camera model is only supported by the kernels.
     """
     import torch
 
@@ -195,7 +195,7 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
         points: World points [u], shape [S, 3].
 
     Raises:
-        UsageError: The camera model is known to the kernels alone.
+        UsageError: The camera model is only supported by the kernels.
     """
     import torch
 

@@ -20,7 +20,7 @@ MAX_BYTES = 2**34
 NOT_REGULAR = "is not a regular file"
 """Reason for a pipe, a socket or a device."""
 PIECE = 1 << 20
-"""Bytes read at a time from a file that is longer than the system says."""
+"""Bytes read at a time from a file that is longer than its reported size."""
 
 
 def open_input(path: str | os.PathLike[str], below: Path | None = None) -> BinaryIO:

@@ -1,7 +1,6 @@
 """Camera models outside of the kernels: positions in the camera to the image plane and back, as arrays or tensors.
 
-The image plane holds points (u, v) that K takes to pixels: x / z and y / z for a pinhole. The kernels have formulas of
-their own.
+The image plane holds points (u, v) that K takes to pixels: x / z and y / z for a pinhole. The kernels have their own formulas.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 MODELS = ("pinhole", "orthographic", "opencv", "fisheye")
 """Camera models that are known here."""
 CENTRAL = ("pinhole", "opencv", "fisheye")
-"""Camera models with a centre of projection, for which a pinhole of the same K can stand."""
+"""Camera models with a centre of projection, which a pinhole of the same K can replace."""
 NEWTON_STEPS = 30
 """Steps of Newton's method for a way back; five reach float64's last digits for usual lenses, more are bisections."""
 
@@ -29,7 +28,7 @@ def check_known(model: str) -> None:
     """Check that a camera model is known here.
 
     Raises:
-        UsageError: Only the kernels know it.
+        UsageError: Only the kernels support it.
     """
     if model not in MODELS:
         raise UsageError(
@@ -48,7 +47,7 @@ def _library(array: Array) -> Any:
 
 
 def depth_of(model: str, positions: Array) -> Array:
-    """Return the depths [...] [u] of positions in the camera [..., 3], as renders have them: distances of a fisheye, else z."""
+    """Return the depths [...] [u] of positions in the camera [..., 3], as in renders: distance for a fisheye, else z."""
     if model == "fisheye":
         depth: Array = (positions**2).sum(-1) ** 0.5
         return depth
@@ -78,7 +77,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
 
 
 def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
-    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN where none lies there.
+    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN if there is none.
 
     An orthographic camera has them at (u, v, 1) for every depth.
 

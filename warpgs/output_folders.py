@@ -26,11 +26,11 @@ FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 
 SEARCHED = getattr(os, "O_PATH", 0) | getattr(os, "O_DIRECTORY", 0) | getattr(os, "O_CLOEXEC", 0)
 """Flags that open a folder which may be written and entered, but not listed."""
 NO_FOLDER_SYNC = (errno.EINVAL, errno.ENOTSUP, errno.EBADF, errno.EACCES)
-"""Errors of file systems that cannot sync a folder; what they keep after a power failure is theirs to say."""
+"""Errors of file systems that cannot sync a folder."""
 
 
 class RefusedError(OSError):
-    """A place that is not used: a link, no regular file, or a folder that was replaced; the text says how to fix it."""
+    """A path that is rejected: a link, not a regular file, or a folder that was replaced; the message contains the fix."""
 
     def __init__(self, message: str):
         """Take the whole message."""
@@ -62,7 +62,7 @@ class Folder:
         return name if self.descriptor is not None else str(self.path / name)
 
     def lstat(self, name: str) -> os.stat_result:
-        """Return what the system knows of an entry, which may be a link."""
+        """Return the status of an entry, which may be a link."""
         return os.stat(self._name(name), dir_fd=self.descriptor, follow_symlinks=False)
 
     def is_link(self, name: str) -> bool:
@@ -186,11 +186,11 @@ _LOCK = threading.RLock()
 def output_folder(folder: Path) -> Iterator[None]:
     """Have all that is written below a folder, in this block, go through its descriptor and follow no link.
 
-    The folder itself may be reached through links, unless it lies below another one that is open. Where another folder takes
-    its place meanwhile, the next write is rejected.
+    The folder itself may be reached through links, unless it is below another open one. Where another folder takes its place
+    meanwhile, the next write is rejected.
 
     Raises:
-        OSError: It is missing, or lies behind a link below a folder that is open.
+        OSError: It is missing, or is behind a link below an open folder.
     """
     path = folder.absolute()
     with _LOCK:
@@ -210,7 +210,7 @@ def output_folder(folder: Path) -> Iterator[None]:
 
 
 def is_below(path: Path) -> bool:
-    """Return whether a path lies below a folder that is open, so that no link to it is followed."""
+    """Return whether a path is below an open folder, so that no link to it is followed."""
     return _outermost(path.absolute().parent) is not None
 
 
@@ -219,10 +219,10 @@ def open_folder(path: Path, make: bool = False) -> Folder:
 
     Args:
         path: The folder.
-        make: Whether to make folders on the way that are missing; below an open folder alone.
+        make: True to create missing parent folders, only below an open folder.
 
     Raises:
-        OSError: It cannot be opened, or a link lies on the way.
+        OSError: It cannot be opened, or a parent folder is a link.
     """
     path = path.absolute()
     with _LOCK:

@@ -145,7 +145,7 @@ def load_object(kind: str, spec: str) -> object:
     """Return the object of ``module:NAME`` or ``path/to/file.py:NAME``, importing it: runs that code.
 
     Args:
-        kind: What it is, for messages.
+        kind: Kind of object, for messages.
         spec: Place and name.
 
     Raises:

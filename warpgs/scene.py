@@ -75,12 +75,12 @@ class View:
     image: np.ndarray
     """Colours in [0, 1], float32, shape [H, W, 3]."""
     mask: np.ndarray | None = None
-    """True where the pixel counts, bool, shape [H, W]; None where every pixel counts."""
+    """True where the pixel counts, bool, shape [H, W]; None if all pixels count."""
     score_mask: np.ndarray | None = None
     """True where a render is scored, bool, shape [H, W]; the fit does not use it. None to score by ``mask``."""
     alpha: np.ndarray | None = None
-    """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None
-    where the image is opaque."""
+    """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None if the
+    image is opaque."""
     alpha_estimated: bool = False
     """True if ``alpha`` was estimated from a black background. It then selects the pixels that start Gaussians and are scored.
     The loss does not use it, because dark parts of the object may count as background."""
@@ -100,7 +100,7 @@ class PointCloud:
     colors: np.ndarray
     """Colours in [0, 1], float32, shape [N, 3]."""
     tracks: tuple[frozenset[str], ...] | None = None
-    """Names of the views that saw each point, length N; None where the format does not say."""
+    """Names of the views that saw each point, length N; None if the format does not store them."""
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -257,7 +257,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class ActivatedGaussians:
-    """A set of N Gaussians by scales and opacities, for `rasterize` alone; fits and files hold `Gaussians`.
+    """A set of N Gaussians by scales and opacities, only for `rasterize`; fits and files use `Gaussians`.
 
     Opacity 1 and scale 0 are allowed and have finite gradients: the rule clamps alpha, and the pixel filter keeps a flat
     Gaussian visible edge-on.
@@ -299,7 +299,7 @@ class ActivatedGaussians:
 
 @dataclass(frozen=True)
 class CovarianceGaussians:
-    """A set of N Gaussians by covariance matrices and opacities, for `rasterize` alone; fits and files hold `Gaussians`."""
+    """A set of N Gaussians by covariance matrices and opacities, only for `rasterize`; fits and files use `Gaussians`."""
 
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""

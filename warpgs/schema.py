@@ -65,7 +65,7 @@ def check_parts(text: str | bytes) -> None:
 
 
 def check_depth(value: Any, most: int) -> None:
-    """Check that at most so many lists and objects lie in each other, without a call for each.
+    """Check that at most so many lists and objects are nested, without a call for each.
 
     Raises:
         SchemaError: There are more.
@@ -93,7 +93,7 @@ def read(path: Path, below: Path | None = None) -> Any:
 
     Raises:
         OSError: It cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
-        SchemaError: `parse` rejects what it holds.
+        SchemaError: `parse` rejects its content.
     """
     return parse(read_input(path, MAX_BYTES, below))
 
@@ -120,7 +120,7 @@ def text(value: Any, place: str) -> None:
 
 
 def one_of(*values: Any) -> Schema:
-    """Return the schema of a value that is one of some, as JSON has it: 1 is not true."""
+    """Return the schema of a value that is one of some JSON values: 1 is not true."""
 
     def check(value: Any, place: str) -> None:
         if not any(value == v and type(value) is type(v) for v in values):

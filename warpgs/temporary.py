@@ -163,10 +163,10 @@ def system_folder() -> Path:
 
 
 def sweep(folder: Folder, own: bool = False) -> None:
-    """Remove temporary files and folders that nobody holds; what cannot be removed or locked stays: it is in nobody's way.
+    """Remove unlocked temporary files and folders; those that cannot be removed or locked stay.
 
     Args:
-        folder: The folder that they lie in.
+        folder: Their folder.
         own: Whether to touch only what belongs to this user.
     """
     with contextlib.suppress(OSError):

@@ -11,7 +11,8 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.train.by_views import OPAQUE_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
-"""Start, background and degree of `default`; the degree follows from the number of views."""
+"""Start, background and degree of `default`, without its extrapolated points; the degree follows from the number of views."""
+NO_EXTRAPOLATION = "init.extrapolate=false"
 STEPS = (500, 1000, 2000)
 """Numbers of steps that training views left out choose from."""
 SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
@@ -38,6 +39,7 @@ COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,density.gradient=0.0005,{ON
 GSPLAT = "gsplat:sh_degree=auto,background=mean"
 RIVALS = (
     Arm("`default`", "default"),
+    Arm("`default`, not extrapolated: the start of all below", f"default:{NO_EXTRAPOLATION}"),
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
     Arm("CoR-GS", COR_GS, (1500, 3000)),
     Arm("gsplat", GSPLAT, STEPS),
@@ -45,14 +47,18 @@ RIVALS = (
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
     Arm("gsplat, 30,000 steps", f"{GSPLAT},steps=30000"),
 )
-"""Methods under one rule: start, background, degree and scores are those of `default`, all else is the method's own."""
+"""Methods under one rule: start (but for extrapolated points), background, degree and scores are those of `default`."""
 LADDER = (
     Arm("`3dgs`, random points", "3dgs:background=auto,sh_degree=null", STEPS),
     Arm("`3dgs`, start from the depth sweep", f"3dgs:{ONE_RULE}", STEPS),
-    Arm("learning rates, opacity decay and schedule of `default`", f"default:dropout=0,method.events=false,{NO_GROWTH}"),
-    Arm("+ dropout", f"default:method.events=false,{NO_GROWTH}"),
-    Arm("+ placement at consistent depth", f"default:{NO_GROWTH}"),
-    Arm("+ refinement by gradients: `default`", "default"),
+    Arm(
+        "learning rates, opacity decay and schedule of `default`",
+        f"default:dropout=0,method.events=false,{NO_GROWTH},{NO_EXTRAPOLATION}",
+    ),
+    Arm("+ dropout", f"default:method.events=false,{NO_GROWTH},{NO_EXTRAPOLATION}"),
+    Arm("+ placement at consistent depth", f"default:{NO_GROWTH},{NO_EXTRAPOLATION}"),
+    Arm("+ refinement by gradients", f"default:{NO_EXTRAPOLATION}"),
+    Arm("+ extrapolated points: `default`", "default"),
     Arm("+ importance: all three scores", f"default:{SCORES}"),
 )
 """Steps of the method, each beside the one above it; the last is off in `default`."""
@@ -65,6 +71,7 @@ ABLATION = (
     Arm("residual, semantics and geometry", f"default:{SCORES}"),
     Arm("all three, pixels of highest importance", f"default:{SCORES},method.agp=false"),
     Arm("no sampling events", "default:method.events=false"),
+    Arm("no extrapolated points", f"default:{NO_EXTRAPOLATION}"),
     Arm("no opacity decay", "default:optimizer.opacities_decay=0"),
     Arm("no dropout", "default:dropout=0"),
 )

@@ -203,8 +203,9 @@ def peer_figures(fit: Fit, scene: Scene) -> dict:
 
 
 def start_of(fit: Fit, scene: Scene, train: list[View]) -> warpgs.Gaussians:
-    """Return the first Gaussians of our default with this seed, or those on the reconstruction's points."""
-    config = config_of("3dgs:init.source=points" if fit.preset.startswith(PEER_POINTS) else "default", fit.seed)
+    """Return the first Gaussians of our default, not extrapolated, with this seed, or those on the reconstruction's points."""
+    first = "3dgs:init.source=points" if fit.preset.startswith(PEER_POINTS) else "default:init.extrapolate=false"
+    config = config_of(first, fit.seed)
     return make_trainer(train, scene.points, config, torch.device(fit.device), scene.background).gaussians
 
 

@@ -56,7 +56,7 @@ class NormalSmoothness(warpgs.LossTerm):
     def __post_init__(self) -> None:
         if not (0 <= self.weight <= 1000 and self.growth >= 1):
             raise UsageError(
-                f"normal-smoothness: weight {self.weight} must lie between 0 and 1000, growth {self.growth} must be at least 1"
+                f"normal-smoothness: weight {self.weight} must be between 0 and 1000, growth {self.growth} must be at least 1"
             )
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:

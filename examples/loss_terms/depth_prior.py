@@ -82,7 +82,7 @@ class DepthCorrelation(warpgs.LossTerm):
     def __post_init__(self) -> None:
         if not (0 <= self.weight <= 1000 and 0 <= self.until <= 1):
             raise UsageError(
-                f"depth-correlation: weight {self.weight} must lie between 0 and 1000, until {self.until} between 0 and 1"
+                f"depth-correlation: weight {self.weight} must be between 0 and 1000, until {self.until} between 0 and 1"
             )
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:

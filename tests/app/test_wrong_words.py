@@ -15,6 +15,8 @@ WHOLE = "expected an integer of at most 2^63 - 1, got"
     ("words", "error"),
     [
         ("fit --ouut run", "unknown flag --ouut; did you mean --out?"),
+        ("render run --views 3", "unknown flag --views; `warpgs render --help-all` lists the flags"),
+        ("convert a.ply --to b.spz", "unknown flag --to; `warpgs convert --help-all` lists the flags"),
         ("fit scene -out run", "unknown flag -out; did you mean --out?"),
         ("fit scene run", "run is an extra argument; did you mean --out run?"),
         ("fit", "SCENE and --out PATH are missing; `warpgs fit --help` lists what it takes"),

@@ -83,7 +83,7 @@ def test_what_is_no_mesh_is_not_written(tmp_path, suffix):
     bad[1, 1] = np.nan
     with pytest.raises(DataError, match="not finite"):
         write_mesh(path, Mesh(bad, TETRAHEDRON.faces, TETRAHEDRON.colors))
-    with pytest.raises(DataError, match="not there"):
+    with pytest.raises(DataError, match="missing vertex"):
         write_mesh(path, Mesh(TETRAHEDRON.vertices[:3], TETRAHEDRON.faces, TETRAHEDRON.colors[:3]))
     with pytest.raises(UsageError, match=r"use \.ply or \.glb"):
         write_mesh(tmp_path / f"a.obj{suffix[1:]}", TETRAHEDRON)

@@ -143,7 +143,7 @@ def test_a_format_may_write_alone(own, tmp_path):
     spec = f"{own}:Written"
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "n.txt"), "--format", spec, "--no-clean"]) == 0
     assert (tmp_path / "n.txt").read_text() == "40"
-    with pytest.raises(UsageError, match="are written here, not read"):
+    with pytest.raises(UsageError, match="can be written but not read"):
         read_gaussians(tmp_path / "n.txt", format=spec)
 
 

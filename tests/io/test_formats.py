@@ -225,4 +225,4 @@ def test_outside_images_need_permission_and_get_harmless_names(tmp_path):
         load_scene(root)
     scene = load_scene(root, allow_outside=True)
     assert any(v.name.startswith("outside/") and v.name.endswith("elsewhere.png") for v in scene.views)
-    assert any("1 images lie outside" in n for n in scene.notes)
+    assert any("1 images are outside" in n for n in scene.notes)

@@ -98,7 +98,7 @@ def test_normals_in_both_axes(tmp_path, suffix):
 
 BAD = {
     "size": (RAMP[:, :-3], r"13 x 12 px, its image 16 x 12: the aspects differ"),
-    "empty": (np.zeros(SHAPE, np.uint16), "holds no depth"),
+    "empty": (np.zeros(SHAPE, np.uint16), "contains no depth"),
     "negative": (-RAMP.astype(np.float32), r"192 depths are negative, down to -2910"),
     "nan": (np.full(SHAPE, np.nan, np.float32), "no depth is finite"),
     "infinite": (np.full(SHAPE, np.inf, np.float32), "no depth is finite"),
@@ -108,8 +108,8 @@ BAD = {
     "numbers": (RAMP.astype(np.int32), "its numbers are int32"),
     "words": (np.full(SHAPE, "a"), "its numbers are"),
     "axes": (np.zeros((2, 3, 4, 5), np.float32), "must be an array"),
-    "vectors": (2 * facing(), "100% of its vectors are no unit normals"),
-    "none": (0 * facing(), "holds no normal"),
+    "vectors": (2 * facing(), "100% of its vectors are not unit normals"),
+    "none": (0 * facing(), "contains no normals"),
     "one channel": (facing()[..., 0], "normals need three channels"),
 }
 
@@ -127,7 +127,10 @@ def test_a_bad_map_is_refused_with_view_and_reason(case, tmp_path):
 
 def test_bad_confidence_is_refused(tmp_path):
     scene, maps = scenes.write_colmap(tmp_path / "scene"), write_maps(tmp_path / "maps")
-    for values, reason in ((np.full(SHAPE, 2.5, np.float32), "lie in"), (np.ones((2, 2), np.float32), "give a map of that")):
+    for values, reason in (
+        (np.full(SHAPE, 2.5, np.float32), "must be in"),
+        (np.ones((2, 2), np.float32), "give a map of that"),
+    ):
         np.save(maps / "photo1.confidence.npy", values)
         with pytest.raises(DataError, match=f"photo1.confidence.npy.*{reason}"):
             load_scene(scene, depths=maps)
@@ -211,7 +214,11 @@ def test_maps_that_transforms_json_names(tmp_path):
     assert bare.views[0].depth is None and bare.views[0].normals is None
     file = root / "transforms.json"
     content = json.loads(file.read_text())
-    for name, reason in (("../x.png", "leads out"), ("x.exr", "maps are read as .png or .npy"), ("gone.npy", "cannot be read")):
+    for name, reason in (
+        ("../x.png", "points outside"),
+        ("x.exr", "maps are read as .png or .npy"),
+        ("gone.npy", "cannot be read"),
+    ):
         content["frames"][2]["depth_file_path"] = name
         file.write_text(json.dumps(content))
         with pytest.raises(DataError, match=reason):

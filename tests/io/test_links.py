@@ -88,7 +88,7 @@ def test_score_masks_that_are_links(tmp_path):
     assert load_scene(scene, score_masks=named).views[0].score_mask is not None
     (named / "000.png").rename(tmp_path / "000.png")
     link(named / "000.png", tmp_path / "000.png")
-    with pytest.raises(DataError, match=r"000.png: a link leads out"):
+    with pytest.raises(DataError, match=r"000.png: a link points outside"):
         load_scene(scene, score_masks=named)
 
 

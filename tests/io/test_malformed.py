@@ -55,7 +55,7 @@ def test_the_folder_itself_may_be_the_reconstruction(tmp_path):
 def test_formats_passed_over_are_noted(tmp_path):
     scenes.write_transforms(scenes.write_colmap(tmp_path))
     reader, notes = detect(tmp_path)
-    assert (reader.name, notes) == ("colmap", ["the folder also holds transforms: colmap is taken"])
+    assert (reader.name, notes) == ("colmap", ["the folder also holds transforms: colmap is used"])
 
 
 @pytest.mark.parametrize("kind,lack", [("colmap", "images"), ("llff", "images"), ("dtu", "image")])

@@ -81,7 +81,7 @@ def test_masks_that_cannot_be_used_are_named(tmp_path):
         with pytest.raises(DataError, match=message):
             load_scene(tmp_path / "scene", score_masks=folder)
 
-    refused("there are no masks")
+    refused("contains no masks")
     for name in "abcde":
         scenes.save(folder / f"{name}.png", mask_of(0))
     refused("no distinct numbers")

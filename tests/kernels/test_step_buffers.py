@@ -7,7 +7,7 @@ import torch
 
 from tests.kernels.test_guard_bytes import Guarded
 from tests.reference import step_buffers as reference
-from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
+from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step, squared_error
 
 
 def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:
@@ -59,3 +59,28 @@ def test_settings_stand_in_their_columns():
     assert (row[Setting.DROPOUT], row[Setting.NUMBER], row[Setting.MEANS_LR], row[SHIFT]) == (0.2, 7, 1e-4, (0.1, 0.5, 0.9))
     assert row[Setting.STEP] == 4
     assert (row[Setting.RED], row[Setting.GREEN], row[Setting.BLUE]) == row[SHIFT] and len(row) == len(Setting)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (5, 7), (37, 111), (64, 64)])
+def test_squared_errors_are_those_of_the_clamped_image(device, size):
+    """Colours below 0 and above 1, images of part of a task and of several; a NaN stays one."""
+    g = torch.Generator().manual_seed(0)
+    rgb, target = 3 * torch.rand(*size, 3, generator=g) - 1, torch.rand(*size, 3, generator=g)
+    wanted = reference.squared_error(rgb, target)
+    found = squared_error(rgb.to(device), target.to(device))
+    assert found.shape == () and abs(float(found) / float(wanted) - 1) < 1e-6
+    rgb[0, 0, 1] = math.nan
+    assert math.isnan(squared_error(rgb.to(device), target.to(device)))
+
+
+def test_squared_errors_have_the_same_bits_on_any_number_of_threads():
+    """Tasks do not depend on the number of threads."""
+    rgb, target = torch.rand(2, 64, 128, 3, generator=torch.Generator().manual_seed(0))
+    threads, found = torch.get_num_threads(), set()
+    try:
+        for count in (1, 2, 5):
+            torch.set_num_threads(count)
+            found.add(float(squared_error(rgb, target)))
+    finally:
+        torch.set_num_threads(threads)
+    assert len(found) == 1

@@ -126,7 +126,7 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
             )
         stored.scene_cameras.update(kept)
         assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
-        assert ("may lie on its side" in capsys.readouterr().out) == upside_down
+        assert ("may be rotated in a viewer" in capsys.readouterr().out) == upside_down
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,8 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
     [
         (["--out", "a.obj"], r"format \.obj is not supported; use \.ply or \.glb"),
         (["--out", "a.ply", "--max-faces", "3"], "--max-faces must be at least 4"),
-        (["--out", "a.ply", "--voxel", "-1"], "--voxel must be above 0"),
+        (["--out", "a.ply", "--voxel", "-1"], "--voxel must be a number above 0, not -1"),
+        (["--out", "a.ply", "--voxel", "1e-9"], "--voxel must be at least a millionth of the longest side of the scene"),
         (["--out", "a.ply", "--depth", "mode"], "median, mean"),
     ],
 )

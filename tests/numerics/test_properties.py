@@ -7,7 +7,6 @@ limit that stands beside the value that was measured.
 import dataclasses
 import math
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -16,13 +15,11 @@ from hypothesis import strategies as st
 from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.colors import C0
 from warpgs.constants import RULES
-from warpgs.export.ply import read_ply, write_ply
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, Normalization, Render
+from warpgs.scene import Camera, Gaussians, Render
 
 few = settings(
     derandomize=True, deadline=None, database=None,
@@ -38,7 +35,7 @@ LIMITS = {
     "rigid gradient": (5e-5, 5e-13),  # measured 7.5e-6, 4.5e-14
     "identity": (1e-6, 1e-14),  # measured 5.0e-8, 7.0e-17, relative to the sum of what cancels
     "mirror": (5e-6, 1e-13),  # measured 5.7e-7, 3.1e-15
-    "sum over cameras": (5e-6, 1e-13),  # measured 1.2e-6 (one Gaussian, k = 3)
+    "sum over cameras": (5e-6, 1e-13),  # measured 1.2e-6
 }
 
 
@@ -259,22 +256,6 @@ def test_a_batch_is_its_cameras(device, scene, rule, cameras):
 
 
 @few
-@given(scenes(), st.integers(2, 5))
-def test_a_camera_k_times_is_a_weight_of_k(device, scene, k):
-    """The same camera k times in a batch gives k times its gradient."""
-    gaussians, cam = build(scene, device, cameras=1)
-    many = dataclasses.replace(cam, viewmat=cam.viewmat.expand(k, 4, 4), K=cam.K.expand(k, 3, 3))
-    moving = leaves(gaussians)
-    once = rasterize(moving, cam)
-    weights = upstream(once)
-    wanted = torch.autograd.grad(k * loss_of(once, weights), list(moving.tensors().values()))
-    again = rasterize(moving, many)
-    found = torch.autograd.grad(loss_of(again, weights.expand(k, *weights.shape[1:])), list(moving.tensors().values()))
-    for a, b in zip(found, wanted):
-        close("sum over cameras", a, b)
-
-
-@few
 @given(scenes(300), RULE_NAMES, st.floats(0, 1))
 def test_weights_and_what_is_left_add_up_to_one(device, scene, rule, value):
     """All colours equal to the background give that colour; the weights of a picture sum to its alpha."""
@@ -412,16 +393,3 @@ def test_colour_gradients_do_not_depend_on_colours(device, scene, rule):
     assert torch.equal(*found)
     unseen = (render.weight_sums == 0).all(0)
     assert not bool(found[0][unseen].any())
-
-
-@few
-@given(scenes())
-def test_stored_and_read_again_it_draws_the_same(device, tmp_path, scene):
-    """Through a PLY file and through a checkpoint: the same bits of the picture."""
-    gaussians, cam = build(scene, device)
-    first = rasterize(gaussians, cam)
-    write_ply(tmp_path / "model.ply", gaussians, Normalization(np.zeros(3), 1.0))
-    save_checkpoint(tmp_path, gaussians.tensors(), {})
-    for stored in (read_ply(tmp_path / "model.ply").tensors(), load_checkpoint(tmp_path)[0]):
-        again = Gaussians(**{n: stored[n].to(device) for n in gaussians.tensors()})
-        assert same(first, rasterize(again, cam))

@@ -150,7 +150,7 @@ def test_the_flag_and_the_files(tmp_path, capsys):
         for file in ("a.spz", "a.splat"):
             assert main(["export", str(tmp_path / name), "--to", str(tmp_path / name / file), "--no-clean"]) == 0
             assert read_with_antialiasing(tmp_path / name / file, None, "file")[1] is (bool(own) and file == "a.spz")
-        assert ("choose that mode where the file is shown" in capsys.readouterr().out) is bool(own)
+        assert ("choose the antialiased mode in your viewer" in capsys.readouterr().out) is bool(own)
         assert content_of_file(tmp_path / name / "a.spz").model.options().antialiased is bool(own)
         write_cameras(tmp_path / "cameras.json", ring(2))
         opened, notes = open_file(tmp_path / name / "point_cloud.ply", tmp_path / "cameras.json", "exact", "cpu")

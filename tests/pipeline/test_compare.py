@@ -26,15 +26,13 @@ from warpgs.pipeline.farm.run import EngineRequest
 from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import TENSORS
-from warpgs.pipeline.runs.fit import fit_request
 from warpgs.pipeline.runs.request import CPU_MAX_SIDE, FitRequest, SceneRequest, read_scene
-from warpgs.pipeline.study.compare import ABLATION_ROWS, _places, ablation_variants, preset_variants, run_study
+from warpgs.pipeline.study.compare import _places, preset_variants, run_study
 from warpgs.pipeline.study.statistics import paired_difference
-from warpgs.pipeline.study.study import FILES, SWITCHES, StudyRequest, run_folder
+from warpgs.pipeline.study.study import FILES, StudyRequest, run_folder
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS, preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 A = FitConfig(steps=8, init=InitConfig(source="random", random_count=200))
@@ -302,68 +300,6 @@ def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
 
 def fail(text):
     return Event(job_of(text).name, "crashed", "its process ended")
-
-
-FULL = dataclasses.replace(A, preset="whole", method=MethodConfig(events=True, hier=True))
-
-
-def test_ablation_rows_switch_off_one_part_each():
-    """Full, uniform sampling, one score more at a time, each other part off, no sampling, and the paper's settings; marks."""
-    variants, marks = ablation_variants(FULL)
-    scores = ["uniform", "residual only", "residual + semantics"]  # which is full without geometry
-    parts = [name for name in SWITCHES if name != "s_geometry"]
-    assert list(variants) == ["full", *scores, *(f"no {name}" for name in parts), "paper-literal"]
-    assert variants["full"] == FULL
-    paper = variants.pop("paper-literal")
-    assert paper == dataclasses.replace(PRESETS["paper-literal"], steps=FULL.steps) and FULL.steps != 30_000
-    weights = [variants[row].method.weights() for row in scores]
-    assert weights == [(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), pytest.approx((2 / 3, 1 / 3, 0.0))]
-    for (row, variant), name in zip(list(variants.items())[4:], parts, strict=True):
-        switches = dataclasses.asdict(variant.method)
-        assert [s for s, value in switches.items() if value is False] == [name] and row == f"no {name}"
-        assert dataclasses.replace(variant, method=FULL.method) == FULL
-        assert [s for s, mark in zip(SWITCHES, marks[row]) if not mark] == [name]
-    assert all(marks["full"]) and list(SWITCHES)[:7] == ["hier", "s_render", "s_semantic", "s_geometry", "ra", "agp", "pm"]
-    with pytest.raises(UsageError, match="preset '3dgs' has no sampling events"):
-        ablation_variants(FitConfig())
-
-
-def test_ablation_switches_on_what_a_preset_leaves_out():
-    """A preset without scores gets a row with each and one with all, and no row twice: uniform is the preset itself."""
-    scores = {"s_render": False, "s_semantic": False, "s_geometry": False}
-    base = dataclasses.replace(FULL, method=dataclasses.replace(FULL.method, **scores))
-    variants, _ = ablation_variants(base)
-    rows = "full", "residual only", "residual + semantics + geometry", "with s_semantic", "with s_geometry"
-    assert {*rows, "no hier"} <= set(variants)
-    assert not {"uniform", "no s_render", "with s_render", "with hier"} & set(variants)
-    weights = [variants[row].method.weights() for row in rows]
-    assert weights == [(0, 0, 0), (1, 0, 0), pytest.approx((0.4, 0.2, 0.4)), (0, 1, 0), (0, 0, 1)]
-    assert "paper-literal" not in ablation_variants(PRESETS["paper-literal"])[0]
-
-
-def test_command_ablates(scene, tmp_path, capsys, monkeypatch):
-    """`warpgs ablate` from flags to a table with check marks; two of its rows, for time."""
-    monkeypatch.setitem(PRESETS._made, "whole", FULL)
-    monkeypatch.setattr("warpgs.pipeline.study.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
-    monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
-    asked = []
-
-    def noted(request, **others):
-        asked.append((request.config.seed, request.config.method))
-        return fit_request(request)
-
-    monkeypatch.setattr("warpgs.pipeline.farm.ensure_run.fit_request", noted)
-    flags = ["--preset", "whole", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
-    assert main(["ablate", scene.path, "--split", scene.split, *flags]) == 0
-    assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out
-    figures, gaps = cells((tmp_path / "out" / "table.md").read_text())
-    assert figures[0][1:9] == ["Hier", "S_rend", "S_sem", "S_geo", "RA", "AGP", "PM", "Events"]
-    assert [r[1:9] for r in figures[2:]] == [["✓"] * 8, ["✓"] * 6 + ["✗", "✓"]]
-    assert gaps[2] == ["no pm", "not exercised", "not exercised", "not exercised", "1"]  # two steps end before any event
-    off = dataclasses.replace(FULL.method, pm=False)
-    assert asked == [(0, FULL.method), (0, off)]
-    assert main(["ablate", scene.path, "--out", str(tmp_path / "y"), "--preset", "3dgs"]) == 2
-    assert "ablate a preset with them" in capsys.readouterr().err
 
 
 def test_requests_that_make_no_sense(scene, tmp_path):

@@ -54,7 +54,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
     for camera in cameras:  # all three look at one point, and so does every frame between them
         seen = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
         assert np.abs(seen[:2]).max() < 0.15 and 2 < seen[2] < 2.5
-    with pytest.raises(UsageError, match="fields of view of their own"):
+    with pytest.raises(UsageError, match="their own fields of view"):
         plan_film(model, str(path), FilmSettings(fov_y=1.0))
 
 

@@ -273,7 +273,7 @@ def test_captured_steps_are_given_up_where_they_need_more():
     assert not wide.graph_refused and not wide.chunked
     needed = single.step(20_000, 200_000)
     tight, chosen = plan(layout, **many, limit=needed, capacity_factor=1.3)
-    assert tight.graph_refused and chosen == single and not tight.chunked and "one by one" in tight.summary()
+    assert tight.graph_refused and chosen == single and not tight.chunked and "without a CUDA graph" in tight.summary()
     assert plan(layout, **many, limit=needed - 2**20, capacity_factor=1.3)[0].chunked
     open_end, _ = plan(layout, **{**many, "most": 10**6, "available": 2**29}, limit=None)
     assert "--memory-limit helps" in open_end.summary() and open_end.lowered_from is None

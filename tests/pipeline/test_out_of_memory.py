@@ -72,7 +72,7 @@ def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
     failing(monkeypatch, take_steps, "step", {3, 30})
     assert finished(fit, []) == list(range(1, 61))
     assert same(fit, reference)
-    assert len(fit.messages) == 2 and "none was left for step 3" in fit.messages[0]
+    assert len(fit.messages) == 2 and "step 3 ran out of memory" in fit.messages[0]
 
 
 def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
@@ -182,7 +182,7 @@ def test_a_full_device_is_noticed_and_the_fit_goes_on(other):
     other.take_all_but(300)
     seen = finished(fit, states)
     assert seen == list(range(2, 61))
-    assert any("none was left" in m for m in fit.messages), fit.messages
+    assert any("ran out of memory" in m for m in fit.messages), fit.messages
     assert all(bool(torch.isfinite(t).all()) for t in fit.gaussians.tensors().values())
 
 

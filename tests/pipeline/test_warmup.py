@@ -138,7 +138,7 @@ def test_missing_points_are_said_before_anything_takes_time(monkeypatch):
     """Before networks run and before the device is waited for."""
     monkeypatch.setattr(setup, "view_priors", lambda *a, **k: pytest.fail("begun"))
     config = dataclasses.replace(PRESETS["default"], init=InitConfig(source="points"))
-    with pytest.raises(DataError, match="no 3D points"):
+    with pytest.raises(DataError, match="needs 3D points"):
         prepare(photos(2), None, config, np.random.default_rng(0), CPU, None, lambda: pytest.fail("asked"))
 
 

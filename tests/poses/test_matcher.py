@@ -39,14 +39,14 @@ def test_keypoints_are_in_pixels_of_the_photograph(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "options", "message"),
     [
-        ((AT, SCORES, UNIT), {"named": "x"}, "has no output scores; give a file of `warpgs priors export --model xfeat`"),
+        ((AT, SCORES, UNIT), {"named": "x"}, "lacks the output scores; give a file of `warpgs priors export --model xfeat`"),
         ((AT, SCORES, UNIT), {"size": (64, "w")}, "fixes only one side"),
         ((AT[:2], SCORES, UNIT), {}, r"returned keypoints \[2, 2\], scores \[3\]"),
         ((AT, SCORES, UNIT[:, :0]), {}, "have 0 numbers, not 1 to 256"),
         ((AT, SCORES, np.ones((3, 300))), {}, "have 300 numbers"),
         ((AT * np.nan, SCORES, UNIT), {}, "hold NaN"),
-        ((AT * 100, SCORES, UNIT), {}, "lie outside the image"),
-        ((AT, SCORES, UNIT * 2), {}, "not of length 1"),
+        ((AT * 100, SCORES, UNIT), {}, "are outside the image"),
+        ((AT, SCORES, UNIT * 2), {}, "do not have length 1"),
     ],
 )
 def test_networks_that_are_no_matchers_are_refused(tmp_path, arrays, options, message):

@@ -59,7 +59,7 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
     for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
         assert with_poses(request, tmp_path, print) == (request, [])
-    with pytest.raises(UsageError, match=r"--matcher finds poses, and .* is no folder of photographs"):
+    with pytest.raises(UsageError, match=r"--matcher finds poses, and .* is not a folder of photographs"):
         with_poses(SceneRequest(str(found[0]), matcher="x.onnx"), tmp_path, print)
     with pytest.raises(UsageError, match="kept in a run folder; give out"):
         with_poses(SceneRequest(str(photographs)), None, print)

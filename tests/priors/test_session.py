@@ -127,7 +127,7 @@ def test_weights_in_another_file_are_refused_though_it_exists(tmp_path, where, m
     np.ones(1, "<f4").tofile(tmp_path / "weights.bin")
     monkeypatch.chdir(tmp_path)  # onnxruntime would look for them here
     path = nw.write(tmp_path / "m.onnx", placed(where))
-    with pytest.raises(DataError, match="weights of 'k' lie in another file"):
+    with pytest.raises(DataError, match="weights of 'k' are in another file"):
         open_network(path)
 
 

@@ -115,7 +115,7 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
         assert not p.foreground.any() and not p.boundary.any() and p.semantics_source.startswith("none")
         check(p, (32, 64))
     text = "\n".join(notes)
-    assert "stands for foreground in a.png" in text and "no mask of an object in c.png, d.png: they do not count" in text
+    assert "used as foreground in a.png" in text and "no mask of an object in c.png, d.png: they do not count" in text
 
 
 def test_a_region_beats_saliency():
@@ -139,7 +139,7 @@ def test_classical_sources_say_so():
     assert not b.disparity.any() and b.depth_source == "none"
     text = "\n".join(notes)
     assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no depth is consistent in b.png" in text
-    assert "saliency stands for foreground" in text and "--segmentation-model" in text
+    assert "saliency is used as foreground" in text and "--segmentation-model" in text
 
 
 def test_without_any_depth_geometry_does_not_count():

@@ -149,7 +149,7 @@ def test_what_nobody_acts_on_stands_in_the_last_section(tmp_path):
     assert "the Gaussians" in page.all("img")[0]["alt"] and page.all("img")[0]["src"].startswith("data:image/webp")
 
 
-@pytest.mark.parametrize("held_out, words", [(True, "not seen"), (False, "trained on")])
+@pytest.mark.parametrize("held_out, words", [(True, "Held-out"), (False, "trained on")])
 def test_views_are_called_what_they_are(tmp_path, held_out, words):
     _, _, page = write(tmp_path / "report.html", held_out=held_out)
     assert any(words in t for t in page.text("h2"))

@@ -21,7 +21,7 @@ from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.step_buffers import Setting
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
-from warpgs.runtime import interop
+from warpgs.runtime import interop, sorting
 
 
 @wp.kernel(enable_backward=False)
@@ -358,7 +358,7 @@ def test_pairs_are_sorted_in_place_where_they_lie():
     for seed in range(3):
         keys = torch.randint(4, (40,), dtype=torch.int32, generator=torch.Generator().manual_seed(seed))
         values, wanted = torch.arange(40, dtype=torch.int32), keys[:20].sort(stable=True)
-        interop.sort_pairs(interop.view(keys, wp.int32), interop.view(values, wp.int32), 20, end_bit=2)
+        sorting.sort_pairs(interop.view(keys, wp.int32), interop.view(values, wp.int32), 20, end_bit=2)
         assert torch.equal(keys[:20], wanted.values) and torch.equal(values[:20].long(), wanted.indices)
 
 

@@ -1,6 +1,8 @@
 """A headless Chromium that tests drive by its debugging protocol, over two pipes: it opens no port."""
 
 import base64
+import contextlib
+import io
 import json
 import os
 import queue
@@ -10,12 +12,20 @@ import subprocess
 import threading
 import time
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from tests.report.test_page_in_browser import BROWSERS
 
 TIME = 120
 """Seconds that anything may take."""
+CHANGED = ("navigated", "context was destroyed", "context with specified id", "Promise was collected", "active page")
+"""Words of errors of a page that another one took the place of."""
+
+
+class PageChanged(Exception):
+    """Another page took the place of the one that was asked."""
 
 
 class Chromium:
@@ -66,7 +76,9 @@ class Chromium:
         session = {"sessionId": self._session} if self._session else {}
         text = json.dumps({"id": self._number, "method": method, "params": params, **session})
         os.write(self._write, text.encode() + b"\0")
-        answer = self._answers.get(timeout=TIME)
+        answer = self._answers.get(timeout=2 * TIME)
+        if "error" in answer and any(w in str(answer["error"]) for w in CHANGED):
+            raise PageChanged(answer)
         assert answer.get("id") == self._number and "error" not in answer, answer
         return answer["result"]
 
@@ -81,12 +93,33 @@ class Chromium:
         return found["result"].get("value")
 
     def wait(self, expression: str):
-        """Wait until JavaScript has a true value, and return it."""
+        """Wait until JavaScript has a true value, looked at in each frame of the page, and return it."""
+        promise = (
+            f"new Promise(done => {{const end = performance.now() + {1000 * TIME}; const look = () => {{"
+            f"const found = {expression}; found || performance.now() > end ? done(found) : requestAnimationFrame(look)}}"
+            "; look()})"
+        )
         until = time.monotonic() + TIME
-        while not (found := self.value(expression)):
-            assert time.monotonic() < until, f"{expression}: {self.console()}"
-            time.sleep(0.1)
-        return found
+        while True:
+            try:
+                found = self.value(promise)
+                assert found, f"{expression}: {self.console()}"
+                return found
+            except PageChanged:  # as it is loaded: look at the next one
+                assert time.monotonic() < until, f"{expression}: {self.console()}"
+
+    def resize(self, width: int, height: int) -> None:
+        """Give the page a size [px], which pictures have then."""
+        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def picture_of(self, shows):
+        """First picture, [H, W, 3] in [0, 1], for which a function is true; the last one where none is, in time."""
+        until = time.monotonic() + TIME
+        while True:
+            with contextlib.suppress(PageChanged):
+                image = np.asarray(Image.open(io.BytesIO(self.picture())).convert("RGB"), np.float32) / 255
+                if shows(image) or time.monotonic() > until:
+                    return image
 
     def console(self) -> list[str]:
         """Lines of the console, and errors."""

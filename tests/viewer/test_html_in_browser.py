@@ -1,14 +1,10 @@
 """The page of a model in a real browser, opened as a file: it shows what our rasterizer does, and asks nobody for anything."""
 
 import dataclasses
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from tests.report.test_page_in_browser import BROWSERS
 from tests.scenes import ring, three_gaussians
 from tests.viewer.chromium import Chromium
 from warpgs.render.rasterize import rasterize
@@ -20,40 +16,6 @@ SHOWN = np.s_[200:, :]
 """Rows without the page's own button."""
 CORNER = np.s_[:160, :320]
 """Place of viser's remark on software rendering, in white letters, which the page hides."""
-MILLISECONDS = 30_000
-"""The browser's own time until the picture is taken: Gaussians fade in."""
-
-
-ATTEMPTS = 8
-"""Pictures of a page until one shows it whole: the browser's own time does not wait for the worker that sorts Gaussians, and
-until then a grey cover lies over the page."""
-
-
-def shot(page, folder) -> tuple[np.ndarray, str]:
-    """A picture of a page in [0, 1], [H, W, 3], and what the browser wrote; the last of several where it stays covered."""
-    for _ in range(ATTEMPTS):
-        image, console = taken(page, folder)
-        if image[-1, -1].max() == 0 and image[SHOWN].std() > 0.05:
-            break
-    return image, console
-
-
-def taken(page, folder) -> tuple[np.ndarray, str]:
-    """A picture of a page as it is once the browser's own time is over, and what the browser wrote."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        pytest.skip(f"none of {', '.join(BROWSERS)} is there")
-    done = subprocess.run(
-        [
-            browser, "--headless=new", "--no-sandbox", "--disable-gpu-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader", "--no-first-run", "--disable-background-networking", "--disable-component-update",
-            "--disable-sync", f"--user-data-dir={folder / 'profile'}", f"--window-size={WIDTH},{HEIGHT}", "--hide-scrollbars",
-            "--enable-logging=stderr", f"--virtual-time-budget={MILLISECONDS}", f"--screenshot={folder / 'shot.png'}",
-            page.as_uri(),
-        ],
-        capture_output=True, text=True, encoding="utf-8", check=True, timeout=240,
-    )  # fmt: skip
-    return np.asarray(Image.open(folder / "shot.png").convert("RGB"), np.float32) / 255, done.stderr
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
@@ -118,12 +80,30 @@ def test_a_page_from_disk_shows_the_render(tmp_path):
     K[:2, 2] = WIDTH / 2, HEIGHT / 2
     wanted = rasterize(g, dataclasses.replace(camera, K=K, width=WIDTH, height=HEIGHT)).rgb.clamp(0, 1).numpy()
     path = tmp_path / "scene.html"
-    assert write_html(path, g, [camera]) == []
-    image, console = shot(path, tmp_path)
-    assert image.shape == wanted.shape and wanted[SHOWN].std() > 0.1
-    assert psnr(image, wanted) > 22, psnr(image, wanted)
-    assert image[CORNER].min(-1).max() < 0.4  # no white letters
-    assert "Content Security Policy" not in console and "Refused" not in console, console
-    path.write_text(path.read_text("utf-8").replace(SORT_FROM_DISK, ""), "utf-8")
-    unsorted, console = shot(path, tmp_path)
-    assert "Refused" in console and psnr(unsorted, wanted) < psnr(image, wanted) - 3
+    assert write_html(path, g, [camera]) == [] and wanted[SHOWN].std() > 0.1
+    browser = Chromium(tmp_path)
+    try:
+        browser.resize(WIDTH, HEIGHT)
+        browser.open(path.as_uri())
+        image = browser.picture_of(lambda found: psnr(found, wanted) > 22)  # they are sorted by a worker, and fade in
+        assert psnr(image, wanted) > 22, psnr(image, wanted)
+        assert image[CORNER].min(-1).max() < 0.4  # no white letters
+        assert not refused(browser), browser.console()
+        path.write_text(path.read_text("utf-8").replace(SORT_FROM_DISK, ""), "utf-8")
+        browser.open(path.as_uri())
+        before: list[np.ndarray] = []
+        unsorted = browser.picture_of(lambda found: refused(browser) and settled(found, before))
+        assert refused(browser) and psnr(unsorted, wanted) < psnr(image, wanted) - 3
+    finally:
+        browser.close()
+
+
+def refused(browser) -> list[str]:
+    """Lines of the console on what the content policy, or the browser, refused."""
+    return [line for line in browser.console() if "Content Security Policy" in line or "Refused" in line]
+
+
+def settled(image: np.ndarray, before: list[np.ndarray]) -> bool:
+    """Whether Gaussians are shown, and the picture is the one before; keeps it for the next."""
+    before.append(image)
+    return image[SHOWN].std() > 0.05 and len(before) > 1 and np.array_equal(image, before[-2])

@@ -1,14 +1,11 @@
 """The viewer in a real browser: it works under its content policy, and pages of other sites get nothing from it."""
 
 import http.server
-import io
 import json
 import threading
 from contextlib import contextmanager
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from tests.viewer.chromium import Chromium
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -121,10 +118,6 @@ class Admitted(set):
         super().add(item)
 
 
-def pixels(png: bytes) -> np.ndarray:
-    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), np.float32) / 255
-
-
 def trouble(browser) -> list[str]:
     """Lines of the console of the content policy, of scripts that failed, and of connections that were refused."""
     words = ("Content Security Policy", "Refused", "exception", "EvalError", "WebSocket connection")
@@ -137,10 +130,7 @@ def test_the_viewer_works_under_its_policy(folder, browser, capfd):
         browser.open(address(server))
         browser.wait(f"{TEXT}.includes('Gaussians') && {TEXT}.includes('cameras')")
         assert len(server.rules.browsers) == 1
-        for _ in range(100):
-            image = pixels(browser.picture())
-            if image[150:, :500].std() > 0.05:
-                break
+        image = browser.picture_of(lambda found: found[150:, :500].std() > 0.05)
         assert image[150:, :500].std() > 0.05, trouble(browser)
         assert browser.value("location.href") == address(server)
         browser.value("[...document.querySelectorAll('label')].find(l=>l.innerText.includes('cameras')).click()")

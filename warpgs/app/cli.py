@@ -54,7 +54,7 @@ GROUPS = {
 PRINTING = ("doctor", "compare", "ablate")
 """Commands with their result on the terminal."""
 ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
-"""Words that ask for text alone."""
+"""Arguments that only print text."""
 
 
 def _help() -> str:

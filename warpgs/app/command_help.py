@@ -66,7 +66,7 @@ def flag_names(kind: type, prefix: str = "") -> Iterator[str]:
 
 
 def positional_names(kind: type) -> list[str]:
-    """Return the names of the words that a command needs before its flags, as its help has them."""
+    """Return the names of a command's positional arguments for its help."""
     hints, names = typing.get_type_hints(kind, include_extras=True), []
     for field in dataclasses.fields(kind):
         hint, markers = _parts(hints[field.name])

@@ -59,7 +59,7 @@ class Package:
     use: str
     """Part that is lost without it."""
     imported: bool = True
-    """False where another check uses it for real, in a process of its own; here it is only found."""
+    """False if another check imports it in a subprocess; here it is only located."""
 
 
 PACKAGES = (
@@ -317,7 +317,7 @@ CHECKS: tuple[Callable[[], Iterable[Finding]], ...] = (
 
 
 APART = frozenset({_rendering})
-"""Checks that wait for a process of their own, and so run beside the others."""
+"""Checks that wait for a subprocess; they run in parallel with the others."""
 
 
 def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
@@ -333,7 +333,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
     """Look at everything a fit and its report need.
 
     Args:
-        tell: Takes a line on each check.
+        tell: Called with a line about each check.
 
     Returns:
         The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.

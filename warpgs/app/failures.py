@@ -9,7 +9,7 @@ from warpgs.version import __version__
 
 
 def report_no_memory(error: Exception) -> int:
-    """Print that no memory is left, in words that say what to do; return the exit code."""
+    """Print that the memory is exhausted, and the fix; return the exit code."""
     return last_words(f"warpgs: {no_memory_message(error)}", ResourceError.exit_code)
 
 

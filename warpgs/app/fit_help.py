@@ -12,7 +12,7 @@ FLAGS = (
     ("--max-side", "N", "", "longest side [px]; 1600, on a CPU 800; 0 no limit"),
     ("--seed", "N", "0", "seed of all random numbers"),
     ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
-    ("--masks", "HOW", "ignore", "masked-out pixels: ignore, or cutout (transparent)"),
+    ("--masks", "HOW", "ignore", "masked-out pixels: ignore or cutout (transparent)"),
     ("--depths", "FOLDER", "", "depth maps, named as the images (docs/scenes.md)"),
     ("--exposure", "", "False", "learn brightness and colour of each photograph"),
     ("--refine-poses", "", "False", "correct slightly wrong poses while training"),
@@ -25,7 +25,7 @@ SPLITS = {
     "every:N": "hold out every Nth view",
     "llff:K, mip360:K": "hold out every 8th, train on K of the rest",
     "dtu:3|6|9, blender:8": "the published ids of these data sets",
-    "train=NAMES;test=NAMES": "by name, separated by commas; either part alone is enough",
+    "train=NAMES;test=NAMES": "by name, with commas; either part alone is enough",
     "all": "hold out none: no scores",
 }
 """Kinds of splits, each in a line."""
@@ -45,7 +45,7 @@ SCENE = (
 
 
 def wants_help(arguments: list[str]) -> bool:
-    """Return whether the words after `fit` ask for the help of one screen."""
+    """Return whether the arguments after `fit` request the short help."""
     return any(word in ("-h", "--help") for word in arguments)
 
 

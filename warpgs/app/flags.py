@@ -49,14 +49,14 @@ def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | 
 
 
 def settings_of(kind: type[Settings], flags: Any) -> Settings:
-    """Return the settings that parsed flags stand for: the inverse of `flags_of`."""
+    """Return the settings of parsed flags: the inverse of `flags_of`."""
     hints = typing.get_type_hints(kind)
     values = {f.name: getattr(flags, f.name) for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
     return kind(**{n: settings_of(hints[n], v) if dataclasses.is_dataclass(hints[n]) else v for n, v in values.items()})
 
 
 def either(flags: Any, name: str) -> bool | None:
-    """Return True for a flag, False for the same with no- before it, None where neither is given.
+    """Return True for a flag, False for its no- form, None if neither is given.
 
     Args:
         flags: Parsed flags with booleans ``name`` and ``no_name``.
@@ -158,7 +158,7 @@ def listed(title: str, lines: Mapping[str, str]) -> str:
 
 
 def word_after(arguments: list[str], flag: str) -> str | None:
-    """Return the word after a flag that must be known before the others can be described; None where it is not given."""
+    """Return the value of a flag that determines the other flags; None if it is not given."""
     found = None
     for i, word in enumerate(arguments):
         name, given, value = word.partition("=")

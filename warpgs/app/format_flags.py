@@ -83,5 +83,5 @@ def chosen_formats(a: Any, target: Path) -> list[Format]:
 
 
 def filters_of(a: Any) -> Filters:
-    """Return the filters that parsed flags of `format_flags` stand for."""
+    """Return the filters of parsed flags of `format_flags`."""
     return Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)

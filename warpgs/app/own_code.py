@@ -13,7 +13,7 @@ def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
     """Return what ``load`` returns; an error of the code that it imports becomes one sentence.
 
     Args:
-        kind: What is loaded, for messages.
+        kind: Kind of the loaded object, for messages.
         spec: Name, ``module:NAME`` or ``path/to/file.py:NAME``.
         load: Function that loads it.
 

@@ -27,7 +27,7 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
 
 
 def scene_of(flags: Any, path: str) -> SceneRequest:
-    """Return the request for a scene folder that parsed flags stand for; a reader of the user's own is loaded.
+    """Return the request for a scene folder from parsed flags; a user-defined reader is loaded.
 
     Raises:
         UsageError: There is no such reader.

@@ -23,7 +23,7 @@ _AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x",
 
 
 def malformed(path: Path, what: str) -> DataError:
-    """Return a DataError about a file that is not what its suffix says, with the remedy."""
+    """Return a DataError about a file that does not match its suffix, with the fix."""
     return DataError(
         f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
     )

@@ -30,8 +30,8 @@ BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
     NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
-"""Errors of decoders, those of the standard library, of zstandard and our own, about invalid content: zipfile
-reports encryption as RuntimeError, methods it does not know as NotImplementedError, and seeks before the start as OSError."""
+"""Errors of decoders, those of the standard library, of zstandard and our own, about invalid content: zipfile reports
+encryption as RuntimeError, unknown methods as NotImplementedError, and seeks before the start as OSError."""
 
 
 class Format:

@@ -15,7 +15,7 @@ from warpgs.geometry import pinhole_of, quaternions
 from warpgs.scene import Camera
 
 NAMES = ("cameras.json", "transforms.json", "sparse")
-"""Names of files, and of a folder, that say their format."""
+"""Names of files, and of a folder, that determine the format."""
 MAX_OFF_CENTER = 0.01
 """Least distance of a principal point from the image's middle for a note that the file drops it [px]."""
 
@@ -26,16 +26,16 @@ def holds_cameras(path: Path) -> bool:
 
 
 def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
-    """Write cameras in the format that the name says; returns notes for the user.
+    """Write cameras in the format of the file name; returns notes for the user.
 
     Args:
         path: cameras.json or transforms.json, in any folder, where an existing file is replaced; or a folder named sparse, as
             COLMAP's text files in its folder 0, which must not be there yet.
-        cameras: Cameras in file units, numpy arrays; for lenses, pinholes of the same K are written, and a note says so.
+        cameras: Cameras in file units, numpy arrays; cameras with lenses are written as pinholes of the same K, with a note.
 
     Raises:
         ResourceError: The folder or the disk does not take the file.
-        UsageError: The name says no format, the folder is there, or a camera is orthographic.
+        UsageError: The name has no known format, the folder exists, or a camera is orthographic.
     """
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")

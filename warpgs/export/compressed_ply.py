@@ -41,7 +41,7 @@ _BITS = (11, 10, 11)
 
 
 def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
-    """Return the bytes of a file, whose header says whether it is antialiased; harmonics beyond 4 are clamped."""
+    """Return the bytes of a file, with the antialiasing declared in its header; harmonics beyond 4 are clamped."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
     colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
@@ -216,7 +216,7 @@ class CompressedPLY(Format):
         return encode(arrays, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header says so.
+        """Return whether the header declares antialiasing.
 
         Raises:
             DataError: The file is missing or no PLY.

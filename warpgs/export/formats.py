@@ -24,7 +24,7 @@ def suffixes() -> list[str]:
 
 
 def find_format(choice: str | type[Format] | Format) -> Format:
-    """Return the format that a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object stands for.
+    """Return the format of a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object.
 
     A string with a colon imports the module or file, which runs its code: never pass one that a file of others names.
 
@@ -47,10 +47,10 @@ def find_format(choice: str | type[Format] | Format) -> Format:
 
 
 def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format | None = None) -> Format:
-    """Return the format of a file: the one given, else the one that its name says.
+    """Return the format of a file: the given one, else that of its suffix.
 
     Raises:
-        UsageError: The suffix is none of a format, or not that of the given one.
+        UsageError: No format has the suffix, or it is not that of the given format.
     """
     if choice is not None:
         chosen = find_format(choice)
@@ -88,15 +88,17 @@ def write_gaussians(
         path: The file; an existing one is replaced.
         gaussians: N >= 1 Gaussians, on any device.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
-        units: Units of ``gaussians``: scene, or file for those that are to be written as they are.
+        units: Units of ``gaussians``: scene, or file to write them unchanged.
         format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
             ``path/to/file.py:Class``. None for the format of the suffix.
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
 
     Raises:
         warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store.
-        warpgs.errors.ResourceError: The file cannot be written. warpgs.errors.UsageError: The suffix, the format or the units
-        are unknown, or scene units come without a normalization. ValueError: A shape disagrees.
+        warpgs.errors.ResourceError: The file cannot be written.
+        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+            normalization.
+        ValueError: A tensor has the wrong shape.
     """
     chosen = copy.copy(format_of(path, format))
     chosen.antialiased = antialiased
@@ -125,8 +127,9 @@ def read_gaussians(
 
     Raises:
         warpgs.errors.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
-            a NaN, an infinity or a rotation of zero length. warpgs.errors.UsageError: The suffix, the format or the units are
-            unknown, or scene units come without a normalization.
+            a NaN, an infinity or a rotation of zero length.
+        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+            normalization.
     """
     gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)
     if antialiased:
@@ -137,6 +140,6 @@ def read_gaussians(
 def read_with_antialiasing(
     path: Path, normalization: Normalization | None, units: str, format: str | type[Format] | Format | None = None
 ) -> tuple[Gaussians, bool]:
-    """Return what `read_gaussians` does, and whether the file says that it is antialiased."""
+    """Return the result of `read_gaussians`, and whether the file declares antialiasing."""
     chosen = format_of(path, format)
     return chosen.read(path, normalization, units), chosen.is_antialiased(path)

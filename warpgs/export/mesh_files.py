@@ -32,7 +32,7 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None) -> None:
-    """Write a mesh to a .ply or .glb file, which appears whole or not at all.
+    """Write a mesh to a .ply or .glb file, atomically.
 
     Args:
         path: The file; an existing one is replaced.

@@ -31,7 +31,7 @@ CHUNK_ROWS = 65536
 OPAQUE = 30.0
 """Logit of an opacity that is 1 in float32, its negative that of an invisible one: it replaces infinity."""
 FLAT = math.log(1e-37)
-"""Logarithm of an axis without length, as short as float32 holds; it stands for minus infinity."""
+"""Logarithm of an axis of length 0, the smallest in float32, instead of minus infinity."""
 
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -61,9 +61,11 @@ def write_ply(
 
     Raises:
         warpgs.errors.DataError: A tensor is not finite, before or after the change of coordinates; or the normalization is not
-            a similarity. Nothing is written. warpgs.errors.ResourceError: The file cannot be written. TypeError: The Gaussians
-            have other parameters; ``stored()`` of `ActivatedGaussians` converts them. warpgs.errors.UsageError: The units are
-            unknown, or scene units are given without a normalization. ValueError: A shape disagrees.
+            a similarity. Nothing is written.
+        warpgs.errors.ResourceError: The file cannot be written.
+        TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
+        warpgs.errors.UsageError: The units are unknown, or scene units are given without a normalization.
+        ValueError: A tensor has the wrong shape.
     """
     path = Path(path)
     normalization = checked_normalization(normalization, units, f"{path}: not written")
@@ -99,8 +101,8 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
 
     Raises:
         warpgs.errors.DataError: The file is missing, malformed, truncated, or contains a NaN, another infinity or a rotation of
-            zero length; the message names the place. warpgs.errors.UsageError: The units are unknown, or scene units are
-            requested without a normalization.
+            zero length; the message names the place.
+        warpgs.errors.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
     path = Path(path)
     gaussians = _read(path, normalization, units)
@@ -260,7 +262,7 @@ class PLY(Format):
         return _read(path, normalization, units)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header says so.
+        """Return whether the header declares antialiasing.
 
         Raises:
             DataError: The file is missing or no PLY.

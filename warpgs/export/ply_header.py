@@ -1,4 +1,4 @@
-"""Headers of binary PLY files: elements, their properties, and comments that say how Gaussians were trained."""
+"""Headers of binary PLY files: elements, their properties, and comments on the training of Gaussians."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class Element:
 
 
 def mode_comments(antialiased: bool) -> tuple[str, str]:
-    """Return the comments that say whether Gaussians are to be antialiased, as Brush and Postshot write them."""
+    """Return the comments of Brush and Postshot that declare antialiasing."""
     return f"comment SplatRenderMode: {'mip' if antialiased else 'default'}", f"comment antialiased {int(antialiased)}"
 
 
 def is_antialiased(head: bytes) -> bool:
-    """Return whether a header that `parse_header` took says that its Gaussians are antialiased; the last comment decides."""
+    """Return whether a parsed header declares antialiasing; the last comment counts."""
     found = False
     for line in head.partition(b"end_header")[0].decode("ascii").lower().replace(":", " ").splitlines():
         match line.split():

@@ -58,7 +58,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
-    """Return the bytes of a file, whose meta.json says where it is antialiased."""
+    """Return the bytes of a file, with antialiasing declared in meta.json."""
     n, k = arrays["sh"].shape[:2]
     width = 4 * math.ceil(math.sqrt(n) / 4)
     height = 4 * math.ceil(n / width / 4)
@@ -106,7 +106,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 256 values that stand for all, ascending, and the entry nearest to each, as uint8 in the shape of ``values``.
+    """Return a codebook of 256 values, ascending, and the index of the nearest entry, as uint8 in the shape of ``values``.
 
     Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that it repeats.
     """
@@ -343,7 +343,7 @@ class SOG(Format):
         return encode(arrays, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether meta.json says so.
+        """Return whether meta.json declares antialiasing.
 
         Raises:
             DataError: The file cannot be read or is malformed.

@@ -50,7 +50,7 @@ HEADER, HEADER_4 = struct.Struct("<IIIBBBB"), struct.Struct("<IIIBBBBI12x")
 COLOR = 0.15 * 255
 MAX_FRACTIONAL_BITS = 24
 MAX_WINDOW = 2**26
-"""Most memory that a zstd stream may ask for [bytes]."""
+"""Largest window of a zstd stream [bytes]."""
 MAX_RATIO, SMALL = 32, 65536
 """Most bytes that a byte of a file may unpack to, and bytes that any file may: real ones have 2 or 3, a bomb has 1000."""
 
@@ -104,7 +104,7 @@ def encode(arrays: Arrays, version: int = VERSION, antialiased: bool = False) ->
     Args:
         arrays: The Gaussians, in the axes of PLY.
         version: 2, 3 or 4.
-        antialiased: Whether the header says that the Gaussians are antialiased.
+        antialiased: True to declare antialiasing in the header.
 
     Raises:
         DataError: A coordinate is too large for the format.
@@ -310,7 +310,7 @@ class SPZ(Format):
         return encode(arrays, self.config.version, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header says so.
+        """Return whether the header declares antialiasing.
 
         Raises:
             DataError: The file cannot be read or is malformed.

@@ -28,7 +28,7 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
 
 
 def empty_pixels(dark: np.ndarray) -> np.ndarray:
-    """Return those of the dark pixels, bool [H, W], between which and the camera nothing stands.
+    """Return the dark pixels without an object in front of them, bool [H, W].
 
     They are joined to the border over others, sideways or up and down, or make up `HOLE` of the image together.
     """

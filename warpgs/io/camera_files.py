@@ -23,7 +23,7 @@ MAX_BYTES = 2**25
 def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     """Return the cameras of a file or of a COLMAP folder by name, in file units, and notes for the user.
 
-    Lenses are taken for pinholes, since renders have no distortion; a note says so where that changes anything.
+    Lenses become pinholes, because renders have no distortion; a note reports lenses with distortion.
 
     Args:
         path: A cameras.json, a transforms.json, or a folder with a COLMAP reconstruction, binary or text.
@@ -91,7 +91,7 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """Return where a reconstruction lies in a folder, which may be a scene, sparse, or sparse/0; None where none does."""
+    """Return the folder of a reconstruction in a scene, in sparse, or in sparse/0; None without one."""
     found = colmap.model_folder(folder)
     return colmap.model_folder(folder / "0") if found is None else found
 

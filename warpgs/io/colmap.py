@@ -70,7 +70,7 @@ class _BinaryFile:
         return struct.unpack_from("<" + layout, self.data, self.at - size)
 
     def raw(self, size: int) -> bytes:
-        """Return the next bytes as they are."""
+        """Return the next bytes unchanged."""
         self._need(size)
         self.at += size
         return self.data[self.at - size : self.at]
@@ -272,7 +272,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
 
 
 def complete_kind(folder: Path) -> str | None:
-    """Return bin or txt, the kind of which cameras and images are there (bin first); None where neither is complete."""
+    """Return bin or txt, whichever has both cameras and images (bin first); None if neither is complete."""
     for kind in ("bin", "txt"):
         if not _missing(folder, kind):
             return kind
@@ -291,7 +291,7 @@ def missing_parts(folder: Path) -> list[str]:
 
 
 def model_folder(root: Path) -> Path | None:
-    """Return the folder of the reconstruction: sparse/0, sparse, or the root; None where none holds any COLMAP file.
+    """Return the folder of the reconstruction: sparse/0, sparse, or the root; None if none contains a COLMAP file.
 
     The first complete one is taken, else the first that holds anything, for the error message.
     """

@@ -118,7 +118,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
     Gray, palette, 8- and 16-bit images and straight alpha are understood.
 
     Args:
-        path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, whatever its suffix.
+        path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.
         max_pixels: Largest number of pixels that its header may announce.
         data: Its bytes, where they have been read already.
 

@@ -42,7 +42,7 @@ class Exif:
 
     @property
     def device(self) -> str:
-        """Maker and model, as far as they are known."""
+        """Known parts of maker and model."""
         return " ".join(filter(None, (self.maker, self.model)))[:MAX_TEXT]
 
 

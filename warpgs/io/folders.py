@@ -23,7 +23,7 @@ MAX_NAME_LENGTH = 4096
 
 
 def has_folder(root: Path, *patterns: str) -> bool:
-    """Return True where a folder of one of the names or glob patterns lies in ``root``."""
+    """Return whether ``root`` contains a folder of one of the names or glob patterns."""
     return any(p.is_dir() for pattern in patterns for p in root.glob(pattern))
 
 
@@ -31,7 +31,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
     """Return the path of a file that a scene names.
 
     Args:
-        folder: What the name is relative to.
+        folder: Folder to which the name is relative.
         name: As found in the file.
         where: Names the file in errors.
         root: The folder that must not be left, links followed; ``folder`` where None.

@@ -24,7 +24,7 @@ def named_by_dtu(names: list[str]) -> bool:
 
 
 def image_ids(names: list[str]) -> list[int] | None:
-    """Return the ids of image files from their names, counted from 0; None where no number tells the names apart.
+    """Return the ids of image files from their names, counted from 0; None if no number distinguishes the names.
 
     DTU's own names `rect_001_3_r5000.png` count from 1 and so name id 0; all others are taken as they are.
     """
@@ -40,7 +40,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     Args:
         names: All image names of a scan, sorted.
         wanted: Ids that a protocol picks, counted from 0.
-        least: Smallest number of images in which the ids mean what the protocol says.
+        least: Smallest number of images for which the ids of the protocol apply.
         where: Protocol and scene, for errors.
 
     Returns:

@@ -113,7 +113,7 @@ def exif_orientation(path: Path) -> int:
 
 
 def turn_upright(array: np.ndarray, orientation: int) -> np.ndarray:
-    """Rotate or mirror a raster [H, W, ...] upright as its EXIF orientation asks."""
+    """Rotate or mirror a raster [H, W, ...] upright by its EXIF orientation."""
     if orientation in (5, 6, 7, 8):
         array = np.swapaxes(array, 0, 1)
     flips = {2: (1,), 3: (0, 1), 4: (0,), 6: (1,), 7: (0, 1), 8: (0,)}.get(orientation, ())
@@ -306,7 +306,7 @@ def load_image(
     max_side: int = 0,
     native: bool = False,
 ) -> LoadedImage:
-    """Decode an image, set it upright if its camera says so, undo distortion, and resample.
+    """Decode an image, rotate it upright by EXIF, remove distortion, and resample.
 
     Colours are resampled in proportion to their opacity, so that what transparent pixels hold does not run into others.
 

@@ -1,4 +1,4 @@
-"""Files that lie below a folder, with links followed."""
+"""Files below a folder, with links followed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from warpgs.errors import DataError
 
 
 def inside(path: Path, root: Path, noun: str) -> Path:
-    """Return a path after a check that no link on it leads out of ``root``, which messages call ``noun``.
+    """Return a path after a check that no link in it points outside ``root``; ``noun`` is its name in messages.
 
     Raises:
         DataError: One does.
@@ -20,5 +20,5 @@ def inside(path: Path, root: Path, noun: str) -> Path:
 
 
 def is_below(path: Path, root: Path) -> bool:
-    """Return True where a path lies below ``root``, links followed; a link that leads round in circles is where it lies."""
+    """Return True if a path is below ``root``, links followed; a circular link counts at its own place."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))

@@ -120,7 +120,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     """Return the reader of the first complete format of a scene folder, and notes on the formats passed over.
 
     Raises:
-        DataError: The folder holds no format, or only a broken one; the message lists what was looked for.
+        DataError: The folder has no format, or only an incomplete one; the message lists the supported files.
     """
     readers = all_readers()
     found = [(r, p) for r in readers if (p := r.probe(root)) is not None]

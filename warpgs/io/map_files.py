@@ -18,18 +18,18 @@ SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
 """Suffixes of other files that may hold maps, which a message names."""
 NONE = "none"
-"""Word instead of a folder, for no maps at all."""
+"""Word instead of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
 """End of the stem of a map of confidence."""
 MILLIMETRES = 0.001
-"""Length of a unit of integers where the user names none, as RGB-D cameras store depth beside poses in metres."""
+"""Default length of a unit of integers: RGB-D cameras store depth in millimetres, with poses in metres."""
 MAX_DEPTH = 1e12
 """Largest depth [file units]; beyond it a map is taken for broken."""
 AXES = ("opencv", "opengl")
 UNIT_TOLERANCE = 0.1
 """Largest difference of a normal's length from 1; eight bits round by less than 0.01."""
 NO_NORMAL = 0.5
-"""Length below which a vector stands for no normal, as the gray of an image of normals does."""
+"""Length below which a vector counts as missing, such as gray in an image of normals."""
 MAX_STRAY = 0.05
 """Largest fraction of a map's normals that may have another length, or face away from the camera."""
 

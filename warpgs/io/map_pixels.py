@@ -14,7 +14,7 @@ SAME_SURFACE = 0.05
 
 
 def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return a map [H, W] or [H, W, C] at another size; 0 stands for nothing known.
+    """Return a map [H, W] or [H, W, C] at another size; 0 marks missing values.
 
     A pixel of a smaller map has the value known nearest to its centre, so that few points stay what they are. A larger map is
     interpolated between known neighbours on one surface, and else takes the nearest value.

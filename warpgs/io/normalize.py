@@ -20,7 +20,7 @@ MAX_COORDINATE = 1e12
 def normalization_of(views: list[View], points: PointCloud | None, where: str) -> Normalization:
     """Return the similarity that puts the mean camera centre at the origin and the farthest camera at 1 / 1.1.
 
-    Where all cameras stand in one place, the points' median distance becomes 1; without points the scale stays.
+    If all cameras are in one place, the points' median distance becomes 1; without points the scale is unchanged.
 
     Raises:
         DataError: A camera centre is absurdly far away; the message begins with ``where`` and names the image.

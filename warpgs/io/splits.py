@@ -169,7 +169,7 @@ def split_views(scene: Scene, spec: str) -> Split:
     ``train=a,b;test=c``: names, with or without suffix; where one half is missing it is the rest.
 
     Raises:
-        DataError: The scene does not have what the split names, or training and test overlap.
+        DataError: The scene lacks views of the split, or training and test views overlap.
         UsageError: The split is not understood.
     """
     check_spec(spec)
@@ -187,7 +187,7 @@ def split_views(scene: Scene, spec: str) -> Split:
 
 
 def held_out_split(scene: Scene) -> tuple[str, str]:
-    """Return the split for a study that needs held-out views and whose user names none, and a sentence that says so.
+    """Return the default split of a study, which needs held-out views, and a note.
 
     Every 8th view is held out where there are at least 9, else the middle one; of two views none.
     """

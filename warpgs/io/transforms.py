@@ -39,7 +39,7 @@ def files_of(root: Path) -> list[Path]:
 
 
 def is_blender(root: Path) -> bool:
-    """Return True where the folder has Blender's layout, in which transparent pixels stand for a white background."""
+    """Return whether the folder has Blender's layout, with a white background behind transparent pixels."""
     return not (root / "transforms.json").is_file() and bool(files_of(root))
 
 
@@ -231,8 +231,8 @@ class _Reading:
 class TransformsReader(Reader):
     """Scenes with transforms.json, or Blender's transforms_train/val/test.json.
 
-    Frames without a file are skipped and named in the notes; `ReadOptions.strict` makes them an error. Transparent images of
-    Blender stand over white, others over black.
+    Frames without a file are skipped and named in the notes; `ReadOptions.strict` makes them an error. The background of
+    transparent images is white for Blender, else black.
     """
 
     description = "transforms.json or transforms_train.json (nerfstudio, instant-ngp, Blender)"

@@ -20,7 +20,7 @@ def unread_format(path: Path, head: bytes) -> str | None:
     """Return a remedy for a photograph of an unsupported format, as the end of a sentence; None for any other file.
 
     Args:
-        path: Name of the file; the suffix decides for RAW alone.
+        path: Name of the file; only RAW is detected by suffix.
         head: Its first bytes; a damaged file is known by them as well.
     """
     if path.suffix.lower() in RAW_SUFFIXES or kind(head) == "RAW":

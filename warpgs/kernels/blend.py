@@ -71,8 +71,8 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
             total = record()
             for k in range(wp.static(values)):
                 total[k] = totals[lane * count + k]
-            for slot in range(starts[i] + 1, starts[i] + counts[i]):
-                v = v_slots[slot]
+            for later in range(1, counts[i]):  # without slots a start may be any number
+                v = v_slots[starts[i] + later]
                 for k in range(wp.static(values)):
                     total[k] += v[k]
             v_projected[i] = total
@@ -106,12 +106,18 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
 
 
 def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
-    """Return what the generic kernels take: projected Gaussians [C, N, 9 + D], and the instances of each tile."""
+    """Return the inputs of the generic kernels: projected Gaussians [C, N, 9 + D], and the instances of each tile."""
     return [
         interop.rows(projected, real),
         interop.view(tiles.ranges, wp.int32),
         interop.view(tiles.gaussian_ids, wp.int32),
     ]
+
+
+def _span(image: torch.Tensor, real) -> tuple[interop.View, int]:
+    """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the distance of its pixels there."""
+    found = interop.span(image, real)
+    return found, found.row_stride()
 
 
 def composite(
@@ -124,7 +130,7 @@ def composite(
     allocator: Allocator = TORCH,
     image: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Return the images, and what the backward pass needs. Nothing is checked, and no gradient is recorded.
+    """Return the images, and the data for the backward pass. Nothing is checked, and no gradient is recorded.
 
     Args:
         projected: Projected Gaussians, contiguous, shape [C, N, 9 + D] with D channels instead of the colour, D out of
@@ -152,7 +158,7 @@ def composite(
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, wp.types.vector(9 + channels, real)),
-        interop.view(backgrounds, real), interop.span(rgb, real), rgb.stride(-2),
+        interop.view(backgrounds, real), *_span(rgb, real),
         *(interop.flat(t, real) for t in (alpha, depth, transmittances, weights)),
         interop.flat(ends, wp.int32),
     ]  # fmt: skip
@@ -169,7 +175,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     v_projected = allocator.output(projected.shape, projected.dtype, device)
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
     deep = v_alpha is not None or v_depth is not None
-    upstream = [interop.span(v_rgb, real), v_rgb.stride(-2)]
+    upstream: list = [*_span(v_rgb, real)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
         upstream.append(interop.flat(v, real))
@@ -207,7 +213,7 @@ def composite_gradients(
         tiles: Their tiles.
         backgrounds: Channels behind everything, shape [C, D].
         settings: Settings as given to `composite`.
-        saved: Results of `composite` but for ``alpha``. Of ``rgb`` only the channels that ``v_images`` has are read.
+        saved: Results of `composite` without ``alpha``. Of ``rgb`` only the channels that ``v_images`` has are read.
         v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The first
             may be a slice of the channels of an image, and on CUDA in float32 have fewer than D: the others are 0.
         allocator: Provider of the gradient's memory.
@@ -298,7 +304,7 @@ def blend(
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
 
     Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
-    Derivation of the backward pass: docs/blend.md. Bitwise repeatable on a CPU, whatever the number of threads, and on CUDA.
+    Derivation of the backward pass: docs/blend.md. Repeats bit for bit, on a CPU with any number of threads and on CUDA.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

@@ -203,8 +203,8 @@ def blend_channels(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
 
-    Differentiable in the projected Gaussians but for their colours and boxes, in ``colors`` and in ``backgrounds``. The
-    gradients of position, factor and opacity are sums over passes, in order: as repeatable as those of `blend`.
+    Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The gradients of
+    position, factor and opacity are sums over passes, in order: as repeatable as those of `blend`.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

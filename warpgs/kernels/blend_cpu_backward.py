@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
-from warpgs.kernels.blend_batch import BATCH, make_batches
+from warpgs.kernels.blend_batch import BATCH, TOGETHER, make_batches
 from warpgs.kernels.blend_records import COLORS, VALUES, make_records
 from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
@@ -122,11 +122,9 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
     b = make_batches(real, tile_size, channels)
     count = VALUES + channels - COLORS + 2 * absgrad
     values = wp.constant(count)
-    channels_of_strip = wp.constant((channels + 2 * absgrad) * STRIP)
+    group_bits = wp.constant(TOGETHER - 1)
+    together_values = wp.constant(TOGETHER * count)
     stride = wp.constant(tile_size * (tile_size + 1))
-    half_sums = wp.types.vector(count * (STRIP // 2), real)
-    strip_sums = wp.types.vector(count * STRIP, real)
-    value_reals = wp.types.vector(count, real)
     batch = wp.constant(BATCH)
     side = wp.constant(tile_size)
     strip = wp.constant(STRIP)
@@ -252,53 +250,58 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
         return s
 
     @wp.func(inline=True)
-    def totals_of(s: wp.ref[r.Gradient]) -> value_reals:
-        """Return the sums over the places in a strip, always in one order."""
-        # Into one array per width, because additions vectorise only where nothing may overlap.
-        sums = strip_sums()
-        for lane in range(strip):
-            sums[0 * strip + lane] = at(s.e1[lane])
-            sums[1 * strip + lane] = at(s.y[lane])
-            sums[2 * strip + lane] = at(s.xx[lane])
-            sums[3 * strip + lane] = at(s.xy[lane])
-            sums[4 * strip + lane] = at(s.yy[lane])
-            sums[5 * strip + lane] = at(s.opacity[lane])
-            sums[(values - 1) * strip + lane] = at(s.z[lane])
-        for k in range(channels_of_strip):
-            sums[6 * strip + k] = at(s.color[k])
-        halves = half_sums()
-        for k in range(values):
-            for lane in range(half):
-                halves[k * half + lane] = sums[k * strip + lane] + sums[k * strip + half + lane]
-        totals = value_reals()
-        for k in range(values):
-            o = k * half
-            totals[k] = (halves[o] + halves[o + 2]) + (halves[o + 1] + halves[o + 3])
-        return totals
+    def hold_channels(o: wp.int32, lane: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+        """Keep the sums of the channels at a place in half a strip."""
+        for k in range(wp.static(channels + 2 * absgrad)):
+            held.halves[o + (6 + k) * half] = at(s.color[k * strip + lane]) + at(s.color[k * strip + half + lane])
 
     @wp.func(inline=True)
-    def store(j: wp.int32, g: wp.ref[b.Batch], totals: value_reals, slot: wp.int32, v_slots: wp.array2d(dtype=real)):
+    def hold(j: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+        """Keep the sums of a Gaussian until those of others are there, too; half of the places in a strip are added here."""
+        o = (j & group_bits) * (values * half)
+        for lane in range(half):
+            held.halves[o + lane] = at(s.e1[lane]) + at(s.e1[half + lane])
+            held.halves[o + 1 * half + lane] = at(s.y[lane]) + at(s.y[half + lane])
+            held.halves[o + 2 * half + lane] = at(s.xx[lane]) + at(s.xx[half + lane])
+            held.halves[o + 3 * half + lane] = at(s.xy[lane]) + at(s.xy[half + lane])
+            held.halves[o + 4 * half + lane] = at(s.yy[lane]) + at(s.yy[half + lane])
+            held.halves[o + 5 * half + lane] = at(s.opacity[lane]) + at(s.opacity[half + lane])
+            held.halves[o + (values - 1) * half + lane] = at(s.z[lane]) + at(s.z[half + lane])
+            hold_channels(o + lane, lane, s, held)
+
+    @wp.func(inline=True)
+    def fold(held: wp.ref[r.Held]):
+        """Add up the other places in a strip, always in one order, for all Gaussians whose sums are held."""
+        for n in range(together_values):
+            o = n * half
+            held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))
+
+    @wp.func(inline=True)
+    def store(
+        j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)
+    ):  # fmt: skip
         """Store the gradient of an instance, which the sums are but for factors that they share."""
+        o = (j & group_bits) * values
         u11 = at(g.u11[j])
         u22 = at(g.u22[j])
         opacity = at(g.opacity[j])
-        v_e1 = opacity * totals[0]
-        v_e2 = opacity * u22 * totals[1]
+        v_e1 = opacity * at(held.totals[o + 0])
+        v_e2 = opacity * u22 * at(held.totals[o + 1])
         v_slots[slot, 0] = u11 * v_e1
         product = u22 * v_e2
         product = wp.where(real(1.0e30) < product, real(wp.inf), product)  # so that it is rounded, and not fused with the sum
         v_slots[slot, 1] = at(g.u12[j]) * v_e1 + product
-        v_slots[slot, 2] = -opacity * totals[2]
-        v_slots[slot, 3] = -opacity * totals[3]
-        v_slots[slot, 4] = -opacity * u22 * totals[4]
+        v_slots[slot, 2] = -opacity * at(held.totals[o + 2])
+        v_slots[slot, 3] = -opacity * at(held.totals[o + 3])
+        v_slots[slot, 4] = -opacity * u22 * at(held.totals[o + 4])
         for k in range(5, values):
-            v_slots[slot, k] = totals[k]
+            v_slots[slot, k] = at(held.totals[o + k])
         if wp.static(absgrad):  # behind the depth, which is the last total
-            v_slots[slot, values - 3] = totals[values - 1]
-            v_slots[slot, values - 2] = opacity * wp.abs(u11) * totals[values - 3]
-            v_slots[slot, values - 1] = opacity * totals[values - 2]
+            v_slots[slot, values - 3] = at(held.totals[o + values - 1])
+            v_slots[slot, values - 2] = opacity * wp.abs(u11) * at(held.totals[o + values - 3])
+            v_slots[slot, values - 1] = opacity * at(held.totals[o + values - 2])
 
-    return SimpleNamespace(walk=walk, sum_up=sum_up, totals_of=totals_of, store=store)
+    return SimpleNamespace(walk=walk, sum_up=sum_up, hold=hold, fold=fold, store=store)
 
 
 @functools.cache
@@ -320,6 +323,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
     side = wp.constant(tile_size)
     batch = wp.constant(BATCH)
     bits = wp.constant(BATCH - 1)
+    together = wp.constant(TOGETHER)
     # values of a row of gradients that are at most 64 bytes apart
     apart = wp.constant(max(1, 64 // ((4 if real is wp.float32 else 8) * channels)))
     touches = wp.constant(-(-(tile_size - 1) // max(1, 64 // ((4 if real is wp.float32 else 8) * channels))) + 1)
@@ -343,6 +347,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         gaussians = b.Batch()
         rows = b.Rows()
         shades = r.Shades()
+        held = r.Held()
         first = ranges[tile, 0]
         # One value of each cache line in a loop of its own, so that many loads are under way at once; it is overwritten.
         corner = (place[0] * settings.height + place[2]) * settings.width + place[1]
@@ -369,7 +374,13 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                 m.walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
                 # Apart from the walk, because what both need does not fit into 16 registers.
                 sums = m.sum_up(j & bits, left, gaussians, rows, pixels, shades)
-                m.store(j & bits, gaussians, m.totals_of(sums), slots[last], v_slots)
+                m.hold(j & bits, sums, held)
                 j += 1
+                if j % together == 0 or j == count:
+                    m.fold(held)
+                    k = (j - 1) // together * together
+                    while k < j:
+                        m.store(k & bits, gaussians, held, slots[last + j - 1 - k], v_slots)
+                        k += 1
 
     return backward

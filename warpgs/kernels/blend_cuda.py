@@ -29,7 +29,7 @@ MAX_TILES = (4096, 16384)
 STATE = 5
 """Floats of that state with three channels: transmittance, colour and depth sum so far. One more for each further channel."""
 WARPS = 2
-"""Warps in a block; each works alone."""
+"""Independent warps in a block."""
 LARGE_GAUSSIAN = 8
 """Tiles per visible Gaussian from which on a warp of the forward pass takes two blocks of pixels instead of one: it loads and
 tests half as many instances, while few of them touch one block alone (docs/decisions/005-cuda-blending.md)."""
@@ -65,7 +65,7 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
 
     Args:
         tile_size: Side of a tile [px].
-        save: True to write what the backward pass needs: transmittances, weights and the states of the chunks.
+        save: True to write the data for the backward pass: transmittances, weights and the states of the chunks.
         per: Blocks of 8 x 4 px that a warp composites: 1, or 2 one below the other. The image does not depend on it.
         channels: Number of channels.
     """
@@ -297,7 +297,7 @@ def backward(
         tiles: Their tiles.
         backgrounds: Colour behind everything, shape [C, D].
         settings: Settings as given to `forward`.
-        saved: Results of `forward` but for ``alpha``.
+        saved: Results of `forward` without ``alpha``.
         v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W]; the last two may be None.
         allocator: Provider of the gradient's memory.
     """

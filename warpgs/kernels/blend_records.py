@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpgs.kernels.blend_batch import TOGETHER
 from warpgs.kernels.falloff import ABREAST, STRIP
 
 COLORS = 3
@@ -23,6 +24,9 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other, in a gradient with the
     two magnitudes behind them where ``absgrad`` asks for these.
     """
+    # Records begin 8 bytes before a cache line, where the compiler puts them: with these, no strip lies in two lines.
+    lead_reals = wp.types.vector(2, real)
+    trail_reals = wp.types.vector(14, real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     column_reals = wp.types.vector((tile_size + ABREAST) * STRIP, real)
@@ -30,24 +34,32 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
 
+    count = VALUES + channels - COLORS + 2 * absgrad
+    half_reals = wp.types.vector(TOGETHER * count * (STRIP // 2), real)
+    total_reals = wp.types.vector(TOGETHER * count, real)
+
     @wp.struct
     class Pixels:
         """Values of each pixel of a tile."""
 
+        lead: lead_reals
         t: tile_reals  # transmittance behind the current instance, then before it
         behind: tile_reals  # sum of w d over what lies behind, background included
         g: tile_channels  # upstream gradient of the channels
         v_z: tile_reals
         v_w: tile_reals
         end: tile_ints  # one past the last instance that was blended
+        trail: trail_reals
 
     @wp.struct
     class Shades:
         """Gradient and weight of the current instance at each pixel that it reaches."""
 
+        lead: lead_reals
         falloff: column_reals  # of one column of strips, and of a few rows beyond it
         v: tile_reals  # gradient of the falloff
         w: tile_reals  # blending weight
+        trail: trail_reals
 
     @wp.struct
     class Gradient:
@@ -62,4 +74,11 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
         color: strip_channels
         z: strip_reals
 
-    return SimpleNamespace(Pixels=Pixels, Shades=Shades, Gradient=Gradient)
+    @wp.struct
+    class Held:
+        """Sums of several instances' gradients, one instance after the other."""
+
+        halves: half_reals  # by place in half a strip
+        totals: total_reals
+
+    return SimpleNamespace(Held=Held, Pixels=Pixels, Shades=Shades, Gradient=Gradient)

@@ -1,4 +1,4 @@
-"""The settings of blending that are no tensors: as callers give them, and as the kernels of every device take them."""
+"""The settings of blending other than tensors, in the forms for callers and for kernels."""
 
 import functools
 from dataclasses import dataclass

@@ -44,7 +44,7 @@ def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) ->
         Logarithms of sizes [u], float32, shape [N].
 
     Raises:
-        ValueError: A shape or a type is not what it must be.
+        ValueError: A shape or a type is wrong.
     """
     interop.check(means=(means, "N 3"), centers=(centers, "C 3"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)

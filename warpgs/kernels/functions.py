@@ -319,7 +319,7 @@ def make_spans(real, lanes: bool = False):
     ) -> vec2i:  # fmt: skip
         """Return the first tile column, and one past the last, that the ellipse |U d| <= reach touches in a row of tiles.
 
-        ``reach`` 0 asks for the whole box instead of the ellipse.
+        ``reach`` 0 selects the whole box instead of the ellipse.
         """
         margin = real(0.01) + real(2.0e-6) * (wp.abs(mx) + half_width)
         left = -half_width
@@ -343,7 +343,7 @@ def make_spans(real, lanes: bool = False):
 
     @wp.func
     def reach_of(opacity: real, alpha_cut: real, square_sigma: real) -> real:
-        """Return the Mahalanobis radius r at which alpha falls to the cut, o exp(-r^2/2) = cut; 0 stands for the whole box."""
+        """Return the Mahalanobis radius r at which alpha falls to the cut, o exp(-r^2/2) = cut; 0 selects the whole box."""
         if alpha_cut > real(0.0) and square_sigma == real(0.0):
             # the last term covers the rounding of the logarithm and of alpha itself
             return wp.sqrt(real(2.0) * wp.log(opacity / alpha_cut) + real(1.0e-5)) * real(1.00001)

@@ -134,7 +134,7 @@ def heaviest(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return the k Gaussians of largest blending weight alpha * T in each pixel, the heaviest first; the nearer one of a tie.
 
-    Not differentiable. Bitwise repeatable, whatever the number of threads.
+    Not differentiable. Repeats bit for bit with any number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

@@ -44,7 +44,7 @@ def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> t
     """Return the logarithm of a fraction of the smallest pixel that sees each mean, at least that of `SMALLEST`.
 
     A pixel of a camera measures depth over focal length, or distance over focal length for a fisheye (Yu et al. 2024,
-    Mip-Splatting, section 4.1). A camera sees what lies in the cone around its image.
+    Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
 
     Args:
         means: Positions [u], float32, shape [N, 3].
@@ -55,7 +55,7 @@ def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> t
         Logarithms of sizes [u], float32, shape [N].
 
     Raises:
-        ValueError: A shape or a type is not what it must be.
+        ValueError: A shape or a type is wrong.
     """
     interop.check(means=(means, "N 3"), cameras=(cameras, "C 9"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)

@@ -54,7 +54,7 @@ def make_kernels():
 
     @wp.func
     def project(turn: wp.mat33d, shift: wp.vec3d, x: real, y: real, w: real) -> wp.vec3d:
-        """Return where a pixel at inverse depth w is found in another view, and whether it lies before that camera."""
+        """Return the position of a pixel at inverse depth w in another view, and whether it is in front of that camera."""
         p = turn * wp.vec3d(x, y, real(1.0)) + w * shift
         ahead = p[2] > real(BEHIND)
         z = wp.where(ahead, p[2], real(1.0))

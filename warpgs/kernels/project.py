@@ -12,8 +12,8 @@ from warpgs.kernels import project_cpu, project_cpu_backward, project_cuda, sh
 from warpgs.kernels.cameras.base import CAMERA_MODELS
 from warpgs.kernels.functions import make_types
 from warpgs.kernels.native import BLOCK
-from warpgs.kernels.project_cpu import LANES
 from warpgs.kernels.project_inputs import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors
+from warpgs.kernels.project_lanes import LANES
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.derivatives import first_order
@@ -109,7 +109,7 @@ def project_gradients(
     """Return the gradients of the first seven inputs. Nothing is checked.
 
     Args:
-        inputs: Fields of `ProjectInputs` but for the opacity factors, contiguous.
+        inputs: Fields of `ProjectInputs` without the opacity factors, contiguous.
         settings: The settings of the forward pass.
         projected: First result of `project_tensors`, shape [C, N, 12].
         tile_counts: Second result of `project_tensors`, int32, shape [C, N].
@@ -201,7 +201,7 @@ def project(
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera model is unknown.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+        ValueError: A shape or device disagrees; the message names argument, expected and found.
     """
     if distortion is None:
         distortion = viewmats.new_empty(len(viewmats), 0)
@@ -224,7 +224,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
-        ValueError: A shape or device disagrees; the message names argument, wanted and found.
+        ValueError: A shape or device disagrees; the message names argument, expected and found.
     """
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")

@@ -9,13 +9,10 @@ import functools
 import warp as wp
 
 from warpgs.constants import LARGEST_COEFFICIENT
-from warpgs.kernels import sh
 from warpgs.kernels.compiler import EXACT
 from warpgs.kernels.functions import make_projection, make_spans
 from warpgs.kernels.project_inputs import PROJECTED_SIZE
-
-LANES = 16
-"""Gaussians of a task."""
+from warpgs.kernels.project_lanes import LANES, make_lanes
 
 
 @functools.cache
@@ -24,20 +21,12 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
     one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
     s = make_spans(real, lanes=True)
-    basis = sh.make_functions(real, bases).basis
+    g = make_lanes(real, camera_model, parameters, bases)
     vec3 = m.vec3
-    vec4 = m.vec4
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lane_bases = wp.types.vector(LANES * bases, real)
+    lane_bases = g.lane_bases
     lanes = wp.constant(LANES)
-
-    @wp.func(inline=True)
-    def store_basis(d: vec4, lane: wp.int32, values: wp.ref[lane_bases]):
-        """Store the basis at a direction."""
-        y = basis(vec3(d[0], d[1], d[2]))
-        for k in range(wp.static(bases)):
-            values[k * lanes + lane] = y[k]
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def forward(
@@ -62,32 +51,11 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         K = Ks[camera]
         lens = lenses[camera]
 
-        mean_x = lane_reals()
-        mean_y = lane_reals()
-        mean_z = lane_reals()
-        quat_w = lane_reals()
-        quat_x = lane_reals()
-        quat_y = lane_reals()
-        quat_z = lane_reals()
-        scale_x = lane_reals()
-        scale_y = lane_reals()
-        scale_z = lane_reals()
+        shapes = g.Shapes()
         opacity = lane_reals()
         for lane in range(used):
             n = first + lane
-            mean = means[n]
-            quat = quats[n]
-            scales = one.scales_of(log_scales[n])
-            mean_x[lane] = mean[0]
-            mean_y[lane] = mean[1]
-            mean_z[lane] = mean[2]
-            quat_w[lane] = quat[0]
-            quat_x[lane] = quat[1]
-            quat_y[lane] = quat[2]
-            quat_z[lane] = quat[3]
-            scale_x[lane] = scales[0]
-            scale_y[lane] = scales[1]
-            scale_z[lane] = scales[2]
+            g.store(means[n], quats[n], log_scales[n], lane, shapes)
             opacity[lane] = one.opacity_of(logit_opacities[n])
             if opacity_factors.shape[0] > 0:
                 opacity[lane] = opacity[lane] * opacity_factors[n]
@@ -105,9 +73,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         c = lane_reals()
         for lane in range(lanes):
             e = m.ellipse(
-                vec3(mean_x[lane], mean_y[lane], mean_z[lane]),
-                vec4(quat_w[lane], quat_x[lane], quat_y[lane], quat_z[lane]),
-                vec3(scale_x[lane], scale_y[lane], scale_z[lane]),
+                g.mean_of(shapes, lane), g.quat_of(shapes, lane), g.scales_of(shapes, lane),
                 view, K, lens, real(width), real(height), near, low_pass,
             )  # fmt: skip
             if wp.static(antialiased):
@@ -161,7 +127,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         # last, since it reads the most
         values = lane_bases()
         for lane in range(lanes):
-            store_basis(m.direction(vec3(mean_x[lane], mean_y[lane], mean_z[lane]), view), lane, values)
+            g.store_basis(m.direction(g.mean_of(shapes, lane), view), lane, values)
         for lane in range(used):
             n = first + lane
             i = camera * count + n

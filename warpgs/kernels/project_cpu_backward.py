@@ -7,8 +7,8 @@ import warp as wp
 from warpgs.kernels import project_backward, sh
 from warpgs.kernels.compiler import EXACT
 from warpgs.kernels.functions import make_projection
-from warpgs.kernels.project_cpu import LANES
 from warpgs.kernels.project_inputs import PROJECTED_SIZE
+from warpgs.kernels.project_lanes import LANES, make_lanes
 
 
 @functools.cache
@@ -23,13 +23,11 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
         bases: Number of basis values that a colour may have (`sh.bases_for`).
         camera_gradients: True to compute the gradients of viewmats and Ks.
     """
-    one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
     of_one = project_backward.make_functions(real, camera_model, parameters, antialiased, bases)
     f = project_backward.make_functions(real, camera_model, parameters, antialiased, bases, lanes=True)
-    functions = sh.make_functions(real, bases)
-    basis_of = functions.basis
-    values = functions.values
+    gaussians = make_lanes(real, camera_model, parameters, bases)
+    values = sh.make_functions(real, bases).values
     vec3 = m.vec3
     vec4 = m.vec4
     mat33 = m.mat33
@@ -40,7 +38,8 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     lane_vec4 = wp.types.vector(4 * LANES, real)
     lane_mat33 = wp.types.vector(9 * LANES, real)
     lane_rows = wp.types.vector(PROJECTED_SIZE * LANES, real)
-    lane_bases = wp.types.vector(bases * LANES, real)
+    lane_bases = gaussians.lane_bases
+    at = gaussians.at
     lanes = wp.constant(LANES)
 
     @wp.struct
@@ -53,24 +52,12 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
         K: lane_mat33
 
     @wp.func(inline=True)
-    def at(entry: wp.ref[real]) -> real:
-        """Return an entry of a vector that is taken by reference; Warp would copy the vector otherwise."""
-        return entry
-
-    @wp.func(inline=True)
     def row_of(rows: wp.ref[lane_rows], lane: wp.int32) -> vec12:
         """Return the row of a lane."""
         found = vec12()
         for k in range(wp.static(PROJECTED_SIZE)):
             found[k] = at(rows[k * lanes + lane])
         return found
-
-    @wp.func(inline=True)
-    def store_basis(d: vec4, lane: wp.int32, basis: wp.ref[lane_bases]):
-        """Store the basis at a direction."""
-        y = basis_of(vec3(d[0], d[1], d[2]))
-        for k in range(wp.static(bases)):
-            basis[k * lanes + lane] = y[k]
 
     @wp.func(inline=True)
     def weights_of(weights: wp.ref[lane_bases], lane: wp.int32) -> values:
@@ -82,7 +69,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
 
     @wp.func(inline=True)
     def store_parts(g: f.ShapeGradient, lane: wp.int32, parts: wp.ref[CameraParts]):
-        """Store what the gradients of the cameras need."""
+        """Store the data for the gradients of the cameras."""
         for j in range(wp.static(3)):
             parts.position[j * lanes + lane] = g.position[j]
             for k in range(wp.static(3)):
@@ -132,31 +119,10 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
         count = means.shape[0]
         first = (begin + wp.tid()) * lanes
         used = wp.min(lanes, count - first)
-        mean_x = lane_reals()
-        mean_y = lane_reals()
-        mean_z = lane_reals()
-        quat_w = lane_reals()
-        quat_x = lane_reals()
-        quat_y = lane_reals()
-        quat_z = lane_reals()
-        scale_x = lane_reals()
-        scale_y = lane_reals()
-        scale_z = lane_reals()
+        shapes = gaussians.Shapes()
         for lane in range(used):
             n = first + lane
-            mean = means[n]
-            quat = quats[n]
-            scales = one.scales_of(log_scales[n])
-            mean_x[lane] = mean[0]
-            mean_y[lane] = mean[1]
-            mean_z[lane] = mean[2]
-            quat_w[lane] = quat[0]
-            quat_x[lane] = quat[1]
-            quat_y[lane] = quat[2]
-            quat_z[lane] = quat[3]
-            scale_x[lane] = scales[0]
-            scale_y[lane] = scales[1]
-            scale_z[lane] = scales[2]
+            gaussians.store(means[n], quats[n], log_scales[n], lane, shapes)
 
         # sums over the cameras; the number of cameras that saw a lane; whether this one does
         v_mean_x = lane_reals()
@@ -193,9 +159,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                         v_rows[k * lanes + lane] = v_projected[i, k]
             for lane in range(lanes):
                 g = f.shape(
-                    vec3(mean_x[lane], mean_y[lane], mean_z[lane]),
-                    vec4(quat_w[lane], quat_x[lane], quat_y[lane], quat_z[lane]),
-                    vec3(scale_x[lane], scale_y[lane], scale_z[lane]),
+                    gaussians.mean_of(shapes, lane), gaussians.quat_of(shapes, lane), gaussians.scales_of(shapes, lane),
                     view, K, lens, real(width), real(height), near, low_pass, row_of(rows, lane), row_of(v_rows, lane), 0,
                 )  # fmt: skip
                 hit = seen[lane] != 0
@@ -213,7 +177,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                 if wp.static(camera_gradients):
                     store_parts(g, lane, parts)
             for lane in range(lanes):
-                store_basis(m.direction(vec3(mean_x[lane], mean_y[lane], mean_z[lane]), view), lane, basis)
+                gaussians.store_basis(m.direction(gaussians.mean_of(shapes, lane), view), lane, basis)
             for lane in range(used):
                 if seen[lane] != 0:
                     n = wp.max(first + lane, 0)
@@ -231,7 +195,7 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                         k += 1
                     views[lane] = views[lane] + 1
             for lane in range(lanes):
-                d = m.direction(vec3(mean_x[lane], mean_y[lane], mean_z[lane]), view)
+                d = m.direction(gaussians.mean_of(shapes, lane), view)
                 v_centered = f.centered(d, weights_of(weights, lane))
                 hit = seen[lane] != 0
                 none = real(0.0)

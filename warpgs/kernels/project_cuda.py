@@ -16,9 +16,9 @@ from warpgs.kernels.project_inputs import PROJECTED_SIZE
 def make_forward(
     real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
 ):  # fmt: skip
-    """Make the forward kernel. It writes the colours last, which read the most.
+    """Make the forward kernel. It computes the colours last, because they need the most data.
 
-    In float32 the Gaussians that touch a tile are dealt to the first threads of each block for that.
+    In float32 the first threads of each block compute the colours of the Gaussians that touch a tile.
 
     Args:
         real: wp.float32, whose rows and coefficients are moved 16 bytes at a time, or wp.float64.

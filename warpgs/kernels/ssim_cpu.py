@@ -76,7 +76,7 @@ def make_functions(real):
 
     @wp.func
     def add_pair(s: vec5, w: real, p: real, q: real) -> vec5:
-        """Return the five sums with one pixel more."""
+        """Return the five sums after adding a pixel."""
         d = p - q
         u = w * p
         v = w * q

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
+from warpgs.kernels.compiler import ROLLED
 from warpgs.runtime import interop
 
 NOT_FINITE = 2
@@ -40,6 +41,10 @@ class Setting(IntEnum):
         return dropout, number, means_lr, *shift, step
 
 
+LANES = 16
+"""Neighbouring elements whose errors are summed together on a CPU, in a loop that vectorises."""
+SEGMENT = 4096
+"""Elements whose errors a task sums on a CPU, a multiple of `LANES`."""
 SHIFT = slice(Setting.RED, Setting.BLUE + 1)
 """Columns of the colour."""
 
@@ -90,11 +95,64 @@ def make_kernels():
     return SimpleNamespace(begin_step=begin_step, end_step=end_step)
 
 
+@functools.cache
+def make_errors():
+    """Make the kernel that sums squared errors on a CPU, one task per `SEGMENT` elements."""
+    values = wp.types.vector(LANES, wp.float32)
+    lanes, segment = wp.constant(LANES), wp.constant(SEGMENT)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def squared_errors(
+        begin: int, rgb: wp.array(dtype=float), target: wp.array(dtype=float),
+        # outputs
+        sums: wp.array(dtype=float),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        base = task * segment
+        end = wp.min(base + segment, rgb.shape[0])
+        s = values()
+        while base < end:
+            o = wp.max(base, 0)
+            base += lanes
+            if base <= end:
+                for lane in range(lanes):
+                    p = rgb[o + lane]
+                    d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]  # a NaN stays one
+                    s[lane] = s[lane] + d * d
+            else:
+                for lane in range(end - o):
+                    p = rgb[o + lane]
+                    d = wp.where(p < 0.0, 0.0, wp.where(p > 1.0, 1.0, p)) - target[o + lane]
+                    s[lane] = s[lane] + d * d
+        total = float(0.0)
+        for lane in range(lanes):
+            total += s[lane]
+        sums[task] = total
+
+    return squared_errors
+
+
+def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+    """Return the sum of squared errors of an image clamped to [0, 1], shape [], the same bits on any number of CPU threads.
+
+    Args:
+        rgb: Colours, shape [H, W, 3].
+        target: Colours in [0, 1], shape [H, W, 3].
+    """
+    if rgb.device.type != "cpu" or rgb.dtype != torch.float32:
+        return torch.nn.functional.mse_loss(rgb.clamp(0, 1), target, reduction="sum")
+    tasks = -(-rgb.numel() // SEGMENT)
+    sums = rgb.new_empty(tasks)
+    inputs = [*(interop.flat(t.contiguous(), wp.float32) for t in (rgb, target)), interop.view(sums, wp.float32)]
+    interop.launch(make_errors(), tasks, inputs, rgb.device, cost=SEGMENT // 10)
+    return sums.sum()
+
+
 def begin_step(
     counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
     viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:  # fmt: skip
-    """Return the inputs of the step whose number is in device memory. Tensors are float32 where nothing else is said.
+    """Return the inputs of the step whose number is in device memory. Tensors are float32 by default.
 
     Args:
         counter: The step's number in its batch, int64, shape [1].

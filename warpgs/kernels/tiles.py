@@ -9,12 +9,13 @@ import warp as wp
 from warpgs.constants import TILE_SIZE, Rule
 from warpgs.errors import ResourceError
 from warpgs.kernels import tiles_emit_cpu
-from warpgs.kernels.project_cpu import LANES
+from warpgs.kernels.project_lanes import LANES
 from warpgs.kernels.tiles_emit import EACH, make_emit, make_find_ranges
 from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries, sums_fit
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
+from warpgs.runtime.sorting import sort_pairs
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
 
 LIST_BYTES = 20
@@ -73,7 +74,7 @@ class InstanceMemory:
     """Memory that the (Gaussian, tile) instances of a render may take."""
 
     budget: int | None = None
-    """Bytes; None for four fifths of what is free."""
+    """Bytes; None for four fifths of the free memory."""
     capacity: int | None = None
     """Number of instances to allocate for, without asking the device how many there are, so that the work can be captured as a
     CUDA graph; None for as many as there are. Unused entries are marked as no tile's."""
@@ -177,7 +178,7 @@ def _depth_order(
         sums_view, bits = interop.view(packed, wp.int64), sum_bits(count)
         inputs = [projected_view, counts_view, sums_view, bits, visible, depths_view, order_view]
         interop.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
-    interop.sort_pairs(depths_view, order_view, visible)
+    sort_pairs(depths_view, order_view, visible)
     return order, visible, total
 
 
@@ -198,7 +199,7 @@ def _sort_by_tile(
     """
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
     keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
-    interop.sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
+    sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
     inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
     native = keys.is_cuda
     interop.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)

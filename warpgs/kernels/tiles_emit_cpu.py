@@ -9,7 +9,7 @@ import warp as wp
 
 from warpgs.kernels.compiler import EXACT
 from warpgs.kernels.functions import make_spans
-from warpgs.kernels.project_cpu import LANES
+from warpgs.kernels.project_lanes import LANES
 from warpgs.kernels.tiles_emit import make_write
 
 

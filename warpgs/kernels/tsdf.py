@@ -20,7 +20,7 @@ from warpgs.scene import Camera
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """A grid of X x Y x Z points along the axes of the world, and what depth maps said about each."""
+    """A grid of X x Y x Z points along the world axes, with the fused depths."""
 
     origin: tuple[float, float, float]
     """Position of the first point [u]."""
@@ -31,7 +31,7 @@ class DistanceGrid:
     distances: torch.Tensor
     """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; of no meaning at weight 0."""
     weights: torch.Tensor
-    """Sum of the weights of the views that saw the point, shape [X, Y, Z]; 0 where none did."""
+    """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
 
 
 @functools.cache
@@ -183,7 +183,7 @@ def empty_grid(
         origin: Position of the first point [u].
         voxel: Distance from one point to the next [u], above 0.
         shape: Number of points along each axis.
-        truncation: Largest distance from a surface that is told apart [u], above 0.
+        truncation: Largest distance from a surface that is stored [u], above 0.
         like: Any tensor, of any shape.
     """
     return DistanceGrid(origin, voxel, truncation, like.new_zeros(shape), like.new_zeros(shape))

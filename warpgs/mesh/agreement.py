@@ -1,7 +1,7 @@
 """Agreement of views on depth: what other views see into, and none of them sees at that depth, is left out of a mesh.
 
-A fit of few views pays for depth only where two of them look. Where one view alone sees a surface, as beside the edge of what
-hides it from the others, its depth is unconstrained.
+A fit of few views pays for depth only where two of them look. If only one view sees a surface, such as beside an occluding
+edge, its depth is unconstrained.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class DepthMap:
     camera: Camera
     """Pinhole camera of the whole image, arrays of numpy."""
     depth: torch.Tensor
-    """z-depth [u] of every ``step``-th pixel of every ``step``-th row, 0 where there is no surface, shape [h, w]."""
+    """z-depth [u] of every ``step``-th pixel of every ``step``-th row, 0 without a surface, shape [h, w]."""
     step: int
     """Pixels from one stored depth to the next."""
     bounds: tuple[float, float]
-    """Depths [u] that most of it lies between."""
+    """Smallest and largest depth [u] of most of the surface."""
 
 
 def depth_map(view: SurfaceView, views: int) -> DepthMap:
-    """Return the depth of a view as it is kept for comparisons.
+    """Return the depth of a view for comparisons.
 
     Args:
         view: The view.

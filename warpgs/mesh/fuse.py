@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -33,7 +34,7 @@ class MeshOptions:
     resolution: int | None = None
     """Voxels along the longest side of the grid; None for 256, or fewer where pixels show no more."""
     max_faces: int = 200_000
-    """Most triangles of the result; what has more is simplified."""
+    """Largest number of triangles; larger meshes are simplified."""
     depth: str = "median"
     """Rendered depth that is fused: median, or mean (expected depth), which mixes surfaces at edges."""
 
@@ -45,6 +46,8 @@ class MeshOptions:
         """
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
+        if self.voxel is not None and not 0 < self.voxel < math.inf:
+            raise UsageError(f"--voxel must be a number above 0, not {self.voxel:g}")
         if self.voxel is not None and self.resolution is not None:
             raise UsageError("--voxel and --resolution exclude each other; give one of them")
         if self.resolution is not None and not MIN_RESOLUTION <= self.resolution <= MAX_RESOLUTION:
@@ -93,17 +96,17 @@ def fuse(
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see of a model.
 
-    What no camera sees stays open, and what cameras do not agree on. Views are used three times: for the extent of the scene,
-    for distances and for colours. Few small ones are rendered once and kept; else one is held in memory at a time, and the
-    depths of all.
+    Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
+    for distances and for colours. Up to 16 million pixels in all are rendered once and kept. With more, each use renders one
+    view at a time, and only the depths are kept.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, arrays of numpy, at least one; for lenses, pinholes of the same K stand.
+        cameras: Cameras, arrays of numpy, at least one; lenses are replaced by pinholes of the same K.
         render: Settings of the rasterizer, as the fit used them.
         options: Options.
         stage: Function that shows a line of progress.
-        planned: Function that is told the grid, and the memory that it takes as text, before the grid is made.
+        planned: Called with the grid, and its memory as text, before the grid is allocated.
 
     Raises:
         DataError: No camera sees a surface.

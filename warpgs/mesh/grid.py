@@ -21,7 +21,7 @@ TRUNCATION = 4.0
 FENCE = 3.0
 """Interquartile ranges outside the quartiles from where a coordinate is far out (Tukey, 1977: Exploratory Data Analysis)."""
 QUANTILES = (0.005, 0.995)
-"""Quantiles of the surface points along an axis that the grid lies between, where the fences are wider."""
+"""Quantiles of the surface points along an axis between which the grid lies, if the fences are wider."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14
@@ -55,7 +55,7 @@ class GridPlan:
 def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower and upper corner, shape [3] each, of the box around points without the outliers along each axis.
 
-    What lies far behind everything else, such as a background at infinity, is cut off.
+    Points far behind all others, such as a background at infinity, are cut off.
 
     Args:
         points: Positions [u], shape [N, 3].
@@ -89,8 +89,8 @@ def plan_grid(
         voxel = longest / (RESOLUTION if resolution is None else resolution)
         if resolution is None:
             voxel = max(voxel, float(np.median(footprints)) / 2)
-    if not (math.isfinite(voxel) and voxel > 0 and longest / voxel <= 2**20):
-        raise UsageError(f"--voxel must be above 0 and no smaller than a millionth of the scene, {longest:.3g}; not {voxel:g}")
+    if not (voxel > 0 and longest / voxel <= 2**20):
+        raise UsageError("--voxel must be at least a millionth of the longest side of the scene")
     margin = 2 * TRUNCATION * voxel
     shape = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
     inside = ((points >= low - margin) & (points <= high + margin)).all(1).mean()

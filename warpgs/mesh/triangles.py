@@ -36,7 +36,7 @@ def extract(grid: DistanceGrid) -> Mesh:
         grid: The grid.
 
     Raises:
-        DataError: There is no surface in what was seen.
+        DataError: No view saw a surface.
     """
     from skimage.measure import marching_cubes
 
@@ -91,7 +91,7 @@ def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     library.
 
     Args:
-        mesh: The mesh, which is returned as it is where it has no more triangles.
+        mesh: The mesh; it is returned unchanged if it is small enough.
         max_faces: Number of triangles, at least 4.
     """
     if len(mesh.faces) <= max_faces:

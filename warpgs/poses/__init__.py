@@ -1,1 +1,1 @@
-"""Camera poses from photographs or a video alone, by structure from motion (extra `poses`, pycolmap)."""
+"""Camera poses from photographs or a video, by structure from motion (extra `poses`, pycolmap)."""

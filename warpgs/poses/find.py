@@ -96,16 +96,16 @@ def find_poses(
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.
         allow_outside: Let links lead to photographs outside the folder.
-        matcher: ONNX file that finds keypoints where SIFT leaves photographs without a pose, as `warpgs priors export --model
-            xfeat` writes it; None for SIFT alone.
+        matcher: ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose;
+            None for SIFT only.
         progress: Called with lines for the user.
 
     Returns:
         The record, as poses.json holds it.
 
     Raises:
-        DataError: There are no photographs or too few, one lies outside or cannot be decoded, fewer than three fit together, or
-            the matcher is none.
+        DataError: There are too few photographs, one is outside the folder or cannot be decoded, fewer than three match, or the
+            matcher is invalid.
         ResourceError: pycolmap failed, or the folder cannot be written.
         UsageError: pycolmap is not installed, or ``out`` holds something already.
     """

@@ -80,7 +80,7 @@ class Mapping:
     version: str
     """Version of pycolmap."""
     kept_focal: bool | None = None
-    """True where the focal length is EXIF's, since so few photographs do not tell it better; False where they contradict it."""
+    """True if the focal length of EXIF is kept, because so few photographs cannot improve it; False if they contradict it."""
 
     @cached_property
     def links(self) -> dict[int, list[tuple[int, int]]]:
@@ -169,7 +169,7 @@ def find_model(
 ) -> Mapping:
     """Find poses of photographs and write the model of those that fit together into ``folder``/model, in COLMAP's files.
 
-    The same photographs give the same bits on the same machine, whatever the number of threads, but for the global mapper.
+    The same photographs give the same bits on the same machine with any number of threads, except with the global mapper.
 
     Args:
         photographs: The photographs, sorted by name.
@@ -178,7 +178,7 @@ def find_model(
         folder: Folder to work in.
         progress: Called with lines for the user.
         threads: CPU threads; 0 for as many as there are cores.
-        learned: Whether ``folder`` holds keypoints and matches of a network, which stand for SIFT's.
+        learned: True if ``folder`` contains keypoints and matches of a network instead of SIFT's.
 
     Raises:
         ResourceError: pycolmap failed.

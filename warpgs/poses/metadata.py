@@ -6,11 +6,11 @@ from warpgs.io.image_formats.jpeg import EOI, LONE, MARKER, NEXT_MARKER, SOS
 from warpgs.io.image_formats.png import SIGNATURE
 
 JFIF, ADOBE, COMMENT = 0xE0, 0xEE, 0xFE
-"""JPEG segments: the first two say how colours are coded, and stay."""
+"""JPEG segments: the first two define the colour coding, and are kept."""
 APPLICATION = range(0xE0, 0xF0)
 """JPEG segments of applications."""
 KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
-"""Chunks of a PNG file that hold its pixels; all others say where, when and by whom it was made."""
+"""Chunks of a PNG file with its pixels; all others are metadata."""
 
 
 def without_jpeg_metadata(data: bytes) -> bytes:

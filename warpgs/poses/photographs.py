@@ -23,7 +23,7 @@ from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
 MASK_FOLDERS = ("mask", "masks", "idrmasks")
 """Folders beside or below photographs that hold masks."""
 RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
-"""Files that tell, beside a config.json, the folder of a run."""
+"""Files that identify, with a config.json, the folder of a run."""
 SHOWN_FOLDERS = 10
 """Folders of photographs that a note names."""
 MATCHING_SIDE = 2000
@@ -49,9 +49,9 @@ class Photograph:
     orientation: int
     """EXIF orientation, 1 to 8."""
     device: str
-    """Maker, model and equivalent focal length of the device; empty where EXIF does not say."""
+    """Maker, model and equivalent focal length of the device; empty without EXIF."""
     focal: float | None
-    """Focal length by EXIF, in longer sides of the image; None where it does not say."""
+    """Focal length by EXIF, in longer sides of the image; None if unknown."""
     digest: str
     """SHA-256 of the file."""
 
@@ -93,7 +93,7 @@ def find_photographs(folder: Path) -> list[Path]:
 
 
 def folder_notes(folder: Path) -> list[str]:
-    """Return notes on skipped runs, and on where the photographs lie if they lie in several folders."""
+    """Return notes on skipped runs, and on the folders of the photographs if there are several."""
     root = image_root(folder)
     files, runs = _sorted_out(folder)
     count = Counter(p.parent.relative_to(root).as_posix() for p in files)

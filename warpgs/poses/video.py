@@ -25,7 +25,7 @@ MAX_FRAME_PIXELS = 2**26
 MAX_TOTAL_PIXELS = 2**40
 """Most pixels of all frames that are read: an hour and a half of 4K at 25 frames a second."""
 START = 12
-"""First bytes of a file, which tell its container."""
+"""First bytes of a file, which identify its container."""
 BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
 """First boxes of MP4 and MOV files (ISO/IEC 14496-12, QuickTime)."""
 

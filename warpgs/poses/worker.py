@@ -30,7 +30,7 @@ MIN_RATIO = 0.6
 PEAK = 0.003
 """Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on temple and fern."""
 CAMERA_MODEL = "SIMPLE_RADIAL"
-"""One focal length and one coefficient of distortion: what a handful of photographs can tell."""
+"""One focal length and one coefficient of distortion, which a few photographs can determine."""
 
 KEEP_FOCAL = 4
 """Most photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""

@@ -23,9 +23,9 @@ CODE = 1
 
 
 def cache_folder() -> Path:
-    """Return where warpgs may keep what it can make again: WARPGS_CACHE, or the place that the system has for such files.
+    """Return the cache folder: WARPGS_CACHE, or the system's folder for caches.
 
-    Where the user has no home folder it is a private folder of this process, and a line on stderr says so.
+    Without a home folder it is a private folder of this process, with a line on stderr.
 
     Raises:
         ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE lies in one that is

@@ -59,7 +59,8 @@ class PairDepth:
     sensitivity: np.ndarray
     """|dz/dpx| [u/px], shape [N]; infinite where a slide of half a pixel leads behind a camera or to infinity."""
     valid: np.ndarray
-    """True where both depths are positive, parallax suffices, the foot lies in the second image and all is finite."""
+    """True where both depths are positive, the parallax suffices, the nearest point of the line is in the second image and all
+    is finite."""
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
@@ -107,7 +108,7 @@ def epipolar_depth(
 
     Args:
         first: Camera whose pixels get a depth.
-        second: Camera that the matches lie in.
+        second: Camera of the matches.
         pixels: Positions in the first image [px], shape [N, 2].
         matches: Position of each in the second image [px], shape [N, 2]; NaN where there is no match.
         min_parallax: Smallest angle between the rays [deg].

@@ -213,7 +213,7 @@ def votes(
 def with_given_depth(
     views: Sequence[View], found: Sequence[ViewDepth] | None, known: PointCloud
 ) -> tuple[list[ViewDepth], list[str]]:
-    """Return the depth of each view with what is given in it, and notes.
+    """Return the depth of each view, combined with its given depth, and notes.
 
     A depth of an `exact` map counts unless more views look through it than confirm it, and comes before a searched one.
     Another counts where a view confirms it and the search found nothing or something else. ``ViewDepth.given`` has all depths
@@ -221,7 +221,7 @@ def with_given_depth(
 
     Args:
         views: Training views, pinholes.
-        found: Searched depth of each that other views confirm; None where none was searched for.
+        found: Estimated depth of each that other views confirm; None if not estimated.
         known: Points of the reconstruction.
 
     Raises:

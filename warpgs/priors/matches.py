@@ -34,7 +34,7 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
 
     Args:
         view: The view.
-        max_pixels: Number of pixels to which a larger image is reduced first; None to leave it as it is.
+        max_pixels: Number of pixels to which a larger image is reduced first; None for the full size.
         most: Largest number of features, those of highest contrast; 0 for all.
     """
     import cv2
@@ -111,8 +111,7 @@ def _triangulate(
 def triangulate_matches(views: list[View]) -> PointCloud:
     """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that agree with the known poses.
 
-    Returns:
-        N points [u] with the colours of their pixels in [0, 1]; none where nothing matched.
+    Returns: N points [u] with the colours of their pixels in [0, 1]; none without matches.
     """
     centers = [v.camera.center for v in views]
     pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))

@@ -53,21 +53,22 @@ PROGRESS_INTERVAL = 5.0
 
 @dataclass(frozen=True)
 class PhotoCheck:
-    """One photograph beside others, at the places that both show; None where too few places matched."""
+    """Comparison of one photograph with others at matched points; None with too few matches."""
 
     name: str
     """Name of the view."""
     compared_with: int
     """Number of photographs that it could be compared with."""
     sharpness: float | None
-    """Fine detail relative to coarse, as a fraction of what the other photographs have; 1 where it is as sharp as they are."""
+    """Fine detail relative to coarse detail, as a fraction of that of the other photographs; 1 if it is as sharp as they
+    are."""
     brightness: float | None
     """Factor to the brightness of the other photographs, the mean of the three channels."""
     channels: tuple[float, float, float] | None
     """Factor of red, green and blue."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the figures by name, as metrics.json holds them."""
+        """Return the figures by name, for metrics.json."""
         return asdict(self)
 
     @property
@@ -190,7 +191,7 @@ def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
 
 
 def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
-    """Return the sentences that name photographs with faults, and how many could not be compared; none where all is well."""
+    """Return notes on photographs with faults, and on the number that could not be compared; none without faults."""
     notes = []
     blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
     if blurred:

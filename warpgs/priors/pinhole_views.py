@@ -13,12 +13,12 @@ from warpgs.scene import Camera, View, ViewDepth
 
 
 def pinhole_view(view: View) -> View:
-    """Return a view resampled to a pinhole of the same K and size; a pinhole's view is returned as it is.
+    """Return a view resampled to a pinhole of the same K and size; a pinhole's view is returned unchanged.
 
     Pixels that the lens did not see leave the mask; of a wide fisheye the rim is lost.
 
     Raises:
-        UsageError: The camera is orthographic, or its model is known to the kernels alone.
+        UsageError: The camera is orthographic, or its model is only supported by the kernels.
     """
     import cv2
 

@@ -98,7 +98,7 @@ def side_file(model: Path) -> Path:
 
 
 def read_side_file(model: Path) -> dict:
-    """Return the entries of the JSON file beside a model; none where there is no such file.
+    """Return the entries of the JSON file beside a model; none without such a file.
 
     Raises:
         DataError: The file is no JSON object, or holds a key or a value that means nothing.
@@ -133,7 +133,7 @@ def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) 
         The description, and notes on values that were assumed.
 
     Raises:
-        DataError: The file beside the model is not what it must be.
+        DataError: The file beside the model is invalid.
         UsageError: A size was requested that the graph does not allow.
     """
     given = {k: v for k, v in flags.items() if v}

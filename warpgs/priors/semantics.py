@@ -24,7 +24,7 @@ DEFAULTS = Preprocessing(512, 32, *IMAGENET, output="classes")
 BOUNDARY_WIDTH = 2 / 500
 """Standard deviation of omega_boundary, in image widths: 2 px at 500 px."""
 MIN_FOREGROUND = 0.01
-"""Smallest mean foreground; below it the network knows nothing that the image shows."""
+"""Smallest mean foreground; below it the network recognises nothing in the image."""
 SMOOTHING = 1000.0
 """Strength of the smoothing of saliency within flat regions [px^2]."""
 L0_WEIGHT, L0_GROWTH = 0.04, 2.0
@@ -128,7 +128,7 @@ def _fast_length(length: int) -> int:
 
 
 def classical_semantics(image: np.ndarray) -> SemanticMaps:
-    """Return the maps of an image [H, W, 3] in [0, 1] without a network, from its colours alone.
+    """Return the maps of an image [H, W, 3] in [0, 1] without a network, from its colours.
 
     L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
     fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
@@ -158,7 +158,7 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
 
 
 def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
-    """Return `classical_semantics` of each image; ``tell`` takes a line on each.
+    """Return `classical_semantics` of each image; ``tell`` is called with a line for each.
 
     A thread works on one, so results do not depend on the number of threads.
     """
@@ -168,7 +168,7 @@ def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] =
 
 
 def knows_foreground(maps: SemanticMaps) -> bool:
-    """Return True where the maps tell an object from its background.
+    """Return whether the maps separate an object from its background.
 
     They do not where the mean foreground stays below 1 % (tabletop scans hold no VOC class), or where every pixel is labelled
     background with a mean foreground below a half.

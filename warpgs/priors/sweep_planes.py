@@ -43,7 +43,7 @@ class SweepConfig:
     max_pixels: int = 200_000
     """Largest number of pixels of an image; larger ones are swept at a reduced size."""
     small_step: float = 0.03
-    """Penalty for a depth one plane off the neighbouring pixel's (P1); costs lie in [0, 1]."""
+    """Penalty for a depth one plane off the neighbouring pixel's (P1); costs are in [0, 1]."""
     large_step: float = 0.5
     """Penalty for any other depth (P2) where the image is even; less across its edges, but above 1.5 P1."""
     max_round_trip: float = 0.6
@@ -77,7 +77,7 @@ def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: 
 
 
 def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return True where pixels [..., 2] [px] lie in the image of ``camera``; NaN does not."""
+    """Return True where pixels [..., 2] [px] are in the image of ``camera``; False for NaN."""
     return (pixels >= 0).all(-1) & (pixels[..., 0] < camera.width) & (pixels[..., 1] < camera.height)
 
 

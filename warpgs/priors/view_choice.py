@@ -96,7 +96,7 @@ def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: i
 
 
 def spread_views(sight: Sight, most: int) -> list[int]:
-    """Return at most that many views, ascending, that together see most of what all see.
+    """Return at most that many views, ascending, that together cover most of the area of all views.
 
     One by one the view is taken by which the views' best overlap with any view taken grows most: the greedy choice for a
     submodular sum, at least 1 - 1/e of the best (Nemhauser et al. 1978).

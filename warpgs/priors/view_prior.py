@@ -225,13 +225,12 @@ def view_priors(
         regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.
-        tell: Takes a line on each view.
+        tell: Called with a line for each view.
 
-    Returns:
-        A prior per view, and notes on what was chosen, assumed or missing.
+    Returns: A prior per view, and notes on choices, assumptions and missing inputs.
 
     Raises:
-        DataError: A model is not what it must be, or its output is no map.
+        DataError: A model is invalid, or its output is not a map.
         UsageError: A flag contradicts a model.
         ResourceError: onnxruntime or its provider is missing.
     """

@@ -3,7 +3,7 @@
 At training sizes the host takes longer to launch twenty kernels than the GPU to run them. A loop repeats its calls: the same
 tensors, with other values in them, and another camera. Its memory requests repeat, too, and so torch gives it the same
 addresses. A graph that was captured at certain addresses is replayed where a call gets those again; elsewhere the kernels are
-launched one by one. The bits are the same, and so is the memory, but for the spare capacity for instances.
+launched one by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class GraphedRasterizer:
         self._black: torch.Tensor | None = None
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
-        """Return images, projected Gaussians and tile counts; None where the instances exceed the capacity.
+        """Return images, projected Gaussians and tile counts; None if the instances exceed the capacity.
 
         Args:
             inputs: The tensors, without opacity factors.
@@ -270,7 +270,7 @@ class Recorder:
         """Key of the last call that exceeded its capacity, and what it needed."""
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
-        """Return what `GraphedRasterizer.render` returns; None where the call must run without graphs.
+        """Return the result of `GraphedRasterizer.render`; None if the call must run without graphs.
 
         ``inputs`` are without opacity factors; ``backgrounds`` [C, 3] may be None.
         """
@@ -322,7 +322,7 @@ class Recorder:
         self.rasterizer, self._key, self._calls, self._too_large = None, None, 0, False
 
     def clear(self) -> None:
-        """Give back all memory, and begin anew as if there had been no call."""
+        """Free all memory and reset the state, as before the first call."""
         with self.graphs.lock:
             self._drop()
             self.graphs.release()

@@ -9,7 +9,7 @@ from warpgs.scene import Camera
 
 
 def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list[tuple[Any, ...]]:
-    """Return Gaussians, camera and options of each of C cameras; what is no list is the same for all.
+    """Return Gaussians, camera and options of each of C cameras; single values are shared by all.
 
     Raises:
         ValueError: A list has another length.

@@ -1,4 +1,4 @@
-"""Pixels instead of an image: the window that holds them, the tiles that they lie in, and their values."""
+"""Pixels instead of an image: their window, their tiles and their values."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
     """Return the smallest window of whole tiles that holds pixels [..., P, 2]; this reads them from the device.
 
     Raises:
-        ValueError: A pixel lies outside the image.
+        ValueError: A pixel is outside the image.
     """
     if not pixels.shape[-2]:
         return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)

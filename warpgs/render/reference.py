@@ -127,7 +127,7 @@ def reference_image(
         Colours, not clamped, shape [h, w, 3].
 
     Raises:
-        UsageError: The camera model is known to the kernels alone.
+        UsageError: The camera model is only supported by the kernels.
     """
     lenses.check_known(camera.model)
     g, device = _project(gaussians, camera, degree, antialiased), gaussians.means.device

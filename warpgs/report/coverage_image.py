@@ -13,7 +13,7 @@ STRIPES = 90
 
 
 def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> np.ndarray:
-    """Return a render with stripes of magenta over what no training view saw, and a tint of amber over what one saw.
+    """Return a render with magenta stripes where no training view saw the surface, and an amber tint where one did.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3]; values outside are clamped.

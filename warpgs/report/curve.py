@@ -28,7 +28,7 @@ def tick_label(value: float) -> str:
 def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
     """Return an SVG chart of ``ys`` over ``xs`` (steps); long series are shown by the means of at most 300 groups.
 
-    Points that are not finite are left out; without any finite point the chart says so.
+    Non-finite points are left out; without any finite point the chart has a note.
     """
     points = [(x, y) for x, y in zip(xs, ys) if math.isfinite(x) and math.isfinite(y)]
     group = max(1, math.ceil(len(points) / MAX_POINTS))

@@ -25,8 +25,8 @@ _STEP = schema.fields({"step": schema.whole(0)})
 class EventLog:
     """A log to which events are appended; a resumed fit first drops the events after its checkpoint.
 
-    It is the one file that is not replaced as a whole: it grows by lines, and only at its end. What a killed fit leaves is
-    whole but for the last line, which readers skip and a resumed fit drops.
+    It is the one file that is not replaced as a whole: it grows by lines, and only at its end. After a kill only the last line
+    can be incomplete; readers skip it and a resumed fit drops it.
     """
 
     _file: BinaryIO | None = None
@@ -95,8 +95,8 @@ class EventLog:
 def read_events(path: Path) -> list[dict]:
     """Return all events of a log in file order.
 
-    A line that is no object with a whole-numbered ``step`` and numbers alone is skipped, because a killed run may leave its
-    last line incomplete. Null is read as NaN, so that a series has a number at every step.
+    A line that is not an object of numbers with an integer ``step`` is skipped, because a killed run may leave an incomplete
+    last line. Null is read as NaN, so that a series has a number at every step.
 
     Raises:
         DataError: The log cannot be read, or is larger than `MAX_BYTES`.

@@ -116,7 +116,7 @@ def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
 
 
 def write_farm_page(path: Path, title: str, cards: list[JobCard], seconds: float) -> None:
-    """Write the page of a farm, as `farm_page` has it; images and reports are linked, from where they lie.
+    """Write the page of `farm_page`, with links to images and reports.
 
     Raises:
         ResourceError: The file cannot be written.

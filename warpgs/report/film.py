@@ -32,7 +32,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     Raises:
         DataError: There are no frames, or they differ in size.
         ResourceError: This OpenCV has no VP9 encoder, or the file cannot be written.
-        UsageError: The suffix is none of `SUFFIXES`, or an animated image would be too large or too fast.
+        UsageError: The suffix is not in `SUFFIXES`, or an animated image would be too large or too fast.
     """
     suffix = path.suffix.lower()
     if suffix in ANIMATIONS:

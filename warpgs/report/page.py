@@ -172,7 +172,7 @@ class Page:
     figures: list[tuple[str, str]]
     """Label and value of each key figure."""
     notes: list[str]
-    """Choices made for the user; a `Detail` stands in the last section."""
+    """Automatic choices; a `Detail` is shown in the last section."""
     table: list[list[str]]
     """Header row, then a row per held-out view."""
     views: list[ViewImages]
@@ -180,13 +180,13 @@ class Page:
     curves: list[str]
     """SVG charts."""
     sampling: SamplingReport | None
-    """The fit's sampling events, or None where it had none."""
+    """The fit's sampling events; None without events."""
     overview: bytes | None
     """Image of cameras and points, or None."""
     protocol: dict[str, str]
     """Settings in which two scores must agree to be compared, and the definition of each figure, by name."""
     details: dict
-    """Configuration, versions and data, shown as JSON on request; of paths the last name alone."""
+    """Configuration, versions and data, shown as JSON on request; paths are reduced to the last name."""
     coverage: CoverageReport | None = None
     """Scores of held-out views by what training views saw, or None."""
     held_out: bool = True

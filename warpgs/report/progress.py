@@ -19,7 +19,7 @@ STAGE_INTERVAL = 5.0
 SMOOTHING = 0.05
 """Weight of the newest value in the running means shown."""
 COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
-"""Part of a line that says how far a stage is."""
+"""Part of a line with the progress of a stage."""
 
 
 def duration(seconds: float) -> str:
@@ -33,7 +33,7 @@ def duration(seconds: float) -> str:
 
 
 def is_live() -> bool:
-    """Return whether stdout is a terminal in which a line can be written anew."""
+    """Return whether stdout is a terminal in which a line can be overwritten."""
     stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich stands before it
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
 
@@ -95,7 +95,7 @@ _PANELS: list[Progress] = []
 
 
 class Stages:
-    """Lines on what is being done, such as ``finding depth: view 7 of 24``.
+    """Lines about the current work, such as ``finding depth: view 7 of 24``.
 
     What stands before the last colon names a stage; where numbers follow, ``7 of 24``, there is a bar. In a terminal one line
     is written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`.
@@ -138,7 +138,7 @@ class Stages:
 
 
 def waiting() -> Stages:
-    """Return stages that are shown in a terminal and nowhere else, for waits that no log needs to tell of."""
+    """Return stages that are shown only in a terminal, for waits that no log needs."""
     return Stages(lambda line: None, live=is_live())
 
 

@@ -120,7 +120,7 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
         background: white or black.
 
     Raises:
-        ResourceError: This machine cannot render; the message says what to install.
+        ResourceError: This machine cannot render; the message names the packages to install.
     """
     inside = _inside(plot.points)
     points, colors = plot.points[inside], plot.colors[inside]

@@ -19,7 +19,7 @@ ALIGNMENT = 256
 
 
 class Allocator:
-    """Provider of a function's tensors; this one asks torch for each."""
+    """Provider of a function's tensors; this one allocates each with torch."""
 
     def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
         """Return a new tensor of a shape [...] that the caller may keep."""
@@ -35,7 +35,7 @@ class Allocator:
 
 
 TORCH = Allocator()
-"""The allocator that asks torch."""
+"""The allocator of torch."""
 
 
 def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
@@ -44,7 +44,7 @@ def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
 
 
 class SizingAllocator(Allocator):
-    """An allocator that asks torch, and notes the sizes that a function asks for."""
+    """An allocator of torch that records the requested sizes."""
 
     def __init__(self):
         self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []

@@ -25,7 +25,7 @@ MIN_REPLAYS = 30
 FREE_CAPTURES = 16
 """Captures of a function that need not have paid: a loop takes a while until its addresses repeat."""
 SMALL_BYTES = 2**16
-"""Size of a workspace up to which it is kept, since to ask for it at each call costs more."""
+"""Size of a workspace up to which it is kept, because allocating it at each call takes longer."""
 
 _CAPTURING = threading.Lock()
 """Lock held during a capture."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import torch
 
 ASSUMED_BYTES = 2 * 2**30
-"""Memory of a machine that does not say how much it has; small machines have this much."""
+"""Assumed memory of a machine that does not report it, that of a small machine."""
 
 OWN_CGROUPS = Path("/proc/self/cgroup")
 CGROUPS = Path("/sys/fs/cgroup")
@@ -45,7 +45,7 @@ def available_bytes(device: torch.device) -> int:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error, or one that it came from, says that memory does not suffice."""
+    """Return whether an error, or one of its causes, reports too little memory."""
     found: BaseException | None = error
     while found is not None:
         text = str(found).lower()
@@ -75,7 +75,7 @@ def installed_bytes(device: torch.device) -> int:
 
 
 def machine_memory() -> Memory | None:
-    """Return the memory of the machine within the limits of the container, if any; None where the system says nothing."""
+    """Return the memory of the machine within the limits of the container, if any; None if unknown."""
     found = [m for m in (_system_memory(), container_memory()) if m is not None]
     if not found:
         return None
@@ -85,7 +85,7 @@ def machine_memory() -> Memory | None:
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
     """Return the tightest limit that control groups set on this process, and the least that is left below one.
 
-    Linux alone has control groups; elsewhere, and where no group sets a limit, this is None. Both versions are read, from the
+    Only Linux has control groups; on other systems, and without a limit, this is None. Both versions are read, from the
     process's own group up to the root, since every group above counts too (kernel documentation, cgroup-v2 "Memory" and
     cgroup-v1 "Memory Resource Controller"). Pages of files not used lately count as free: the kernel drops them first.
 

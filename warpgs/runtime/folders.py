@@ -13,7 +13,7 @@ from warpgs.temporary import temporary_folder
 
 
 def cache_home() -> Path | None:
-    """Return the folder that the system has for a user's caches; None where the user has no home folder.
+    """Return the system's folder for a user's caches; None without a home folder.
 
     XDG_CACHE_HOME or ~/.cache, ~/Library/Caches on macOS, %LOCALAPPDATA% on Windows. Nothing is created.
     """

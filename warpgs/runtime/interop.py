@@ -134,7 +134,7 @@ def rows(tensor: torch.Tensor, dtype) -> View:
 def span(tensor: torch.Tensor, dtype) -> View:
     """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with what lies between them.
 
-    Rows are contiguous, and ``tensor.stride(-2)`` leads from each to the next.
+    Rows are contiguous, and `View.row_stride` leads from each to the next.
     """
     return View(tensor, dtype, 0)
 
@@ -182,21 +182,6 @@ _LOADING = threading.Lock()
 in which kernels are not safe either, while one runs."""
 _SORTING = threading.RLock()
 """Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
-
-
-@functools.lru_cache(maxsize=64)
-def _array_at(address: int, size: int, dtype: object, device: torch.device) -> wp.array:
-    """Return memory at an address as a Warp array, which does not own it: whoever reads it holds the tensor."""
-    return wp.array(ptr=address, shape=size, dtype=dtype, device=warp_device(device))
-
-
-def sort_pairs(keys: View, values: View, count: int, **bits: int) -> None:
-    """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace.
-
-    On a GPU it runs on the stream of `stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
-    """
-    arrays = (_array_at(t.data_ptr(), t.numel(), dtype, t.device) for t, dtype, _ in (keys, values))
-    wp.utils.radix_sort_pairs(*arrays, count, **bits)
 
 
 @contextlib.contextmanager
@@ -379,14 +364,14 @@ def _symbols(pattern: str) -> tuple[str | int, ...]:
 def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
 
-    A capital letter stands for a size that must agree wherever it occurs.
+    A capital letter is a size that must agree wherever it occurs.
 
     Returns:
         The sizes by letter.
 
     Raises:
         TypeError: An argument is no tensor, or its scalar type is neither float32 nor float64, or types differ.
-        ValueError: A shape or a device disagrees; the message names the argument, what was wanted and what was found.
+        ValueError: A shape or a device disagrees; the message names the argument, expected and found.
     """
     sizes: dict[str, int] = {}
     first_name, first = "", None

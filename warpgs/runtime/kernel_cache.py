@@ -1,6 +1,6 @@
 """The folder of compiled kernels: the one that Warp would take, if it can be written and by nobody else; else a private one.
 
-Warp runs what it finds there, so whoever can write to it can run code as this user.
+Warp runs the kernels that it finds there, so anyone with write access can run code as this user.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class KernelCache(NamedTuple):
 
 @functools.cache
 def prepare_kernel_cache() -> KernelCache:
-    """Choose the folder and tell Warp; to be called before `wp.init`. One line on stderr says if it is a private one.
+    """Choose the folder and tell Warp; to be called before `wp.init`. If it is a private one, a line is printed on stderr.
 
     Raises:
         ResourceError: No folder at all can be written.

@@ -1,4 +1,4 @@
-"""Guards of everything that listens: sockets of this machine alone, and who may talk to a page that is served there.
+"""Guards of all servers: sockets of this machine only, and checks of the clients of a served page.
 
 Any page in a browser can send requests to any port of the machine that its reader sits at, and so can every program of every
 user of the machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start,
@@ -54,7 +54,7 @@ def loopback_socket(port: int, fix: str, host: str = HOST) -> socket.socket:
 
 
 def loopback_of(name: str) -> str | None:
-    """Return the loopback address that a host name or address stands for, 127.0.0.1 before ::1; None for other hosts."""
+    """Return the loopback address of a host name or address, 127.0.0.1 before ::1; None for other hosts."""
     try:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
     except (OSError, UnicodeError):  # it cannot be resolved; whoever connects to it says so
@@ -158,14 +158,14 @@ class WebGuard:
         return f"http://{HOST}:{port}/{self.token}/"
 
     def admitted_path(self, target: str, hosts: Sequence[str], origins: Sequence[str], upgrade: bool) -> str | None:
-        """Return the path below the token that a request asks for, or None where it must be refused.
+        """Return the requested path below the token, or None if the request must be rejected.
 
         Args:
             target: Target of the request line. One with a query is rejected: pages obey parameters that others choose.
             hosts: Values of all headers ``Host``. There must be one, with one of `NAMES`: a foreign name that resolves to
                 127.0.0.1 is rejected.
             origins: Values of all headers ``Origin``. Each must be the server's own, and a websocket must have exactly one.
-            upgrade: Whether a websocket is requested, which is found at the top alone.
+            upgrade: True if a websocket is requested, which only exists at the top path.
         """
         if len(hosts) != 1 or not _is_own(hosts[0]):
             return None

@@ -12,7 +12,7 @@ from warpgs.runtime.output_streams import open_missing_descriptors
 
 @contextlib.contextmanager
 def hidden_stderr() -> Iterator[None]:
-    """Hide what is written to stderr in the block, by native libraries too; that of other threads is hidden with it."""
+    """Hide the output to stderr in the block, also that of native libraries and other threads."""
     open_missing_descriptors()
     _flush(2)
     saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
@@ -27,7 +27,7 @@ def hidden_stderr() -> Iterator[None]:
 
 @contextlib.contextmanager
 def output_to(descriptor: int) -> Iterator[None]:
-    """Send what is written to stdout and stderr in the block to an open file, by native libraries and other threads too."""
+    """Send stdout and stderr in the block to an open file, also for native libraries and other threads."""
     open_missing_descriptors()
     _flush(1, 2)
     saved = [os.dup(number) for number in (1, 2)]

@@ -16,7 +16,7 @@ def let_idle_threads_sleep() -> None:
     """Let OpenMP's idle threads sleep in this process, if torch is not imported yet, and in its children.
 
     Between its loops OpenMP keeps its threads spinning, on cores that our own launches need. On two busy cores a backward pass
-    then took six times as long. A variable that is set already is left as it is.
+    then took six times as long. A variable that is already set is not changed.
     """
     os.environ.setdefault(VARIABLE, "passive")
 

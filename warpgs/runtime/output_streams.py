@@ -1,4 +1,4 @@
-"""Output that cannot be written: said once on stderr, and no reason for a command to stop.
+"""Output that cannot be written: one line on stderr, and the command continues.
 
 A pipe whose reader has gone, a full disk, a closed descriptor, a terminal that has hung up: from the first write that fails
 on, output goes to the null device, that of native libraries too.
@@ -167,5 +167,5 @@ def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
 
 
 def careful(stream: TextIO) -> TextIO:
-    """Return a stream as it is where its writes do not fail, else wrapped; for displays that draw while a fit goes on."""
+    """Return a stream unchanged if its writes do not fail, else wrapped; for displays that draw during a fit."""
     return stream if isinstance(stream, CarefulStream) else cast(TextIO, CarefulStream(stream, "stdout"))

@@ -130,7 +130,7 @@ class RankWatch:
             time.sleep(3 * BEAT_SECONDS)  # with this process the store may go, from which the others hear of it
 
     def settle(self, seconds: float) -> None:
-        """Wait for the thread to end this process, which it does once it knows who is lost; at most so long [s]."""
+        """Wait at most so long [s] for the thread to end this process, which it does when it knows the lost rank."""
         time.sleep(seconds + 2 * BEAT_SECONDS)
 
     def leave(self) -> None:

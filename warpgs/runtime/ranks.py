@@ -1,4 +1,4 @@
-"""Processes that fit one scene together: who they are, what they exchange, and what ends them when one is lost.
+"""Processes that fit one scene together: their identity, their exchange, and their end when one is lost.
 
 They are started by torchrun, or with the variables that it sets: RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT.
 Numbers go by NCCL between GPUs and by gloo between CPUs. Neither tells in time that a process is gone (a kernel of NCCL waits
@@ -30,7 +30,7 @@ EXCHANGE_TIME = timedelta(days=1)
 
 
 class Ranks:
-    """The processes of a fit; of this class itself where there is one alone."""
+    """The processes of a fit; this class itself for a single process."""
 
     rank = 0
     """Number of this process."""
@@ -132,7 +132,7 @@ def _number(name: str, least: int, most: int, default: str | None = None) -> int
 
 
 def place() -> tuple[int, int]:
-    """Return rank and number of the processes that this one was started as, 0 and 1 for one alone.
+    """Return rank and number of the processes, 0 and 1 for a single one.
 
     Raises:
         UsageError: The variables are no such numbers.
@@ -144,7 +144,7 @@ def place() -> tuple[int, int]:
 
 
 def join(device: str) -> Ranks:
-    """Wait for the other processes that were started with this one; returns `ALONE` where there are none.
+    """Wait for the other processes that were started with this one; returns `ALONE` without others.
 
     Args:
         device: auto, cpu or cuda; with CUDA each process takes the GPU of its number on this machine.
@@ -241,7 +241,7 @@ def last_words(line: str, code: int) -> int:
 
 
 def place_or_first() -> tuple[int, int]:
-    """Return `place`, or that of the first process where the variables say nothing of use."""
+    """Return `place`, or that of the first process if the variables are unusable."""
     try:
         return place()
     except UsageError:

@@ -80,7 +80,7 @@ def interrupting_signals() -> Iterator[None]:
 def noted_signals() -> Iterator[Callable[[], bool]]:
     """Note the first signal, so that the body can end in good order; a second one raises KeyboardInterrupt in it.
 
-    Gives a function that says whether one came.
+    Gives a function that returns whether a signal came.
     """
     came = False
 
@@ -96,6 +96,6 @@ def noted_signals() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def ignored_signals() -> Iterator[None]:
-    """Let signals pass while the body says the last words of a program that they end already."""
+    """Let signals pass while the body prints the last lines of a program that is already ending."""
     with _handled(signal.SIG_IGN):
         yield

@@ -40,7 +40,7 @@ def _stdin_until_our_end() -> Iterator[int]:
 def run_python(
     code: str, *arguments: str, timeout: float, environment: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run Python code in another process, and return its exit code and what it wrote.
+    """Run Python code in another process, and return its exit code and its output.
 
     It works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it nor what it starts
     looks for modules in the current folder (``-P``, PYTHONSAFEPATH): that may be a scene from anywhere, with a numpy.py in it.

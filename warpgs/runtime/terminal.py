@@ -45,7 +45,7 @@ def be_quiet() -> None:
 def say(line: object = "", *, error: bool = False) -> None:
     """Print one line at once: `printable`, and with codes for the letters that the terminal does not have.
 
-    Where it cannot be written, a line on stderr says so once, and the program goes on.
+    If it cannot be written, one line is printed on stderr, and the program continues.
 
     Args:
         line: The line.
@@ -79,12 +79,12 @@ def _print(line: object, error: bool) -> None:
 
 
 def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
-    """Yield items, and tell before each how many are done: ``scoring: 3 of 12 views``.
+    """Yield items, and print before each how many are done: ``scoring: 3 of 12 views``.
 
     Args:
         items: The items.
         tell: Takes a line.
-        what: What is done with the items.
+        what: Name of the work on the items.
         unit: Word for several of them.
     """
     for done, item in enumerate(items):

@@ -241,13 +241,13 @@ def write_object(
         width: Image width [px].
         height: Image height [px].
         seed: Decides the object.
-        tell: Takes a line on each view before it is rendered.
+        tell: Called with a line for each view before it is rendered.
 
     Returns:
         The split to use: eight training views around the object, all others held out.
 
     Raises:
-        UsageError: The folder is not empty, the sizes are too small, or the format is none of the two.
+        UsageError: The folder is not empty, the sizes are too small, or the format is unknown.
         ResourceError: The folder cannot be written.
     """
     if form not in FORMATS:

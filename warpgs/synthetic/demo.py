@@ -315,7 +315,7 @@ def write_demo(
         width: Image width [px].
         height: Image height [px].
         seed: Seed of the patterns and of the choice of points.
-        tell: Takes a line on each view before it is rendered.
+        tell: Called with a line for each view before it is rendered.
 
     Returns:
         The split to use: six training views along the camera path, all others held out.

@@ -67,7 +67,7 @@ class Rules:
             inner: viser's own, which returns files.
             protocol: Name of the protocol that a websocket must speak.
             connection: The connection.
-            request: The request, as websockets has it.
+            request: The request of websockets.
         """
         from websockets.datastructures import Headers
 

@@ -33,9 +33,9 @@ class Content:
     stem: Path
     """Beginning of the paths of files that are saved from the viewer: RUN/ or x. of x.ply."""
     fine: torch.Tensor | None = None
-    """True for Gaussians of the fine layer, bool, shape [N]; None where no layers are known."""
+    """True for Gaussians of the fine layer, bool, shape [N]; None without layers."""
     views: Mapping[str, View] = field(default_factory=dict)
-    """Views by name, with their photographs; none where the scene cannot be read."""
+    """Views by name, with their photographs; empty if the scene cannot be read."""
     sheet: Path | None = None
     """PNG that shows where fine Gaussians were placed, or None."""
 

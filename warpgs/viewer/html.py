@@ -36,7 +36,7 @@ POLICY = (
 NO_REMARKS = "<style>.mantine-Notifications-root{display:none}</style>"
 """Style that hides viser's remark on browsers without a GPU, which stood before the model."""
 NO_SCENE_TREE = '<style>:has(>[aria-label$="scene tree"]){display:none!important}</style>'
-"""Style that hides viser's button for the scene tree, in which stands one name."""
+"""Style that hides viser's button for the scene tree, which has only one entry."""
 HELP = (
     "<style>#warpgs-help{position:fixed;top:.8em;right:.8em;z-index:2;font:13px sans-serif;color:#fff;text-shadow:0 0 3px #000}"
     "#warpgs-help button{font:inherit;margin-left:.5em;cursor:pointer}</style>"
@@ -75,7 +75,7 @@ def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def plain_background(color: Sequence[float]) -> np.ndarray:
-    """Return an image of one colour in [0, 1], uint8, shape [2, 2, 3], to stand behind the scene."""
+    """Return an image of one colour in [0, 1], uint8, shape [2, 2, 3], as background of the scene."""
     return np.full((2, 2, 3), np.round(255 * np.clip(color, 0, 1)), np.uint8)
 
 
@@ -85,10 +85,10 @@ def page_of(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "warpgs",
 ) -> tuple[str, list[str]]:
-    """Return the page as text, and notes for the user on what it shows otherwise than a render would.
+    """Return the page as text, and notes for the user on differences from a render.
 
-    The page holds the Gaussians in units of their own (`packed`), without directions: colours are those of degree 0. No name
-    of a file, a view or a machine is in it, but for ``title``.
+    The page holds the Gaussians in units of their own (`packed`), without directions: colours are those of degree 0. It
+    contains no name of a file, a view or a machine, except ``title``.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
@@ -157,7 +157,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     Args:
         folder: The run folder.
         target: The file to write.
-        filters: Filters of the model; it is cleaned where they do not say.
+        filters: Filters of the model; it is cleaned by default.
 
     Raises:
         DataError: The folder is not a run, or nothing is left of its model.

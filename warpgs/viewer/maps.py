@@ -28,7 +28,7 @@ MAPS = {
 }
 """Images by name, with their descriptions."""
 NEAR = 1e-3
-"""Distance from a camera within which a view stands at it, as a fraction of the cameras' extent."""
+"""Distance from a camera within which a view counts as at the camera, as a fraction of the cameras' extent."""
 
 
 class Maps:
@@ -40,7 +40,7 @@ class Maps:
         self._depths: list[DepthView] | None = None
 
     def view_at(self, camera: Camera) -> str | None:
-        """Return the name of the camera of the model that a camera stands at; None where it stands at none."""
+        """Return the name of the model's camera at the same position as a camera; None without one."""
         cameras = self.content.model.scene_cameras.items()
         return next((n for n, c in cameras if stands_at(camera, c, NEAR * self.extent)), None)
 

@@ -20,10 +20,10 @@ _MARK_LOADED = (
 
 
 def live_page(text: str, nonce: str) -> str:
-    """Return viser's page for a content policy that runs scripts with a nonce alone.
+    """Return viser's page for a content policy that only runs scripts with a nonce.
 
     Args:
-        text: The page as viser has it.
+        text: The page of viser.
         nonce: Word of the policy, of letters that are safe in an attribute.
     """
     own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}</script>"

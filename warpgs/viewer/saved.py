@@ -30,7 +30,7 @@ class CropBox:
     """Rotation from the box's axes to the world's, shape [3, 3]."""
 
     def contains(self, means: torch.Tensor) -> torch.Tensor:
-        """Return which points [N, 3] lie inside, bool, shape [N]."""
+        """Return which points [N, 3] are inside, bool, shape [N]."""
         offsets = means.detach().cpu().double() - torch.from_numpy(self.center)
         inside = ((offsets[:, :, None] * torch.from_numpy(self.rotation)).sum(1).abs() <= torch.from_numpy(self.size / 2)).all(
             1
@@ -46,7 +46,7 @@ class CropBox:
 
 
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
-    """Return a camera of a path as JSON holds it.
+    """Return a camera of a path as JSON.
 
     Args:
         camera: Camera in scene units.

@@ -1,4 +1,4 @@
-"""The viewer's server: viser's, bound to this machine alone, without tunnels, and open to all who know its address."""
+"""The viewer's server: that of viser, bound to this machine, without tunnels, for clients with its full address."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def require_viser() -> None:
     """Check that viser is there.
 
     Raises:
-        ResourceError: It is not; the message says what to install.
+        ResourceError: It is not installed; the message names the package.
     """
     try:
         version("viser")

@@ -28,7 +28,7 @@ PHOTO_SIDE = 256
 MAP_SIDE = {"cpu": 480, "cuda": 1280}
 """Longer side of an image that is rendered here, by device [px]."""
 SETTLED = 0.15
-"""Time for which a browser's camera stands still before an image is rendered for it [s]."""
+"""Time without motion of a browser's camera before an image is rendered for it [s]."""
 HIDDEN = 3.0
 """Distance from a browser's eye within which cameras are hidden, in sizes of their frusta: they would hide the scene."""
 TRAIN_COLOR, TEST_COLOR = (20, 150, 150), (224, 138, 44)
@@ -84,7 +84,7 @@ class Window:
         self._thread.join(timeout=10)
 
     def shown(self) -> Gaussians:
-        """Return the Gaussians of the layer and the crop box that the panel asks for."""
+        """Return the Gaussians of the layer and the crop box selected in the panel."""
         gaussians, fine = self.content.model.gaussians(), self.content.fine
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
         if fine is not None and self.panel.layer() != ALL:

@@ -14,7 +14,7 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help.
 
     Raises:
-        UsageError: Flags do not go together, or a value is none of those that a flag takes.
+        UsageError: Flags exclude each other, or a value is invalid.
     """
     import tyro
 
@@ -37,8 +37,8 @@ def run(arguments: list[str], about: str) -> int:
 
     a = parse_flags(Demo, arguments, "warpgs demo", about)
     check_range("--views", a.views, 8, 10_000)
-    check_range("--width", a.width, 8, 8192)
-    check_range("--height", a.height, 8, 8192)
+    check_range("--width", a.width, 32, 8192)
+    check_range("--height", a.height, 32, 8192)
     check_range("--seed", a.seed, 0, 2**31 - 1)
     if a.format not in ("transforms", "colmap"):
         raise UsageError(f"--format must be transforms or colmap, not {a.format!r}")

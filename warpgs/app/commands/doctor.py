@@ -14,7 +14,7 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help.
 
     Raises:
-        UsageError: Flags do not go together, or a value is none of those that a flag takes.
+        UsageError: Flags exclude each other, or a value is invalid.
     """
 
     @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """`warpgs fit`: flags derived from `FitConfig`: names, defaults and help texts are those of its fields.
 
-Defaults depend on the preset; a strategy and loss terms bring settings of their own. So the few flags that decide which others
+Defaults depend on the preset; a strategy and loss terms have their own settings. So the few flags that decide which others
 there are, are looked up first. Parses, calls, prints; no logic.
 """
 

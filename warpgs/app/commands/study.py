@@ -40,7 +40,7 @@ def study_flags() -> type:
 
 
 def run_study_of(a, variants: dict, marks: dict) -> int:
-    """Run the study that parsed flags ask for."""
+    """Run the study of parsed flags."""
     from warpgs.app.scene_flags import scene_of
     from warpgs.pipeline.farm.run import EngineRequest
     from warpgs.pipeline.study.compare import run_study

@@ -7,7 +7,7 @@ import struct
 OLD_HEADER = 12
 """Bytes of the header of OS/2, with sides of 16 bits."""
 RAW, MASKED = 0, (3, 6)
-"""Ways to store pixels: as they are, and with masks that say which bits are which colour."""
+"""Ways to store pixels: plain, and with bit masks of the colours."""
 
 
 def _header(data: bytes) -> tuple[int, int, int, int, int]:

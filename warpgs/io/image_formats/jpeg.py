@@ -106,7 +106,7 @@ def _check_scans(data: bytes) -> None:
 
 
 def decode(data: bytes) -> np.ndarray | None:
-    """Return all pixels, uint8, [H, W, 3] in BGR or [H, W, 1] for gray; None where OpenCV must convert them (CMYK).
+    """Return all pixels, uint8, [H, W, 3] in BGR or [H, W, 1] for gray; None if OpenCV must convert them (CMYK).
 
     Raises:
         ValueError: Coded data is missing, or libjpeg-turbo warns of it.

@@ -1,4 +1,4 @@
-"""Formats of image files that are read, told by their first bytes."""
+"""Supported image formats, detected by the first bytes of a file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def format_of(data: bytes) -> tuple[str, ModuleType]:
     """Return name and module of the format of an image file, by its first bytes.
 
     Raises:
-        ValueError: It is none of them.
+        ValueError: The format is not supported.
     """
     for start, name, module in FORMATS:
         if data.startswith(start):

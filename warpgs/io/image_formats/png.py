@@ -94,7 +94,7 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
 
 def check(data: bytes) -> None:
-    """Check all checksums, and that the pixels are as many as the header says.
+    """Check all checksums, and the number of pixels against the header.
 
     Raises:
         ValueError: They are not, or a checksum does not match.

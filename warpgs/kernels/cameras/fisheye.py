@@ -14,7 +14,7 @@ ANTIPODE = 1e-3
 NEAR_AXIS = 0.04
 """Squared tangent of the angle from the axis below which series replace quotients that would cancel."""
 TERMS = 12
-"""Terms of the series: what is left out is below 1e-13 of the sum."""
+"""Terms of the series: the error is below 1e-13 of the sum."""
 
 
 @register("fisheye")
@@ -25,7 +25,7 @@ class Fisheye(CameraModel):
 
     @staticmethod
     def make_functions(real: type) -> SimpleNamespace:
-        """Make the functions; `CameraModel.make_functions` says what each must do."""
+        """Make the functions of `CameraModel.make_functions`."""
         return _make_functions(real)
 
 

@@ -18,7 +18,7 @@ class OpenCV(CameraModel):
 
     @staticmethod
     def make_functions(real: type) -> SimpleNamespace:
-        """Make the functions; `CameraModel.make_functions` says what each must do."""
+        """Make the functions of `CameraModel.make_functions`."""
         return _make_functions(real)
 
 

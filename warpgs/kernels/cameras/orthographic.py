@@ -16,7 +16,7 @@ class Orthographic(CameraModel):
 
     @staticmethod
     def make_functions(real: type) -> SimpleNamespace:
-        """Make the functions; `CameraModel.make_functions` says what each must do."""
+        """Make the functions of `CameraModel.make_functions`."""
         return _make_functions(real)
 
 

@@ -1,4 +1,4 @@
-"""The engine of a farm: runs jobs, and says what becomes of them."""
+"""The engine of a farm: runs jobs and reports their events."""
 
 from __future__ import annotations
 

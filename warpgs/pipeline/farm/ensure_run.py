@@ -29,7 +29,7 @@ class Outcome:
     state: str
     """kept, continued, fitted, redone or failed."""
     metrics: dict[str, Any] | None
-    """Contents of metrics.json, or of eval.json where LPIPS was measured later; None where it failed."""
+    """Contents of metrics.json, or of eval.json if LPIPS was measured later; None if the run failed."""
     note: str = ""
     """Note on this run for readers of the study; empty where nothing is special."""
     error: WarpgsError | None = None
@@ -99,19 +99,19 @@ def ensure_run(
     """Ensure that a run folder holds the finished run that is requested.
 
     A finished run of the same configuration, code of the user's own, data, views, kind of device and version is kept. A
-    half-finished one is continued from its checkpoint. What is there and is neither is moved aside, and the run is done anew.
+    half-finished one is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
 
     Args:
         request: The fit; ``out`` is its folder, ``resume`` is decided here.
         fingerprint: Fingerprint of the scene's data.
-        split: The views that train and those held out; None where no run can be the same.
+        split: Training and held-out views; None if no existing run can match.
         device: cpu or cuda.
         variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
         resolved: The settings of ``request`` with those chosen that it leaves open; None where it leaves none open.
         others: As `fit` takes them: on_step, verbose.
 
     Returns:
-        The outcome. It holds the error of this one run, if any, so that the others can go on.
+        The outcome. It contains the error of this run, if any, so that other runs continue.
     """
     try:
         record, why = _stored(request.out)

@@ -53,9 +53,9 @@ def run_farm(
 ) -> list[JobStatus]:
     """Run jobs until each is done or has failed.
 
-    A job that is finished and valid is skipped. A job whose process dies, or that has no memory left, is started once more
-    after the others, and goes on from its checkpoint. A folder of a job is locked while it is worked on here; one that
-    another farm has locked is looked at again later, and its result is taken over.
+    A job that is finished and valid is skipped. If the process of a job dies or runs out of memory, the job is started once
+    more after the others, from its checkpoint. A folder of a job is locked while it is worked on here; one that another farm
+    has locked is looked at again later, and its result is taken over.
 
     Args:
         jobs: The jobs.

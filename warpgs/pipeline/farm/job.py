@@ -1,4 +1,4 @@
-"""A job of a farm: a fit, where its results lie, and the same as text for another process."""
+"""A job of a farm: a fit and the folder of its results, also as text for another process."""
 
 from __future__ import annotations
 

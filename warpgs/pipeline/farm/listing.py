@@ -25,7 +25,7 @@ PLUGINS = ("preset", "strategy", "loss-terms", "view-modules", "reader")
 FARM_FLAGS = (
     "out", "resume", "view", "view-port", "device", "threads", "time-budget", "allow-outside", "help", "help-all", "h",
 )  # fmt: skip
-"""Flags of `warpgs fit` that no single job may have: they are the farm's, or the user's alone."""
+"""Flags of `warpgs fit` that a single job may not have."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ListedJob:
 
 
 def list_jobs(jobs: str) -> list[ListedJob]:
-    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or as the file has them.
+    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file.
 
     Raises:
         DataError: A line of the file is no job.

@@ -177,7 +177,7 @@ class LocalEngine:
         return [Event(process.job, "crashed", f"its process {how}{last}")]
 
     def close(self) -> None:
-        """Tell all processes to save and to stop, and end those that do not."""
+        """Ask all processes to save and stop, and kill those that do not."""
         processes = [*self._busy.values(), *self._idle]
         threads = [threading.Thread(target=p.worker.end, args=(SECONDS_TO_SAVE,)) for p in processes]
         for thread in threads:

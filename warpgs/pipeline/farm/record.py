@@ -18,7 +18,7 @@ from warpgs.version import __version__
 
 RECORD = "job.json"
 LOG = "log.txt"
-"""Name of the file with what a job printed."""
+"""Name of the file with the output of a job."""
 THUMBNAIL = "thumbnail.jpg"
 PLY = "point_cloud.ply"
 CHECKED = (PLY, "metrics.json", CONFIG)
@@ -60,7 +60,7 @@ class JobRecord:
     seconds: float = 0.0
     """Wall time of the job, reading and scores included [s]."""
     psnr: float | None = None
-    """Mean over held-out views [dB]; None where none is held out."""
+    """Mean over held-out views [dB]; None without held-out views."""
     ssim: float | None = None
     """Mean over held-out views."""
     gaussians: int = 0

@@ -1,4 +1,4 @@
-"""A farm as the command line asks for it: jobs, an engine, a display, and an index of the results."""
+"""The farm of the command line: jobs, an engine, a display, and an index of the results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class EngineRequest:
     engine: str = "local"
     """local (processes of this machine), ray or slurm."""
     slots: int | None = None
-    """Jobs at a time; None for as many as there are GPUs times ``per_gpu``, one on a CPU, or what the cluster has."""
+    """Number of concurrent jobs; None for ``per_gpu`` for each GPU, one on a CPU, or the capacity of the cluster."""
     per_gpu: int = 1
     """Jobs that share a GPU."""
     threads: int = 1
@@ -49,8 +49,8 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
 
     Raises:
         ResourceError: The device is missing.
-        UsageError: There is no such engine, what it needs is not installed, it cannot have so many slots, or other users can
-            write to ``slurm_folder``.
+        UsageError: The engine is unknown or not installed, it cannot have so many slots, or other users can write to
+            ``slurm_folder``.
     """
     r = request
     if r.engine not in ENGINES:
@@ -73,7 +73,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
     """Run a farm, show its progress, and write its index.
 
     Args:
-        jobs: The jobs, whose folders lie below ``results``.
+        jobs: The jobs, with folders below ``results``.
         engine: The engine; it is closed.
         results: Folder of the results.
         live: As in `FarmTable`.

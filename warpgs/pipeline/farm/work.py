@@ -49,7 +49,7 @@ THUMBNAIL_SIDE = 480
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Run the job of a text; what it prints goes to its log. Engines of other machines call this.
+    """Run the job of a text; its output goes to its log. Engines of other machines call this.
 
     Args:
         text: As of `job_text`.
@@ -57,7 +57,7 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
         on_step: As in `fit`.
 
     Returns:
-        The state: done, failed, or held where another farm works on it. All else stands in the job's record.
+        The state: done, failed, or held where another farm works on it. The job's record has all else.
     """
     if threads:
         set_threads(threads)

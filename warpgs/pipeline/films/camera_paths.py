@@ -1,4 +1,4 @@
-"""Camera paths for films, made from how the training cameras stand."""
+"""Camera paths for films, from the arrangement of the training cameras."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
     """Return a camera with the size and field of view of a film.
 
     Args:
-        camera: Camera of a photograph; its pose stays, and for a lens the pinhole of the same K stands.
+        camera: Camera of a photograph; its pose is kept, and a lens is replaced by the pinhole of the same K.
         size: Width and height [px]; None for those of the photograph.
         fov_y: Vertical field of view [rad], as of a principal point in the middle; None for that of the photograph.
-        turned: Whether the photograph lies on its side, so that width and height are swapped.
+        turned: True if the photograph is rotated by a quarter turn, so that width and height are swapped.
 
     Raises:
         UsageError: The camera is orthographic.
@@ -61,7 +61,7 @@ def path_of(rig: Rig) -> str:
 
 
 def upright(rig: Rig, camera: Camera) -> Camera:
-    """Return a camera with its centre and axis turned upright, for photographs that lie on their side."""
+    """Return a camera with its centre and axis turned upright, for rotated photographs."""
     if not rig.turned:
         return camera
     pose = look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)
@@ -119,7 +119,7 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
         kind: ``turntable``: a level circle at the cameras' distance and elevation, or a swing through their range and back
             where they stand on one side; in a room a turn on the spot. ``spiral``: two turns that rise and fall; of cameras
             that look to one side, two turns that open and close again.
-        rig: How the training cameras stand.
+        rig: Arrangement of the training cameras.
         cameras: Training cameras, at least one.
         frames: Number of cameras.
 

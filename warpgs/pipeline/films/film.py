@@ -64,7 +64,7 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
     """Return whether ``out`` is a film and not a folder, and whether all frames have one size.
 
     Raises:
-        UsageError: There is no camera, or something was requested that cannot be made of these frames or put into that place.
+        UsageError: There is no camera, or the frames do not allow the requested film or output.
     """
     if not plan.cameras:
         raise UsageError("no camera to render; give at least one")
@@ -97,7 +97,7 @@ def _frames(
         settings: Settings of the film.
         coverage: As in `render_path`; the images lie in a subfolder beside ``files``.
         check: Looks at the frames.
-        tell: Takes a line on each frame before it is rendered.
+        tell: Called with a line for each frame before it is rendered.
     """
     gaussians, options = model.gaussians(), model.options()
     if settings.background is not None:
@@ -146,8 +146,8 @@ def render_film(
             then all that is written.
         settings: Settings of the film.
         coverage: As in `render_path`; of a folder only.
-        sheet: Whether to write six frames in one image, too: sheet.png in the folder, or beside the film.
-        tell: Takes a line on each frame before it is rendered, and one before the film is finished.
+        sheet: True to also write six frames in one image: sheet.png in the folder, or beside the film.
+        tell: Called with a line before each frame is rendered, and before the film is finished.
 
     Raises:
         ResourceError: A file cannot be written, or another process writes into the folder.

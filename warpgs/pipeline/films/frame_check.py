@@ -1,4 +1,4 @@
-"""Frames of a film that show nothing, or what no photograph saw, noticed while they are rendered."""
+"""Detection of empty frames, and of frames outside the captured area, while a film is rendered."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BLACK = 1 / 255
 """Mean of the brightest channel below which a frame is black."""
 
 OUTSIDE = 0.1
-"""Fraction of a frame that lies outside all photographs above which it gets a note."""
+"""Fraction of a frame outside all photographs above which a note is printed."""
 
 
 def _ranges(numbers: list[int]) -> str:
@@ -42,7 +42,7 @@ class FrameCheck:
     black: list[int] = field(default_factory=list)
     """Numbers of the other frames that are black."""
     outside: list[int] = field(default_factory=list)
-    """Numbers of the other frames of which more than `OUTSIDE` lies outside all photographs."""
+    """Numbers of the other frames with more than `OUTSIDE` outside all photographs."""
     count: int = 0
     """Number of frames looked at."""
 

@@ -1,4 +1,4 @@
-"""Rigs: how training cameras stand to their subject, from their poses alone."""
+"""Rigs: the arrangement of training cameras around their subject, from their poses."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ MIN_FORWARD = 0.5
 MIN_UP = 0.5
 """Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
 MIN_SWING = math.radians(6)
-"""Least range of azimuths of a film, for cameras that stand one above the other."""
+"""Smallest range of azimuths of a film, for cameras above each other."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A set of cameras as a film sees it: the point that matters, the upward direction, and where the cameras stand."""
+    """An arrangement of cameras for films: the point of interest, the upward direction, and the positions of the cameras."""
 
     kind: str
     """One of `KINDS`: forward (from one side), ring (around a point), room (outwards from a place), free (none of these)."""
@@ -44,7 +44,7 @@ class Rig:
     first: np.ndarray
     """Level direction of azimuth 0, perpendicular to ``up``, length 1, shape [3]."""
     span: tuple[float, float] | None
-    """First and last azimuth that cameras stand at (look at, in a room) [rad]; None where they are all round."""
+    """First and last azimuth of the cameras (of their viewing directions, in a room) [rad]; None if they are all around."""
     distance: float
     """Median distance of the cameras from ``center`` [u]."""
     elevation: float
@@ -52,7 +52,7 @@ class Rig:
     rise: float
     """Standard deviation of the elevations [rad]."""
     turned: bool
-    """True where the photographs lie on their side, so that an upright film swaps width and height."""
+    """True if the photographs are rotated by a quarter turn, so that an upright film swaps width and height."""
 
     def describe(self) -> str:
         """Return a phrase on where the cameras look."""
@@ -172,14 +172,14 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
 
 
 def rig_of(cameras: list[Camera], depth: float) -> Rig:
-    """Return how cameras stand to what they photographed.
+    """Return the arrangement of cameras around their subject.
 
     Cameras whose optical axes meet stand around the point nearest to all axes, unless they see it from one side; then, as where
     axes do not meet but point one way, the point is ``depth`` in front of their mean centre.
 
     Args:
         cameras: Training cameras, at least one.
-        depth: Distance from the cameras to what they show [u], above 0.
+        depth: Distance from the cameras to their subject [u], above 0.
     """
     centers, forwards = np.array([c.center for c in cameras]), np.array([c.viewmat[2, :3] for c in cameras])
     focus = focus_point(cameras)
@@ -205,7 +205,7 @@ def rig_of(cameras: list[Camera], depth: float) -> Rig:
 
 
 def up_of(cameras: list[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the upward direction of a scene, as films have it: of length 1, shape [3].
+    """Return the upward direction of a scene for films: of length 1, shape [3].
 
     Args:
         cameras: Training cameras, at least one.

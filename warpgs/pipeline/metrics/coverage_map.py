@@ -71,14 +71,14 @@ def depth_views(
         gaussians: N Gaussians in the units of the cameras.
         cameras: Cameras of the training views, arrays of numpy.
         options: Options of the rasterizer.
-        masks: True where a pixel of a view counts, bool, shape [H, W] each; None for a view without a mask, or for none at all.
+        masks: True where a pixel of a view counts, bool, shape [H, W] each; None for a view without a mask, or for no masks.
         max_pixels: Most pixels of all maps together; with more of them every map is rendered smaller, both sides alike.
 
     Returns:
         The views in the order of the cameras, on the device of the Gaussians.
 
     Raises:
-        UsageError: A camera is orthographic; for one with a lens, the pinhole of the same K stands.
+        UsageError: A camera is orthographic. (A lens is replaced by the pinhole of the same K.)
     """
     pixels = sum(c.width * c.height for c in cameras)
     factor = min(1.0, (max_pixels / max(1, pixels)) ** 0.5)
@@ -162,14 +162,13 @@ class Coverage:
 def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView], tolerance: float = TOLERANCE) -> Coverage:
     """Count at each pixel of a render the training views that saw the point it shows.
 
-    A view saw the point where it lies in its image, inside of its mask, and on the surface that the view itself sees there:
-    neither behind it (hidden) nor before it (the view looked through). The model's depth decides, so a count is as good as the
-    model's geometry.
+    A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind it (occluded) nor in
+    front of it (the view looks through). The model's depth decides, so a count is as good as the model's geometry.
 
     Args:
         depth: z-depth of the render [u], 0 where there is no surface, shape [H, W], as `depth_of` gives it.
         camera: Camera of the render, arrays of numpy.
-        training: Training views, as `depth_views` gives them.
+        training: Training views, from `depth_views`.
         tolerance: Largest difference of depths of one surface, as a fraction of the depth.
 
     Returns:
@@ -195,7 +194,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
     Args:
         depth: z-depth of the render [u], 0 where there is no surface, shape [H, W].
         camera: Camera of the render, a pinhole; arrays of numpy.
-        photographs: Cameras of the photographs; for one with a lens, the pinhole of the same K stands.
+        photographs: Cameras of the photographs; a lens is replaced by the pinhole of the same K.
         empty: Whether pixels without a surface count, as at the median depth of the others.
 
     Raises:

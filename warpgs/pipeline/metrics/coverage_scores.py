@@ -35,11 +35,11 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
 
     Each photograph is carried to another view by the model's depth and compared with the photograph there, pixel by pixel.
     That is the error to expect of a pixel whose colour comes from a view with such a difference: measured on training data,
-    after a fit to the same data. It holds what the two photographs do not share (reflections, exposure), too.
+    after a fit to the same data. It includes differences between the photographs, such as reflections and exposure.
 
     Args:
         train: Training views.
-        training: Their depths, as `depth_views` gives them.
+        training: Their depths, from `depth_views`.
 
     Returns:
         Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has that of
@@ -96,7 +96,7 @@ def classes_of(coverage: Coverage, transparent: bool) -> dict[str, np.ndarray]:
 
     Args:
         coverage: Coverage of the render.
-        transparent: Whether the scene has an alpha: a pixel without a surface is then background, and else one that nobody saw.
+        transparent: True if the scene has an alpha channel: a pixel without a surface is then background, else unseen.
     """
     counts, empty = coverage.counts.cpu().numpy(), coverage.empty.cpu().numpy() & transparent
     return {"0": (counts == 0) & ~empty, "1": counts == 1, "2+": counts >= 2, "background": empty}
@@ -146,7 +146,7 @@ def score_by_coverage(
         test: Held-out views, at least one.
         options: Options of the rasterizer.
         show: Called for each held-out view with its render [H, W, 3] and the pixels of each class, bool [H, W].
-        tell: Takes a line on each view before it is rendered.
+        tell: Called with a line before each view is rendered.
 
     Returns:
         ``classes``: over all held-out views together, by class, the number of scored ``pixels``, their ``share_of_pixels`` and

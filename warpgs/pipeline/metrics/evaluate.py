@@ -29,9 +29,9 @@ ALPHA_VARIANTS = {
     "alpha_empty": "mean rendered alpha over the pixels of an opacity below 0.02: 0 is right",
     "alpha_object": "mean rendered alpha over the pixels of an opacity above 0.98: 1 is right",
 }
-"""Definition of each score of views that know their opacity. A mean is over the views that have such pixels."""
+"""Definition of each score of views with an alpha channel. A mean is over the views that have such pixels."""
 EMPTY, OPAQUE, OBJECT = 0.02, 0.5, 0.98
-"""Opacity below which a pixel is empty, above which it shows the object, and above which it is the object alone."""
+"""Opacities below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
 NO_LPIPS = "not measured: no --lpips-weights were given"
 SSIM_WINDOW = 11
@@ -87,7 +87,7 @@ def _opacity_scores(
 
 
 def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
-    """Compare a rendered image [H, W, 3], and its alpha [H, W] where the view knows its opacity, with the image of its view.
+    """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view.
 
     With a mask the recipe is that of DTU's protocol (Niemeyer et al. 2022 and all since): PSNR over the mask's pixels alone,
     SSIM and LPIPS on both images with white outside of it.
@@ -163,7 +163,7 @@ def baselines(train: list[View], test: list[View]) -> dict[str, float]:
 
 
 def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
-    """Return the means over views of every score that is a number; empty where there are no views.
+    """Return the means over views of every numeric score; empty without views.
 
     Those of opacity are over the views that have one.
     """

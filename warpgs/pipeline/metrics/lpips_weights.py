@@ -170,7 +170,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
         out: The safetensors file to write; its header names net, version and the SHA-256 of both sources.
 
     Returns:
-        Lines for the user: what was written, and whether a source is not the published one.
+        Lines for the user: the written file, and whether a source differs from the published one.
 
     Raises:
         DataError: A source is missing, no state dict, of another network, or not finite.

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import torch
 
+from warpgs.kernels.step_buffers import squared_error
+
 
 def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
     """Return the mean squared error of a rendered image clamped to [0, 1], over the pixels that count.
@@ -14,12 +16,11 @@ def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | Non
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
-    rgb = rgb.clamp(0, 1)
     if mask is None:
-        return torch.nn.functional.mse_loss(rgb, target)
-    return ((rgb - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
+        return squared_error(rgb, target) / rgb.numel()
+    return ((rgb.clamp(0, 1) - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
 
 
 def psnr_of(mse: float) -> float:

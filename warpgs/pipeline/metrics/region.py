@@ -36,7 +36,7 @@ def counted_region(view: View) -> tuple[np.ndarray | None, str]:
 def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
     """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all.
 
-    The opaque ones that its mask keeps where the view knows its opacity, else the region of `counted_region`.
+    The opaque ones that its mask keeps if the view has an alpha channel, else the region of `counted_region`.
     """
     if view.alpha is None:
         return counted_region(view)

@@ -28,7 +28,7 @@ class Coverage:
 
 @torch.no_grad()
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> Coverage:
-    """Render every view once and measure what it sees of each Gaussian.
+    """Render every view once and measure its weights of each Gaussian.
 
     Args:
         gaussians: N Gaussians.

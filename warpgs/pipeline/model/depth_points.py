@@ -77,7 +77,7 @@ def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointClo
 
 
 def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
-    """Return a mask [N], True where a point [N, 3] lies before the depths [H, W] (0: none) of a view other than ``without``."""
+    """Return a mask [N], True if a point [N, 3] is in front of the depths [H, W] (0: none) of a view other than ``without``."""
     hides = np.zeros(len(points), bool)
     for j, (view, depth) in enumerate(zip(views, depths)):
         if j != without:
@@ -148,8 +148,8 @@ def coarse_points(
         depths: Geometrically consistent depth of each, confirmed by other views.
         merge_px: Width of the cells in which consistent points become one [px]; 0 keeps every pixel.
         fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
-            those of `complete`; none lies in space that another view looks through, nor beside a consistent point. Views whose
-            depth was not searched for have no part in it, so that the work for each view is bounded.
+            those of `complete`; none is in space that another view looks through, or beside a consistent point. Views without
+            estimated depth are left out, so that the work for each view is bounded.
         source: Name of the source in the notes, sweep or flow.
         known: Points of a reconstruction. Those that two of the views saw are taken where no depth is consistent, and their
             depths are filled in around them.

@@ -56,7 +56,7 @@ def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
 
 
 def box_of(text: str) -> Box:
-    """Return the box that a user asks for.
+    """Return the box of a user's text.
 
     Args:
         text: JSON with center, size and perhaps rotation; the name of a .json file that holds it; or six numbers with commas:
@@ -64,7 +64,7 @@ def box_of(text: str) -> Box:
 
     Raises:
         DataError: The file cannot be read, or holds something else.
-        UsageError: The text is none of these, or a side is not longer than 0.
+        UsageError: The text is invalid, or a side is not longer than 0.
     """
     if text.lower().endswith(".json"):
         return _box_of_file(Path(text))
@@ -104,12 +104,12 @@ def _box_of_file(path: Path) -> Box:
 
 
 def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
-    """Return the Gaussians at which ``keep``, bool or rows [N], says so."""
+    """Return the Gaussians selected by ``keep``, bool or rows [N]."""
     return Gaussians(**{name: t[keep] for name, t in gaussians.tensors().items()})
 
 
 def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
-    """Return where the means lie in a box, bool [N]; both in the same units."""
+    """Return whether each mean is in a box, bool [N]; both in the same units."""
     offsets = gaussians.means.double() - torch.tensor(box.center, dtype=torch.float64, device=gaussians.means.device)
     directions = np.array(box.rotation).T
     out = torch.ones(len(gaussians), dtype=torch.bool, device=offsets.device)
@@ -120,11 +120,11 @@ def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
 
 
 def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
-    """Return which Gaussians only disturb, each for the first reason that holds, bool [N] by reason.
+    """Return the floaters and needles, each under the first reason that applies, bool [N] by reason.
 
     Args:
         gaussians: N Gaussians.
-        maxima: Largest blending weight of each over all training views, shape [N]; None where no view is known.
+        maxima: Largest blending weight of each over all training views, shape [N]; None without views.
     """
     out = {}
     free = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)

@@ -15,7 +15,7 @@ from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
 from warpgs.scene import Camera, PointCloud, View
 
 MARGIN = 1.5
-"""Distance from the nearest opaque pixel at which a point lies in the empty region of a view [px]."""
+"""Distance from the nearest opaque pixel at which a point is in the empty region of a view [px]."""
 FINEST = 1.5
 """Largest width of the finest cells in the views, their median [px]."""
 PROJECTIONS = 2**25
@@ -27,9 +27,9 @@ TOLERANT = 12
 SEEN = 0.9
 """Fraction of the views that must have a cell in their image: space that few look into cannot be carved."""
 OPAQUE_COLOR = 0.9
-"""Opacity from which on a pixel shows the object alone, and gives its colour."""
+"""Opacity from which a pixel shows only the object, and has its colour."""
 LEAST_VIEWS = 2
-"""Views that must see a cell: what none sees lies inside, or behind, where nothing was photographed."""
+"""Number of views that must see a cell, because unseen cells are inside the object or outside the photographs."""
 LIKE = 0.15
 """Standard deviation of the colours that views see a cell in, up to which they are like, of the channel that differs most."""
 BEHIND_CELLS = 3.0
@@ -51,7 +51,7 @@ class Silhouette:
         """True where the object reaches the border of the image, so that it may go on outside."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
-        """Return three masks [N] of balls around points [N, 3]: before empty pixels alone; before opaque ones; perhaps seen.
+        """Return three masks [N] of balls around points [N, 3]: only at empty pixels; only at opaque ones; perhaps seen.
 
         Args:
             points: Centres of the balls [u].
@@ -73,12 +73,12 @@ class Silhouette:
 
 
 def silhouettes(views: Sequence[View]) -> list[Silhouette]:
-    """Return the silhouettes of the views that know their opacity."""
+    """Return the silhouettes of the views with an alpha channel."""
     return [Silhouette(v) for v in views if v.alpha is not None]
 
 
 def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndarray:
-    """Return a mask [N], True where a point [N, 3] lies at least `MARGIN` px from what more views show than may err."""
+    """Return a mask [N], True if a point [N, 3] is at least `MARGIN` px from opaque pixels in more views than may err."""
     votes = sum((s.look(points, 0.0, MARGIN)[0].astype(int) for s in shapes), np.zeros(len(points), int))
     return votes > len(shapes) // TOLERANT
 
@@ -156,11 +156,11 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     """Return points on the surface of the visual hull with the colours of the views that see them, and a sentence on them.
 
     Args:
-        views: Training views; those that know their opacity carve.
+        views: Training views; those with an alpha channel carve.
         merge_px: Width of the cells in which points become one [px]; 0 keeps one for every pixel.
 
     Returns:
-        The cloud, empty where fewer than two views know their opacity or nothing is in all of them.
+        The cloud, empty where fewer than two views have an alpha channel or nothing is in all of them.
     """
     shapes = silhouettes(views)
     nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))

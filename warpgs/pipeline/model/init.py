@@ -100,7 +100,7 @@ class Start(NamedTuple):
     how: str
     """Source of the points, for the user."""
     depths: list[ViewDepth] | None = None
-    """Geometrically consistent depth of each view; None where none was computed."""
+    """Geometrically consistent depth of each view; None if not computed."""
     extrapolated: int = 0
     """Number of points, the last ones, that are extrapolated where no view looks."""
 
@@ -116,7 +116,7 @@ def consistent_depths(
         known: Points that bound the planes.
         config: Source and its settings.
         device: Returns the device to sweep on, once it may be used.
-        progress: Called with a line for the user on what is being done.
+        progress: Called with a line for the user about the current work.
     """
     if config.source == "flow":
         between = flow_between(views, config.flow, config.flow_range)
@@ -135,7 +135,7 @@ def consistent_points(
 ) -> Start:  # fmt: skip
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
-    With fewer than `MIN_POINTS` such points the start is random, and says why.
+    With fewer than `MIN_POINTS` such points the start is random, with a note.
     """
     reason, depths, given, source = "a single view has no other to compare with", None, [], config.source
     if len(views) > 1:
@@ -157,7 +157,7 @@ def consistent_points(
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
-    """Return the reconstruction's points that two of the views saw, or the only one; none where there is no reconstruction.
+    """Return the reconstruction's points that two of the views saw, or the only view; none without a reconstruction.
 
     A point that one of them saw was placed with the help of views that are held out.
     """
@@ -173,7 +173,7 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
     """Refuse a start from points where the scene has none that the training views saw.
 
     Raises:
-        DataError: There are none, and ``config`` asks for them.
+        DataError: There are none, and ``config`` needs them.
     """
     if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
@@ -183,9 +183,9 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
 
 
 def on_object(start: Start, views: list[View]) -> Start:
-    """Return the start without points that are empty in a view that knows its opacity.
+    """Return the start without points that are empty in a view with an alpha channel.
 
-    Where fewer than `MIN_POINTS` are left, it is as it was.
+    If fewer than `MIN_POINTS` are left, it is unchanged.
     """
     shapes = silhouettes(views)
     if not shapes:
@@ -207,7 +207,7 @@ def initial_points(
 ) -> Start:  # fmt: skip
     """Return the points to start from.
 
-    ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines on what is being done.
+    ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines about the current work.
 
     Raises:
         DataError: Points were requested and the scene has none that the training views saw.
@@ -252,7 +252,7 @@ def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
 
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
-    """Return the size of the scene [u]: that of the camera set; where all cameras stand together, a tenth of the cloud's."""
+    """Return the size of the scene [u]: that of the camera set, or a tenth of the cloud's if all cameras are in one place."""
     extent = geometry.camera_extent(cameras)
     spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)

@@ -84,8 +84,8 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
 
     A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
     spread by a tenth (docs/decisions/003-random-start.md); any other view samples inverse depths uniformly, and keeps points
-    that a second view sees where there are any. Where views show an object on black, or know their opacity, points start on the
-    object, and those that fewest views see before what is empty come first, so that none lies there.
+    that a second view sees where there are any. If views show an object on black, or have an alpha channel, points start on the
+    object. Those that the fewest views see in front of empty pixels come first, so that none is in empty space.
 
     Raises:
         DataError: Masks leave no pixel of any training view.

@@ -84,7 +84,7 @@ class LimitConfig:
     a third, three of them reach no camera; larger ones beside or behind training cameras are a fog before other views."""
     min_pixels: float = 0.2**0.5
     """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
-    most finely; 0 for no limit. It stands for the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
+    most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
     ratio_from: float = 0.7
     """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
 

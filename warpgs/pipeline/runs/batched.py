@@ -19,7 +19,7 @@ def check_batched(
     """Check that the processes can share a fit.
 
     Args:
-        scene: What is fitted, as `warpgs.fit` takes it.
+        scene: The scene, as in `warpgs.fit`.
         config: Settings.
         ranks: The processes.
         time_budget: Time that the fit may take [s]; None for no limit.

@@ -86,7 +86,7 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
         Tensors by name on the CPU, shapes [...] as they were saved, and the state.
 
     Raises:
-        DataError: There is none, or it is incomplete: truncated, altered, or of another format.
+        DataError: The checkpoint is missing, truncated, altered, or of another format.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load

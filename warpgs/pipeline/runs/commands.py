@@ -46,7 +46,7 @@ def scene_of(
     Args:
         stored: The run.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
-        tell: Takes a line on each image before it is read.
+        tell: Called with a line for each image before it is read.
 
     Raises:
         DataError: The scene is gone, or its images or cameras have changed since the fit.
@@ -120,7 +120,7 @@ def render(
     file_of: tuple[Path | None, str | None] | None = None,
     antialiased: bool = False,
 ) -> list[str]:  # fmt: skip
-    """Render a run or a file of Gaussians along a path to PNG files and a film, or to a film alone; returns lines for the user.
+    """Render a run or a file of Gaussians along a path to PNG files and a film, or only to a film; returns lines for the user.
 
     Args:
         folder: The run folder; or the file, where ``file_of`` is given.
@@ -129,7 +129,7 @@ def render(
         settings: Settings of the film; their background is not looked at.
         device_name: auto, cpu or cuda.
         background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
-        coverage: Whether to write images of what no training view saw, too.
+        coverage: True to also write images of the coverage by training views.
         sheet: Whether to write six frames in one image, too.
         file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.
         antialiased: Whether that file was trained with antialiasing.
@@ -177,7 +177,7 @@ def render(
 
 
 def repeat_failed_step(path: Path, device_name: str) -> list[str]:
-    """Compute a step again whose loss was not finite; returns lines for the user on what it reads and computes.
+    """Repeat a step with a non-finite loss; returns lines for the user on its inputs and results.
 
     Raises:
         DataError: The file holds no such step.

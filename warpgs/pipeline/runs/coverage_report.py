@@ -44,8 +44,8 @@ def coverage_of_run(
         train: Training views.
         test: Held-out views, at least one.
         options: Options of the rasterizer.
-        names: Names of image files by view, as `image_names` gives them for the whole scene.
-        tell: Takes a line on each view before it is rendered.
+        names: Names of image files by view, from `image_names` for the whole scene.
+        tell: Called with a line for each view before it is rendered.
 
     Returns:
         What `score_by_coverage` returns.

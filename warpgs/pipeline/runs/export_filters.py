@@ -30,11 +30,12 @@ class Filters:
     sh_degree: int | None = None
     """Highest degree of harmonics; None for all that the format holds."""
     rotate: str | None = None
-    """Axis and angle as x,y,z,degrees, or level: up as the cameras of a run say, to -y; None for no rotation."""
+    """Axis and angle as x,y,z,degrees; or level, to rotate the upward direction of a run's cameras to -y; None for no
+    rotation."""
 
 
 NO_FILTERS = Filters()
-"""Filters of someone who asks for none: cleaning is up to the format."""
+"""The default filters: the format determines cleaning."""
 
 
 def filtered(
@@ -44,9 +45,9 @@ def filtered(
 
     Args:
         gaussians: N Gaussians in file units.
-        stored: The run that they are of; None where no camera is known.
+        stored: The run of the Gaussians; None without cameras.
         filters: The filters.
-        cleaned: Whether to clean where the filters do not say.
+        cleaned: Default for cleaning.
 
     Returns:
         The Gaussians that are left, the rotation [3, 3] that turned them (None for none), and lines for the user.
@@ -95,14 +96,14 @@ def _maxima(stored: StoredRun) -> torch.Tensor:
 
 
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
-    """Return the rotation [3, 3] that a user asks for, None for none.
+    """Return the rotation [3, 3] of a user's text, None for none.
 
     Args:
         wish: Axis and angle as x,y,z,degrees; level; or None.
-        cameras: Cameras whose upward direction `level` takes; None where none are known.
+        cameras: Cameras with the upward direction for `level`; None if unknown.
 
     Raises:
-        UsageError: The text is no rotation, or no camera says where up is.
+        UsageError: The text is not a rotation, or there are no cameras for `level`.
     """
     if wish is None:
         return None

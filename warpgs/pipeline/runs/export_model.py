@@ -39,7 +39,7 @@ def convert(
 
     Args:
         source: The file to read; of cameras also a folder with a COLMAP reconstruction.
-        target: The file to write; its name says the format.
+        target: The file to write; its suffix selects the format.
         filters: Filters; cameras are rotated only.
         formats: Formats that are taken where a file's name ends as their files do, as in `write_gaussians`, before any other.
 
@@ -70,14 +70,14 @@ def export(
 
     Args:
         folder: The run folder.
-        target: The file to write; its name says the format.
+        target: The file to write; its suffix selects the format.
         filters: Filters; cameras are rotated only.
-        format: Format to write, as in `write_gaussians`; None for the one that the name says.
+        format: Format to write, as in `write_gaussians`; None for the format of the suffix.
 
     Raises:
         DataError: The folder is not a run, or nothing is left of its model.
         ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: The name says no format, or not the given one, or a filter is invalid.
+        UsageError: The suffix has no format, or not the given one, or a filter is invalid.
     """
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))

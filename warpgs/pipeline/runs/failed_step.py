@@ -30,7 +30,7 @@ Bundle = tuple[dict[str, torch.Tensor], dict[str, Any]]
 
 
 def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle:
-    """Return what the next step of a fit computes its loss from.
+    """Return the inputs of the loss of the next step.
 
     Args:
         trainer: The fit, in the state before the step.
@@ -62,7 +62,7 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
 
 
 def save_failed_step(path: Path, bundle: Bundle) -> None:
-    """Write a failed step as a safetensors file, whose header holds the plain values.
+    """Write a failed step as a safetensors file, with the plain values in its header.
 
     Raises:
         ResourceError: The file cannot be written.
@@ -74,7 +74,7 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
     """Read what `save_failed_step` wrote, tensors of shape [...] on a device.
 
     Raises:
-        DataError: The file is missing or is another.
+        DataError: The file is missing or not a failed step.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -116,8 +116,8 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
 def findings(bundle: Bundle) -> list[str]:
     """Compute a failed step again; returns a line for everything that it reads and computes, and whether that is finite.
 
-    Terms of the loss from outside warpgs are computed where their modules are loaded. What the strategy adds to the loss is
-    not computed.
+    Terms of the loss from outside warpgs are computed where their modules are loaded. The strategy's terms of the loss are not
+    computed.
 
     Raises:
         DataError: A tensor or a value is missing or of another shape.

@@ -187,10 +187,10 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
-    """Run `fit` as the command line, a study or a farm asks for it; ``others`` are its on_model, on_step and ranks.
+    """Run `fit` for the command line, a study or a farm; ``others`` are its on_model, on_step and ranks.
 
     Raises:
-        KeyboardInterrupt: A signal ended it; the message says how to go on.
+        KeyboardInterrupt: A signal ended the fit; the message explains how to continue.
     """
     r = request
     try:

@@ -141,7 +141,7 @@ def model_fields(
 
 
 def tell(job: FitJob, trainer: Trainer) -> None:
-    """Print what the fit has to say, and keep it for the report."""
+    """Print the messages of the fit, and keep them for the report."""
     while trainer.messages:
         trainer.notes.append(trainer.messages.pop(0))  # a continued run has them in its report, too
         job.note(trainer.notes[-1])

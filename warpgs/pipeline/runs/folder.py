@@ -84,7 +84,7 @@ def _check_folder(out: Path, resume: bool) -> None:
 
 
 def camera_values(camera: Camera) -> dict[str, Any]:
-    """Return the values of a camera as config.json holds them; coefficients only where the model has some."""
+    """Return the values of a camera for config.json; with coefficients if the model has some."""
     values = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in vars(camera).items()}
     return values if camera.distortion is not None else {n: v for n, v in values.items() if n != "distortion"}
 
@@ -186,7 +186,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
 
 
 def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Check that a checkpoint is of the fit that config.json beside it records: same settings, data and training views.
+    """Check that a checkpoint belongs to the fit of its config.json: same settings, data and training views.
 
     Raises:
         DataError: It is of another.

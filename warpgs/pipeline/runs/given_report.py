@@ -23,7 +23,7 @@ DEPTH, NORMALS = "given_depth", "given_normals"
 def given_figures(
     train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
 ) -> dict[str, Any]:
-    """Return for each kind of given map what the model makes of it: a row for each view that has one, and a summary.
+    """Return the comparison of the model with each kind of given map: a row for each view that has one, and a summary.
 
     Args:
         train: The views to fit.

@@ -61,7 +61,7 @@ class FitJob:
         return sorted({v.camera.model for v in self.scene.views} - {*CENTRAL})
 
     def say(self, line: str) -> None:
-        """Print a line for the user, unless the fit is to be silent, or to tell of its progress alone."""
+        """Print a line for the user, unless the fit is silent or prints only progress."""
         if self.verbose is True:
             say(line)
 

@@ -19,7 +19,7 @@ def cameras_of(scene: Scene) -> dict[str, Camera]:
 
 
 def learned_cameras(scene: Scene, split: Split, learned: LearnedViews) -> Mapping[str, Camera]:
-    """Return the cameras of all views of a scene as view modules have them now, by name."""
+    """Return the cameras of all views of a scene after the view modules, by name."""
     return learned.cameras(cameras_of(scene), split.train, split.test)
 
 
@@ -32,7 +32,7 @@ def learned_figures(
     learned: LearnedViews, scene: Scene, split: Split, given: Mapping[str, Camera], test: Sequence[View],
     gaussians: Gaussians, options: RasterizeOptions,
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Return the figures of each view module by its name, as metrics.json holds them.
+    """Return the figures of each view module by its name, for metrics.json.
 
     Args:
         learned: View modules with their parameters.

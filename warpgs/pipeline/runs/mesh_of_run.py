@@ -31,7 +31,7 @@ def mesh(
         options: Options; ``voxel`` is in units of the scene's files.
         device_name: auto, cpu or cuda.
         stage: Function that shows a line of progress.
-        say: Function that shows what was chosen, before the work starts.
+        say: Called with the automatic choices before the work starts.
 
     Returns:
         Lines for the user.

@@ -36,7 +36,7 @@ def open_file(
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
         rule: Name of the cut-offs that it was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
-        antialiased: True for a model that was trained so (`RasterizeOptions.antialiased`) and whose file does not say it.
+        antialiased: True for a model that was trained with `RasterizeOptions.antialiased`, if its file does not declare it.
 
     Raises:
         DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.

@@ -35,6 +35,7 @@ from warpgs.kernels import (
     tiles_emit_cpu,
     tiles_order,
 )
+from warpgs.kernels.blend_records import COLORS, VALUES
 from warpgs.kernels.native import BLOCK
 from warpgs.pipeline.train.strategies import mcmc
 from warpgs.runtime import allocator, interop
@@ -43,7 +44,7 @@ from warpgs.runtime.load_module import load_module
 from warpgs.runtime.terminal import say
 
 THREADS = 256
-"""Threads of a block where a launch does not say otherwise."""
+"""Default number of threads of a block."""
 CAMERA_MODEL = "pinhole"
 """Model of the cameras of a fit: readers give no other."""
 
@@ -73,7 +74,8 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
         own = [
             project_cpu.make_forward(real, *variant), project_cpu_backward.make_backward(real, *variant, False),
             blending.forward, blending.backward, without_depth.backward, blending.contributions,
-            blend.make_segments(real).sum_gradients,
+            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
+            step_buffers.make_errors(),
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
@@ -116,7 +118,7 @@ def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
 
 
 def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
-    """Compile what is not in the cache yet, and yield each module as it is done.
+    """Compile the modules that are not cached, and yield each when it is done.
 
     Args:
         devices: Where; None for the CPU and every CUDA device that torch sees.

@@ -57,7 +57,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
         threads: CPU threads of the networks; 0 for as many as there are cores.
 
     Raises:
-        DataError: The scene or a network's file is not what it must be.
+        DataError: The scene or a network's file is invalid.
         ResourceError: The folder cannot be written, or another process writes into it.
         UsageError: The source or the split is unknown.
     """

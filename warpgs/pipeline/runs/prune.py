@@ -78,12 +78,12 @@ def prune(
     `render` and `export` take it as they take the run.
 
     Args:
-        folder: The run folder, which stays as it is.
+        folder: The run folder, which is not changed.
         keep_psnr: Allowed loss, above 0.
         out: Folder to write; None for the run's name with ``-pruned``.
         device_name: auto, cpu or cuda.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
-        tell: Called with a line for the user on what is being done.
+        tell: Called with a line for the user about the current work.
 
     Returns:
         Lines for the user.

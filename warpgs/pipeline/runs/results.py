@@ -135,7 +135,7 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and a depth map of each held-out view.
 
-    Where no view is held out, the images are of the training views. LPIPS is measured on held-out views alone.
+    Where no view is held out, the images are of the training views. LPIPS is measured only on held-out views.
 
     Args:
         out: The run folder; None to write nothing.
@@ -144,8 +144,8 @@ def evaluate_run(
         test: Held-out views.
         options: Options of the rasterizer.
         lpips: Network for LPIPS, or None.
-        names: Names of image files by view, as `image_names` gives them for the whole scene; None for those of these views.
-        tell: Takes a line on each view before it is rendered.
+        names: Names of image files by view, from `image_names` of the whole scene; None for those of these views.
+        tell: Called with a line for each view before it is rendered.
 
     Returns:
         Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
@@ -251,10 +251,10 @@ def write_report(
     overview: Overview,
     tell: Callable[[str], object] = lambda line: None,
 ) -> None:
-    """Write report.html for a run whose scores are known.
+    """Write report.html for a scored run.
 
     Args:
-        out: The run folder, whose metrics.jsonl gives the curves.
+        out: The run folder, with the curves in metrics.jsonl.
         scene: The scene.
         split: Its views to fit and those held out.
         gaussians: The fitted model, in scene units [u].
@@ -262,8 +262,8 @@ def write_report(
         metrics: Contents of metrics.json.
         record: Contents of config.json.
         sampling: The part on sampling events, or None.
-        overview: What the function of `overview_of` returned.
-        tell: Takes a line on each view before it is rendered.
+        overview: Result of the function of `overview_of`.
+        tell: Called with a line for each view before it is rendered.
     """
     train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
     image, why = overview

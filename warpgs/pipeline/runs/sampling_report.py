@@ -110,9 +110,9 @@ def _on_host(sampled: SampledView) -> SampledView:
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
     """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
 
-    A thread of its own makes them. The end of the block waits for it, and so does the function that it gives, which is to be
-    called before a checkpoint: a fit that goes on from there does not write the images of events before it. An image that
-    cannot be written is none that a fit should end for: ``fit.messages`` says it once.
+    A separate thread writes them. The end of the block waits for it, and so does the function that it gives, which is to be
+    called before a checkpoint: a fit that goes on from there does not write the images of events before it. If an image cannot
+    be written, the fit continues, with one message in ``fit.messages``.
 
     Args:
         fit: The fit, before its first step.
@@ -183,7 +183,7 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
 
 
 def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
-    """Return the report's part on the sampling events of a finished fit; None where there were none."""
+    """Return the report's part on the sampling events of a finished fit; None without events."""
     method, figures = fit.config.method, event_figures(fit)
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:

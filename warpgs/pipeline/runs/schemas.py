@@ -85,7 +85,7 @@ def check_record(record: Any) -> None:
     """Check the contents of config.json.
 
     Raises:
-        SchemaError: They are not what a fit writes.
+        SchemaError: No fit writes such values.
     """
     _RECORD(record, "")
     if not record["train"]:
@@ -114,7 +114,7 @@ _COVERED = mapping(
     one_of("0", "1", "2+", "background"),
 )  # fmt: skip
 OPACITY = ("psnr_whole", "psnr_foreground", "alpha_empty", "alpha_object")
-"""Scores of views that know their opacity, as `warpgs.pipeline.metrics.evaluate` defines them."""
+"""Scores of views with an alpha channel, defined in `warpgs.pipeline.metrics.evaluate`."""
 METRICS = fields(
     {
         "test": mapping(or_null(real)), "train": mapping(or_null(real)),

@@ -17,7 +17,7 @@ from warpgs.poses.record import JSON, TEXT, read_record
 
 
 def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
-    """Find the poses of photographs where a request names some without cameras; other requests are returned as they are.
+    """Find the poses of photographs if a request names some without cameras; other requests are returned unchanged.
 
     Args:
         request: The request; its path may be a folder of images or a video.
@@ -57,7 +57,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
 
 def lost_lines(out: Path | None) -> list[str]:
-    """Return a line on the photographs of a run that have no pose, and so no part in it; an empty list where there are none.
+    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one.
 
     Raises:
         DataError: The record of the run's poses is incomplete.

@@ -42,7 +42,7 @@ class Difference:
 
     @property
     def excludes_zero(self) -> bool:
-        """True where the interval lies on one side of 0; never with fewer than two pairs."""
+        """True if the interval does not contain 0; never with fewer than two pairs."""
         return self.low > 0 or self.high < 0
 
 

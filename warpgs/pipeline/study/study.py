@@ -51,7 +51,7 @@ class StudyRequest:
     seeds: int
     """Number of runs of each variant on each scene, with seeds from 0 on."""
     out: Path
-    """Folder of the study; each run lies in SCENE/VARIANT/SEED below it."""
+    """Folder of the study; its runs are in SCENE/VARIANT/SEED."""
     device: str = "auto"
     """auto, cpu or cuda."""
     lpips_weights: Path | None = None

@@ -31,7 +31,7 @@ def color_of(text: str) -> Color | None:
         text: auto, mean, scene, black, white, ``#rrggbb``, or three numbers in [0, 1] as ``r,g,b``.
 
     Raises:
-        UsageError: It is none of them.
+        UsageError: The colour is invalid.
     """
     if text in CHOSEN:
         return None

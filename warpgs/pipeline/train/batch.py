@@ -1,4 +1,4 @@
-"""Steps of several views: the gradients of each in a slot of its own, their mean in one order, and one update.
+"""Steps of several views: each view has a slot for its gradients; these are averaged in a fixed order, for one update.
 
 Slots are spread over the processes of a fit; all else of a step is done by every process, with the same bits.
 """
@@ -89,7 +89,7 @@ class BatchSteps:
         self, places: Sequence[tuple[Kind, int]], settings: Sequence[tuple[float, ...]], stacks: Mapping[Kind, ViewStack],
         plan: StepPlan, max_instances: int | None, *, captured: bool,
     ) -> None:  # fmt: skip
-        """Take the step whose learning rates and settings `buffers` holds.
+        """Take the step of `buffers`, with its learning rates and settings.
 
         Args:
             places: Kind and row of the view of each slot, of all processes.

@@ -15,7 +15,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views at most: where views know their opacity, and where all are opaque."""
+"""Steps of a fit of up to `FEW` views at most: where views have an alpha channel, and where all are opaque."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Views from which steps grow beyond `MIN_STEPS`; the power of their number with which they do; and their bound."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
@@ -26,7 +26,7 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 """Fraction of the steps at half size up to so many views; beyond it falls with their number."""
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
-cannot tell a colour that changes with direction from an error of the shape."""
+cannot distinguish a view-dependent colour from an error of the shape."""
 OPACITIES_DECAY, SPARSE_VIEWS = 0.001, 9
 """Fraction of every opacity that a step takes up to so many opaque views, with one layer; with more, or where views know their
 opacity, it takes none, and there are two layers: neither was measured there (docs/decisions/023-opacity-decay.md)."""

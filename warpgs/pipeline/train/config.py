@@ -1,4 +1,4 @@
-"""All settings of a fit, composed of the dataclasses that live beside the code which reads them."""
+"""All settings of a fit, composed of the dataclasses of its modules."""
 
 from __future__ import annotations
 

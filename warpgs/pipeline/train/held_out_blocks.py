@@ -22,7 +22,7 @@ SIDES = 16, 32
 """Least and largest side of a block [px]; between them a sixteenth of the image's shorter side. In images of which an
 eighth is less than the least, it is that eighth."""
 MIN_BLOCKS = 12
-"""Fewest blocks over all views with which a gain can be told from noise."""
+"""Smallest number of blocks over all views for a significant gain."""
 MAX_FRACTION = 0.1
 """Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was requested."""
 

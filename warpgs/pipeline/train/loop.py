@@ -33,7 +33,7 @@ def run(
         on_step: Called after each step.
         save: Saves the state.
         stopped: Whether to end after a step.
-        restore: Loads the state that was saved last; returns False where there is none.
+        restore: Loads the last saved state; returns False without one.
 
     Raises:
         NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.

@@ -15,7 +15,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, Prior
 
 OUTPUTS = ("rgb", "alpha", "depth")
-"""Images of `warpgs.Render` that a loss term can ask for."""
+"""Images of `warpgs.Render` for loss terms."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Target:
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None
-    """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
+    """1 where a pixel counts, else 0, shape [H, W]; None if all pixels count."""
     maps: Mapping[str, torch.Tensor]
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None

@@ -1,9 +1,9 @@
 """Memory that a fit needs, added up from what its parts declare, and the means to keep to a limit.
 
 A step holds parameters with their moments throughout, and on top of them what its heaviest moment needs. Each part declares its
-bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. What
-the CUDA driver, Python and the compiled kernels occupy comes on top. Not counted, since they are small: parameters of single
-views, and the buffers of learning rates and losses (`StepBuffers`).
+bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The
+CUDA driver, Python and the compiled kernels need more on top. Not counted, since they are small: parameters of single views,
+and the buffers of learning rates and losses (`StepBuffers`).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views
 
 @dataclass(frozen=True)
 class Layout:
-    """Parts of a fit, which with the numbers of Gaussians and instances decide what a step needs."""
+    """Parts of a fit; with the numbers of Gaussians and instances they determine the memory of a step."""
 
     sizes: StepSizes
     """Sizes of every step, without Gaussians and instances."""
@@ -107,7 +107,7 @@ class MemoryPlan:
     """Predicted memory of a fit, and the means by which it keeps to its limit."""
 
     limit: int | None
-    """Bytes that the fit may take; None where it was given no limit."""
+    """Bytes that the fit may take; None without a limit."""
     available: int
     """Bytes that the device had free."""
     gaussians: int
@@ -211,7 +211,7 @@ def plan(
         The plan, and the layout of the steps to be taken: without graphs where those would not keep to the limit.
 
     Raises:
-        UsageError: The limit is below what the smallest step needs.
+        UsageError: The limit is below the need of the smallest step.
     """
     cap, refused = max(most, count), False
     single = replace(layout, graphs=0)

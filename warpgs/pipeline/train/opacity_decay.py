@@ -1,4 +1,4 @@
-"""Decay of opacities: each step takes a fraction of every opacity, so that only what photographs ask for stays.
+"""Decay of opacities: each step lowers every opacity by a fraction, so that Gaussians without support in the photographs fade.
 
 The idea is that of Binocular3DGS (Han et al. 2024, arXiv 2410.18822); docs/decisions/023-opacity-decay.md has the measurements.
 """
@@ -19,7 +19,7 @@ def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, 
 
     Args:
         logits: Logits of opacities, float32, shape [N].
-        fraction: Fraction of an opacity that is taken, in [0, 1); 0 changes nothing.
+        fraction: Fraction by which an opacity is lowered, in [0, 1); 0 changes nothing.
         going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
         used: Gaussians whose opacities change, bool, shape [N]; None for all.
     """

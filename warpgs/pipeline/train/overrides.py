@@ -83,7 +83,7 @@ def with_settings(config: FitConfig, values: Mapping[str, Any], place: str, *, k
 
 
 def changed_settings(before: FitConfig, after: FitConfig) -> list[str]:
-    """Return the names of the settings in which two configurations differ, as flags have them."""
+    """Return the names of the settings in which two configurations differ, in the form of flags."""
     old, new = (dict(_values(c)) for c in (before, after))
     return [flag(n) for n, value in new.items() if n not in old or old[n] != value]
 

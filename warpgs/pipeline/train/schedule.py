@@ -101,9 +101,9 @@ class PhaseConfig:
     """
 
     coarse: int = 0
-    """Steps of phase 1, in which there is the coarse layer alone; 2000 in the paper. 0 with ``stable`` 0: no phases."""
+    """Steps of phase 1, with only the coarse layer; 2000 in the paper. 0 with ``stable`` 0: no phases."""
     stable: int = 0
-    """Steps of phase 3, in which the set stays as it is; 3000 in the paper."""
+    """Steps of phase 3, in which no Gaussians are added or removed; 3000 in the paper."""
     every: float = 100.0
     """Steps from the first sampling event to the second (T_base, which the paper leaves open)."""
     growth: float = 4.0

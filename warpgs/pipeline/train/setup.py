@@ -38,7 +38,7 @@ class Preparation:
     start: Start
     """The first points, and the depths that views confirm."""
     priors: list[Prior] | None
-    """One a view; None where nothing asks for them."""
+    """One for each view; None if not needed."""
     notes: list[str]
     """Notes on choices, assumptions and missing inputs."""
 
@@ -47,7 +47,7 @@ def prepare(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
     priors: list[Prior] | None, ready: Callable[[], object], progress: Callable[[str], object] = lambda line: None,
 ) -> Preparation:  # fmt: skip
-    """Find the first points, and priors where they are not given and sampling or a loss term asks for them.
+    """Find the first points, and compute priors if sampling or a loss term needs them and they are not given.
 
     Args:
         train: The views to fit.
@@ -57,7 +57,7 @@ def prepare(
         device: Device to sweep on, unless there is a memory limit: depths take more than a step may.
         priors: Prior of each view; None to compute them where they are needed.
         ready: Called before the device is used, and in any case before the end.
-        progress: Called with a line for the user on what is being done.
+        progress: Called with a line for the user about the current work.
 
     Raises:
         DataError: There is nothing to start from.
@@ -79,15 +79,7 @@ def prepare(
     @functools.cache
     def start() -> Start:
         progress("finding start points")
-        # what is searched for along lines is searched for in pinholes; given points need no search
-        views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
-        found = initial_points(views, points, config.init, generator, usable, progress)
-        if found.depths is None and any_given(views):  # a start that searches for none
-            depths, lines = with_given_depth(views, None, seen_points(views, points))
-            found = found._replace(depths=depths, how="\n".join((found.how, *lines)))
-        if found.depths is not None:
-            found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
-        return subsample(found, config.max_gaussians, generator)
+        return _start_of(train, points, config, generator, usable, progress)
 
     notes = []
     if priors is None and needs_priors(config):
@@ -108,6 +100,22 @@ def prepare(
     lines = f"start: {found.how}".splitlines()
     # lines on single views are indented
     return Preparation(train, found, priors, [*(Detail(n.strip()) if n.startswith(" ") else n for n in lines), *notes])
+
+
+def _start_of(
+    train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator,
+    usable: Callable[[], torch.device], progress: Callable[[str], object],
+) -> Start:  # fmt: skip
+    """Return the first points and the depths that come with them; arguments are those of `prepare` and `initial_points`."""
+    # what is searched for along lines is searched for in pinholes; given points need no search
+    views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
+    found = initial_points(views, points, config.init, generator, usable, progress)
+    if found.depths is None and any_given(views):  # a start that searches for none
+        depths, lines = with_given_depth(views, None, seen_points(views, points))
+        found = found._replace(depths=depths, how="\n".join((found.how, *lines)))
+    if found.depths is not None:
+        found = found._replace(depths=[lens_depth(v.camera, d) for v, d in zip(train, found.depths, strict=True)])
+    return subsample(found, config.max_gaussians, generator)
 
 
 def _unused_networks(config: FitConfig) -> list[str]:
@@ -159,7 +167,7 @@ def prepared_views(
     images of events show it.
 
     Raises:
-        UsageError: Two loss terms ask for a map of one name.
+        UsageError: Two loss terms need a map of the same name.
     """
     views, disparities = [TrainingView.of(v, device) for v in with_alpha(train)], []
     priors, depths = made.priors or [None] * len(train), made.start.depths or [None] * len(train)

@@ -73,7 +73,7 @@ def subtrees(slots: range, node: Node) -> list[Node]:
 
 
 def depth(node: Node) -> int:
-    """Return how many sums stand side by side while the slots of a node are added one after the other."""
+    """Return the number of partial sums in memory while the slots of a node are added one after the other."""
     first, end = node
     if end - first == 1:
         return 1

@@ -334,7 +334,7 @@ class StepGraphs:
     def capture_all(
         self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
     ) -> list[CapturedGraph]:
-        """Return the graph of each of several steps of one plan, captured where there is none yet.
+        """Return the graph of each of several steps of one plan, captured if necessary.
 
         Args:
             kinds: Kind of each step's view.

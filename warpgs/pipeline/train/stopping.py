@@ -1,4 +1,4 @@
-"""Early stopping of a fit by the error of left-out blocks of pixels, beside any strategy (docs/decisions/020)."""
+"""Early stopping of a fit by the error of left-out blocks of pixels, for any strategy (docs/decisions/020)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class StoppingConfig:
 
 @dataclass(frozen=True)
 class Measurement:
-    """Held-out blocks at one time, and their gain since the measurement before; plain values as metrics.json has them."""
+    """Left-out blocks at one time, and their gain since the previous measurement; plain values for metrics.json."""
 
     step: int
     """Steps done."""
@@ -209,7 +209,7 @@ class Stopping:
         return 3 * step < self.marks[-1] or step <= self.earliest
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return the errors of the blocks at every measurement, shape [M, B], and plain values, to go on from."""
+        """Return the errors of the blocks at every measurement, shape [M, B], and plain values, for resuming."""
         tensors = {"stopping.measured": torch.stack([e for _, e in self.measured])} if self.measured else {}
         return tensors, {
             "ended": self.ended, "why": self.why, "measured": [s for s, _ in self.measured],

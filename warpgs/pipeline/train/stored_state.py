@@ -25,7 +25,7 @@ def check_state(
         stopping: Schema of the values of early stopping.
 
     Raises:
-        DataError: Something is missing, or is not what a fit stores.
+        DataError: A value is missing or invalid.
     """
     state = fields({
         "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),

@@ -43,7 +43,7 @@ class StepTaker:
         return 0 if self.batched is None else self.batched.result()[0]
 
     def clear(self) -> None:
-        """Drop all graphs; they are captured anew."""
+        """Drop all graphs; they are captured again."""
         for graphs in (self.graphs, self.batched):
             if graphs is not None:
                 graphs.clear()

@@ -67,8 +67,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
         views: Training views.
         device: Device of the fit.
 
-    Returns:
-        The configuration with its steps, and a sentence that says what was chosen and why.
+    Returns: The configuration with its steps, and a note on the choice.
 
     Raises:
         UsageError: The budget is no positive number, or too short for the shortest fit.

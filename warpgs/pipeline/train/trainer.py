@@ -143,7 +143,7 @@ class Trainer:
 
     @property
     def phases(self) -> Phases:
-        """Phases of the fit as they are now."""
+        """Current phases of the fit."""
         return self.context.phases
 
     @property
@@ -204,7 +204,7 @@ class Trainer:
         return OutOfMemoryError(no_memory_message(error, f" for step {self.step + 1}"), intact)
 
     def spare_memory(self) -> None:
-        """Give back memory that is not in use, and take steps one by one from here on, in chunks that fit into what is free.
+        """Free unused memory, and run steps without graphs from here on, in chunks that fit into the free memory.
 
         Raises:
             ResourceError: Not even the smallest step fits.

@@ -28,7 +28,7 @@ class TrainingView:
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None = None
-    """1 where a pixel counts, else 0, shape [H, W]; None where all count."""
+    """1 where a pixel counts, else 0, shape [H, W]; None if all pixels count."""
     semantic: torch.Tensor | None = None
     """S_semantic in [0, 1], shape [H, W]; None for a view without a semantic score."""
     geometry: torch.Tensor | None = None
@@ -89,7 +89,7 @@ class TrainingView:
 def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of the view of a step.
 
-    On CUDA image, mask, opacity and disparity are copied from the stacks. Views that know their opacity stand over the
+    On CUDA image, mask, opacity and disparity are copied from the stacks. Views with an alpha channel stand over the
     background of the step, beside what was added to it.
     """
     copies = (3 + sizes.masked + sizes.cutout + sizes.depth) * sizes.cuda
@@ -160,7 +160,7 @@ class ViewStack:
     images: Rows
     """Colours in [0, 1], shape [V, H, W, 3]."""
     masks: Rows | None
-    """1 where a pixel counts, else 0, shape [V, H, W]; None where all count."""
+    """1 where a pixel counts, else 0, shape [V, H, W]; None if all pixels count."""
     maps: Mapping[str, Rows]
     """Maps that loss terms requested, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
@@ -279,7 +279,7 @@ def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
 def show_learned(
     views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
 ) -> None:
-    """Write what is learned now into views of `with_learned`, from which density strategies render.
+    """Write the current learned values into views of `with_learned`, from which density strategies render.
 
     Args:
         views: Training views.

@@ -37,7 +37,7 @@ def inverse_depth_difference(
         depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
         alpha: Rendered opacity, shape [H, W].
         target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: means over pixels stay what they are.
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     shown = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
     shown = shown if mask is None else shown & (mask > 0)
@@ -87,7 +87,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
     Args:
         normals: Unit normals, 0 for missing values, shape [H, W, 3].
         target: Given normals, 0 for missing values, shape [H, W, 3]; shorter ones, means of several, count less.
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
     shown = shown if mask is None else shown & (mask > 0)

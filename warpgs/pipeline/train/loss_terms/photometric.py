@@ -30,7 +30,7 @@ def photometric_loss(
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Photographed colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count. Masked pixels are black to the
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count. Masked pixels are black to the
             window of SSIM, in which they count where it reaches pixels that do.
         ssim_weight: lambda, in [0, 1].
 

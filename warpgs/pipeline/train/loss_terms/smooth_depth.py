@@ -41,7 +41,7 @@ def depth_roughness(
         alpha: Rendered opacity, shape [H, W].
         image: Photographed colours in [0, 1], whose edges weaken the term, shape [H, W, 3].
         weight: Weights of the pixels, shape [H, W].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     shown = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
     shown = shown if mask is None else shown & (mask > 0)

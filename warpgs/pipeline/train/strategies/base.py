@@ -111,8 +111,7 @@ class Strategy:
 
         Args:
             phase: Value of `phase` for the step.
-            v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two values are that of the mean
-                [1/px].
+            v_projected: Gradient of the projected Gaussians, shape [1, N, 12]; the first two values belong to the mean [1/px].
             visible: Gaussians that touch a tile, bool, shape [1, N]; all False if the step is skipped.
             size: Width and height of the view [px].
         """

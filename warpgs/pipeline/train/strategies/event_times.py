@@ -12,7 +12,7 @@ class EventTimes:
     after: int
     """The first event comes after this."""
     every: int
-    """Steps between two events, which lie at its multiples."""
+    """Steps between two events, which are at multiples of this."""
     until: int
     """No event comes after this."""
 

@@ -197,7 +197,7 @@ class GradientGrowth:
         return self.refines(step) or self.resets(step)
 
     def refine(self, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None) -> Iterator[DensityUpdate]:
-        """Yield the change by `refine`, then order the Gaussians and begin to gather anew.
+        """Yield the change by `refine`, then order the Gaussians and reset the statistics.
 
         Args:
             growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.

@@ -112,7 +112,7 @@ def render_score(rendered: torch.Tensor, image: torch.Tensor, valid: torch.Tenso
 
 
 def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry: bool) -> tuple[float, float, float]:
-    """Return the three weights, those of absent scores 0, the others scaled to sum to 1; all 0 where none is left."""
+    """Return the three weights: 0 for missing scores, the others scaled to sum to 1; all 0 without any score."""
     chosen = (config.render * render, config.semantic * semantic, config.geometry * geometry)
     total = sum(chosen)
     return chosen if total == 0 else tuple(w / total for w in chosen)

@@ -123,7 +123,7 @@ def perturb(
 ) -> None:  # fmt: skip
     """Add noise of each Gaussian's own covariance to its mean, in place; the less the more opaque it is (eq. 8).
 
-    The noise depends on seed, step and row alone: the same on every device, and again after a fit is continued.
+    The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit.
 
     Args:
         gaussians: N Gaussians, float32.

@@ -54,7 +54,7 @@ class ProtectConfig:
 
     @property
     def logit(self) -> float:
-        """Least opacity as a logit, as it is stored."""
+        """Smallest opacity, as a stored logit."""
         return geometry.logit(self.opacity)
 
 
@@ -165,7 +165,7 @@ class Event:
 
 
 class Rendered(NamedTuple):
-    """A view as it is before an event, and where it can be sampled."""
+    """A render of a view before an event, and the pixels that can be sampled."""
 
     rgb: torch.Tensor
     """Colours as the view shows them, shape [H, W, 3]."""
@@ -227,7 +227,7 @@ def least_contributing(
 ) -> torch.Tensor:
     """Return the rows of the ``count`` candidates (bool [N]) with the least sums of blending weights, int64 [count].
 
-    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size: they only have to rank.
+    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size, because they only rank the Gaussians.
     """
     total = torch.zeros(len(gaussians), device=gaussians.means.device)
     for view in views[:: -(-len(views) // MAX_WEIGHED)]:
@@ -248,6 +248,25 @@ def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView
         total += rasterize(gaussians, view.camera, weigh).weight_sums[0]
     ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
     return DensityUpdate(ids, {n: t[:0] for n, t in gaussians.tensors().items()}, ids[:0])
+
+
+def _sampled(
+    gaussians: Gaussians, views: list[TrainingView], config: MethodConfig, options: RasterizeOptions, generator: torch.Generator
+) -> tuple[dict[str, torch.Tensor], tuple[SampledView, ...]]:
+    """Return the Gaussians that are sampled in the views, by name of the tensor, and the maps that led to them."""
+    numbers = list(range(len(views)))
+    if len(views) > MAX_VIEWS:
+        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
+    before = [render_before(gaussians, views[i], config, options) for i in numbers]
+    residuals: list[Residual] = []
+    if config.importance.residual == "gain" and config.weights()[0] > 0:
+        footprint = config.sampler.footprint
+        residuals = [residual_of(views[i], b.rgb, b.surface, footprint) for i, b in zip(numbers, before, strict=True)]
+    coefficients = gaussians.sh.shape[1]
+    sampled, rows = zip(
+        *(sample_view(views[i], i, b, residuals, config, coefficients, generator) for i, b in zip(numbers, before, strict=True))
+    )
+    return {name: torch.cat([r[name] for r in rows]) for name in rows[0]}, sampled
 
 
 @torch.no_grad()
@@ -282,21 +301,8 @@ def sampling_event(
     Returns:
         The change, and the maps that led to it.
     """
-    numbers = list(range(len(views)))
-    if len(views) > MAX_VIEWS:
-        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
-    before = [render_before(gaussians, views[i], config, options) for i in numbers]
-    residuals: list[Residual] = []
-    if config.importance.residual == "gain" and config.weights()[0] > 0:
-        footprint = config.sampler.footprint
-        residuals = [residual_of(views[i], b.rgb, b.surface, footprint) for i, b in zip(numbers, before, strict=True)]
-    coefficients = gaussians.sh.shape[1]
-    sampled, rows = zip(
-        *(sample_view(views[i], i, b, residuals, config, coefficients, generator) for i, b in zip(numbers, before, strict=True))
-    )
-    added = {name: torch.cat([r[name] for r in rows]) for name in rows[0]}
+    added, sampled = _sampled(gaussians, views, config, options, generator)
     count = len(added["means"])
-
     coarse_count, fine_count = int((~fine).sum()), int(fine.sum())
     over = max(fine_count + count - int(config.sampler.max_fraction * coarse_count), count - capacity)
     keep = torch.ones(len(gaussians), dtype=torch.bool, device=fine.device)

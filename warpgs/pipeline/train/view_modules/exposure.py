@@ -1,8 +1,8 @@
 """Exposure of training views: an affine map of the rendered colours of each, learned with the Gaussians.
 
-A camera that meters every photograph anew shows one colour brighter here and bluer there. With exposures a step compares the
-view's image with A rgb + b of its render. What is learned are the 12 numbers of [A - 1 | b], which start at zero. A step uses
-them less their mean over all training views, so that the model has their mean exposure: else all of them could turn darker
+A camera with automatic exposure and white balance changes the colours between photographs. With exposures a step compares the
+view's image with A rgb + b of its render. The learned parameters are the 12 numbers of [A - 1 | b], which start at zero. A step
+uses them less their mean over all training views, so that the model has their mean exposure: else all of them could turn darker
 while the Gaussians turn brighter, and no training image would tell.
 """
 
@@ -91,7 +91,7 @@ class Exposure(ViewModule):
             raise UsageError(f"exposure weight must be between 0 and 1000, not {self.weight}")
 
     def check(self, views: Sequence[View]) -> None:
-        """Check that no view knows its opacity: an exposure would change the background with the object.
+        """Check that no view has an alpha channel: an exposure would change the background with the object.
 
         Raises:
             UsageError: One does.

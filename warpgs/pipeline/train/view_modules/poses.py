@@ -158,7 +158,7 @@ def refined_cameras(
 def pose_figures(
     given: Mapping[str, Camera], refined: Mapping[str, Camera], train: Sequence[str], held_out: bool, scale: float
 ) -> dict[str, Any]:
-    """Return what refinement changed, as metrics.json holds it.
+    """Return the changes by refinement, for metrics.json.
 
     Args:
         given: Cameras before, in scene units.
