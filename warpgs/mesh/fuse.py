@@ -81,7 +81,7 @@ def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap
         views: Surface that each camera sees.
         plan: The grid.
         maps: Depth of each view, which the others are compared with.
-        like: Any tensor of the type and on the device of the grid.
+        like: Any tensor of the type and on the device of the grid, shape [...].
     """
     grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like)
     for view, others in zip(views("fusing depth"), neighbours(maps)):

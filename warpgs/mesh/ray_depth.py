@@ -14,9 +14,9 @@ from warpgs.scene import Camera, Gaussians
 CONTRIBUTORS = 32
 """Heaviest Gaussians of a pixel that are looked at."""
 BAND = 0.02
-"""Largest difference from the median depth, as a fraction of it, of what is of the same surface."""
+"""Largest difference from the median depth, as a fraction of it, that counts as the same surface."""
 MIN_SHARE = 0.5
-"""Least share of the weights within `BAND` of the median of a pixel that shows a surface (docs/decisions/027-mesh-depth.md)."""
+"""Least fraction of the weights within `BAND` of the median of a pixel that shows a surface (docs/decisions/027-mesh-depth.md)."""
 BLOCK = 2**15
 """Pixels at a time: 40 MB for each number of a matrix of every contributor."""
 
@@ -69,7 +69,7 @@ def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor
 def surface_depth(
     gaussians: Gaussians, camera: Camera, ids: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the median depth of what makes up each pixel, and the share of its weights within `BAND` of that.
+    """Return the median depth of what makes up each pixel, and the fraction of its weights within `BAND` of that.
 
     Args:
         gaussians: N Gaussians in the units of the camera.
@@ -78,7 +78,7 @@ def surface_depth(
         weights: Their blending weights, 0 for none, shape [H, W, k].
 
     Returns:
-        z-depth [u] and share in [0, 1], shape [H, W] each; 0 and 0 where a pixel has no Gaussian.
+        z-depth [u] and fraction in [0, 1], shape [H, W] each; 0 and 0 where a pixel has no Gaussian.
     """
     height, width, k = ids.shape
     matrices, means = whitening(gaussians, camera)
