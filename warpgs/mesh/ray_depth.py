@@ -16,9 +16,10 @@ CONTRIBUTORS = 32
 BAND = 0.02
 """Largest difference from the median depth, as a fraction of it, that counts as the same surface."""
 MIN_SHARE = 0.5
-"""Least fraction of the weights within `BAND` of the median of a pixel that shows a surface (docs/decisions/027-mesh-depth.md)."""
+"""Least fraction of the weights within `BAND` of the median where a pixel shows a surface
+(docs/decisions/027-mesh-depth.md)."""
 BLOCK = 2**15
-"""Pixels at a time: 40 MB for each number of a matrix of every contributor."""
+"""Pixels at a time: 38 MB for the matrices of their contributors."""
 
 
 def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
