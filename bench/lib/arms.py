@@ -38,8 +38,8 @@ class Arm:
 COR_GS = f"3dgs:strategy=examples/11_cor_gs.py:CorGS,density.gradient=0.0005,{ONE_RULE}"
 GSPLAT = "gsplat:sh_degree=auto,background=mean"
 RIVALS = (
+    Arm("`default` without extrapolated points", f"default:{NO_EXTRAPOLATION}"),
     Arm("`default`", "default"),
-    Arm("`default`, not extrapolated: the start of all below", f"default:{NO_EXTRAPOLATION}"),
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
     Arm("CoR-GS", COR_GS, (1500, 3000)),
     Arm("gsplat", GSPLAT, STEPS),
