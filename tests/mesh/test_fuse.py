@@ -11,7 +11,7 @@ from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
-from warpgs.mesh.surface_views import sample_surface, surface_view
+from warpgs.mesh.surface_views import SurfaceViews, sample_surface, surface_view
 from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.runs import mesh_of_run as run_mesh
 from warpgs.pipeline.runs.folder import METRICS_FILE, StoredRun
@@ -47,7 +47,7 @@ def test_a_vertex_that_nobody_sees_has_its_neighbours_colour(fused):
     """The middle of the ball, and a point far behind every camera."""
     hidden = CENTER + np.array([[0.2, 0, 0], [-99, 0, 0]])
     more = dataclasses.replace(fused.mesh, vertices=np.concatenate([fused.mesh.vertices, hidden]))
-    colors, count = vertex_colors(more, ball(), cameras(ALL_SIDES), RENDER, fused.plan, "median", lambda line: None)
+    colors, count = vertex_colors(more, SurfaceViews(ball(), cameras(ALL_SIDES), RENDER, "median"), fused.plan.truncation)
     assert count == fused.uncolored + 2 and np.array_equal(colors[:-2], fused.mesh.colors)
     assert colors[-2, 0] > 0.5 > colors[-2, 2] and colors[-1, 2] > 0.5 > colors[-1, 0]
 

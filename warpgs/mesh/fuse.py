@@ -13,7 +13,7 @@ from warpgs.errors import UsageError
 from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
 from warpgs.mesh.agreement import DepthMap, agreed, depth_map, neighbours
 from warpgs.mesh.grid import MAX_RESOLUTION, MIN_RESOLUTION, GridPlan, check_memory, plan_grid
-from warpgs.mesh.surface_views import DEPTHS, SAMPLES, sample_surface, surface_views
+from warpgs.mesh.surface_views import DEPTHS, SAMPLES, SurfaceViews, sample_surface
 from warpgs.mesh.triangles import decimate, extract, remove_small_parts
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
@@ -74,24 +74,17 @@ class FusedMesh:
     """Number of vertices that no view saw, and that have the colour of the nearest that was seen."""
 
 
-def integrate_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, plan: GridPlan, depth: str,
-    maps: Sequence[DepthMap], stage: Callable[[str], object],
-) -> DistanceGrid:  # fmt: skip
+def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor) -> DistanceGrid:
     """Return the grid after all views, in the order of the cameras.
 
     Args:
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, arrays of numpy.
-        render: Settings of the rasterizer.
+        views: Surface that each camera sees.
         plan: The grid.
-        depth: Depth that is fused.
         maps: Depth of each view, which the others are compared with.
-        stage: Function that shows a line of progress.
+        like: Any tensor of the type and on the device of the grid, shape [...].
     """
-    grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, gaussians.means)
-    views = surface_views(gaussians, cameras, render, depth, "fusing depth", stage)
-    for view, others in zip(views, neighbours(maps)):
+    grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like)
+    for view, others in zip(views("fusing depth"), neighbours(maps)):
         view = agreed(view, [maps[i] for i in others])
         integrate(grid, view.camera, view.depth, view.weights)
     return grid
@@ -103,8 +96,9 @@ def fuse(
 ) -> FusedMesh:  # fmt: skip
     """Make a mesh of the surfaces that cameras see of a model.
 
-    Areas that no camera sees, or on which cameras disagree, stay open. Each view is rendered three times, for the extent of the
-    scene, for distances and for colours. One is held in memory at a time, and the depths of all.
+    Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
+    for distances and for colours. Up to 16 million pixels in all are rendered once and kept. With more, each use renders one
+    view at a time, and only the depths are kept.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
@@ -120,12 +114,13 @@ def fuse(
         UsageError: A camera is orthographic, or an option is out of range.
     """
     samples, maps = [], []
-    for view in surface_views(gaussians, cameras, render, options.depth, "finding surfaces", stage):
+    views = SurfaceViews(gaussians, cameras, render, options.depth, stage)
+    for view in views("finding surfaces"):
         samples.append(sample_surface(view, max(1, SAMPLES // len(cameras))))
         maps.append(depth_map(view, len(cameras)))
     plan = plan_grid(*map(np.concatenate, zip(*samples)), options.voxel, options.resolution)
     planned(plan, check_memory(plan, gaussians.means.device))
-    grid = integrate_views(gaussians, cameras, render, plan, options.depth, maps, stage)
+    grid = integrate_views(views, plan, maps, gaussians.means)
     del maps
     unseen = 1 - np.count_nonzero(grid.weights.cpu().numpy()) / plan.points
     stage("finding triangles: marching cubes")
@@ -135,32 +130,26 @@ def fuse(
     if len(cleaned.faces) > options.max_faces:
         stage(f"simplifying: {len(cleaned.faces):,} triangles")
     mesh = decimate(cleaned, options.max_faces)
-    colors, uncolored = vertex_colors(mesh, gaussians, cameras, render, plan, options.depth, stage)
+    colors, uncolored = vertex_colors(mesh, views, plan.truncation)
     return FusedMesh(replace(mesh, colors=colors), plan, unseen, len(whole.faces), removed, uncolored)
 
 
-def vertex_colors(
-    mesh: Mesh, gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, plan: GridPlan, depth: str,
-    stage: Callable[[str], object],
-) -> tuple[np.ndarray, int]:  # fmt: skip
+def vertex_colors(mesh: Mesh, views: SurfaceViews, truncation: float) -> tuple[np.ndarray, int]:
     """Return the weighted mean of the rendered colours that the views see at each vertex.
 
     Args:
         mesh: The mesh, V vertices.
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, arrays of numpy.
-        render: Settings of the rasterizer.
-        plan: Grid that the mesh was made with.
-        depth: Depth that was fused.
-        stage: Function that shows a line of progress.
+        views: Surface that each camera sees, at least one.
+        truncation: Largest distance from a surface that the grid of the mesh stored [u].
 
     Returns:
         Colours in [0, 1], float32, shape [V, 3], and the number of vertices that no view sees.
     """
-    points = torch.as_tensor(mesh.vertices, dtype=gaussians.means.dtype, device=gaussians.means.device)
-    sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
-    tolerance = COLOR_TOLERANCE * plan.truncation
-    for view in surface_views(gaussians, cameras, render, depth, "colouring", stage):
+    tolerance = COLOR_TOLERANCE * truncation
+    for i, view in enumerate(views("colouring")):
+        if i == 0:
+            points = torch.as_tensor(mesh.vertices, dtype=view.depth.dtype, device=view.depth.device)
+            sums, weights = torch.zeros_like(points), torch.zeros_like(points[:, 0])
         gather_colors(points, tolerance, view.camera, view.depth, view.weights, view.image, sums, weights)
     known = (weights > 0).cpu().numpy()
     colors = sums.cpu().numpy() / np.maximum(weights.cpu().numpy(), np.finfo(np.float32).tiny)[:, None]

@@ -11,6 +11,7 @@ import torch
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, pinhole_of
 from warpgs.kernels.tsdf import face_cosines
+from warpgs.mesh.ray_depth import CONTRIBUTORS, MIN_SHARE, surface_depth
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
@@ -23,6 +24,8 @@ EMPTY = 0.02
 """Opacity below which a pixel shows that nothing is there: five of 255 levels."""
 SAMPLES = 200_000
 """Pixels of all views that are looked at to find where the surfaces are."""
+KEPT_PIXELS = 2**24
+"""Most pixels of all views that are rendered once and kept, 320 MiB; with more, every use renders again."""
 
 
 @dataclass(frozen=True)
@@ -55,33 +58,55 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
     if depth not in DEPTHS:
         raise UsageError(f"depth {depth!r} is not one of {', '.join(DEPTHS)}")
     camera = pinhole_of(camera)
-    r = rasterize(gaussians, camera, replace(options, median_depth=depth == "median"))
-    z = r.depth if r.median_depth is None else r.median_depth
+    r = rasterize(gaussians, camera, replace(options, heaviest=CONTRIBUTORS if depth == "median" else 0))
+    z = r.depth
+    if r.heaviest_ids is not None and r.heaviest_weights is not None:
+        z, share = surface_depth(gaussians, camera, r.heaviest_ids, r.heaviest_weights)
+        z = torch.where(share >= MIN_SHARE, z, 0)
     z = torch.where(r.alpha >= MIN_ALPHA, z, torch.where(r.alpha <= EMPTY, torch.inf, 0.0)).contiguous()
     weights = face_cosines(z, camera) * torch.where(torch.isfinite(z), r.alpha, 1.0)
     return SurfaceView(camera, z, weights, r.rgb.contiguous())
 
 
-def surface_views(
-    gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str, purpose: str,
-    stage: Callable[[str], object],
-) -> Iterator[SurfaceView]:  # fmt: skip
-    """Yield what each camera sees of the surface, one after the other, so that one view is held at a time.
+class SurfaceViews:
+    """Surfaces that all cameras see, in their order, as often as they are asked for.
 
-    Args:
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, arrays of numpy.
-        options: Settings of the rasterizer.
-        depth: Depth that is taken, one of `DEPTHS`.
-        purpose: Words for the line of progress.
-        stage: Function that shows a line of progress, before each view.
-
-    Raises:
-        UsageError: A camera is orthographic, or the depth is unknown.
+    Up to `KEPT_PIXELS` pixels are kept; with more, one view is held at a time.
     """
-    for i, camera in enumerate(cameras, 1):
-        stage(f"{purpose}: view {i} of {len(cameras)}")
-        yield surface_view(gaussians, camera, options, depth)
+
+    def __init__(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str,
+        stage: Callable[[str], object] = lambda line: None,
+    ) -> None:  # fmt: skip
+        """Take what is rendered.
+
+        Args:
+            gaussians: N Gaussians in the units of the cameras.
+            cameras: Cameras, arrays of numpy.
+            options: Settings of the rasterizer.
+            depth: Depth that is taken, one of `DEPTHS`.
+            stage: Function that shows a line of progress, before each view.
+        """
+        self._render = lambda camera: surface_view(gaussians, camera, options, depth)
+        self._cameras, self._stage = cameras, stage
+        self._keeps = sum(c.width * c.height for c in cameras) <= KEPT_PIXELS
+        self._kept: dict[int, SurfaceView] = {}
+
+    def __call__(self, purpose: str) -> Iterator[SurfaceView]:
+        """Yield what each camera sees of the surface.
+
+        Args:
+            purpose: Words for the line of progress.
+
+        Raises:
+            UsageError: A camera is orthographic, or the depth is unknown.
+        """
+        for i, camera in enumerate(self._cameras):
+            self._stage(f"{purpose}: view {i + 1} of {len(self._cameras)}")
+            view = self._kept.get(i) or self._render(camera)
+            if self._keeps:
+                self._kept[i] = view
+            yield view
 
 
 def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarray]:
