@@ -233,7 +233,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
         ("plot RUN a.png --size 320 240", "did you mean --out a.png?"),
         ("mesh RUN a.glb", "did you mean --out a.glb?"),
         ("export RUN scene.html", "scene.html is an extra argument; did you mean --to scene.html?"),
-        ("export RUN a.ply --to b.ply", "a.ply is an extra argument; `warpgs export --help` lists what it takes"),
+        ("export RUN a.ply --to b.ply", "a.ply is an extra argument; `warpgs export --help` lists its arguments"),
         ("render RUN --size 720", "--size needs two numbers: width height, such as --size 1280 720"),
         ("render RUN --size 720 --fps 30", "--size needs two numbers"),
         ("plot RUN --size 720x480", "--size needs two numbers"),

@@ -19,17 +19,17 @@ WHOLE = "expected an integer of at most 2^63 - 1, got"
         ("convert a.ply --to b.spz", "unknown flag --to; `warpgs convert --help-all` lists the flags"),
         ("fit scene -out run", "unknown flag -out; did you mean --out?"),
         ("fit scene run", "run is an extra argument; did you mean --out run?"),
-        ("fit", "SCENE and --out PATH are missing; `warpgs fit --help` lists what it takes"),
-        ("fit scene --out", "--out needs a value; `warpgs fit --help` lists what it takes"),
-        ("fit scene --out --steps 3", "--out needs a value; `warpgs fit --help` lists what it takes"),
-        ("fit scene --out run --steps abc", f"--steps: {WHOLE} 'abc'; `warpgs fit --help` lists what it takes"),
-        ("fit scene --out run --seed 1.5", f"--seed: {WHOLE} '1.5'; `warpgs fit --help` lists what it takes"),
+        ("fit", "SCENE and --out PATH are missing; `warpgs fit --help` lists its arguments"),
+        ("fit scene --out", "--out needs a value; `warpgs fit --help` lists its arguments"),
+        ("fit scene --out --steps 3", "--out needs a value; `warpgs fit --help` lists its arguments"),
+        ("fit scene --out run --steps abc", f"--steps: {WHOLE} 'abc'; `warpgs fit --help` lists its arguments"),
+        ("fit scene --out run --seed 1.5", f"--seed: {WHOLE} '1.5'; `warpgs fit --help` lists its arguments"),
         ("fit scene --out run --method.hier x", "--method.hier: 'x' is not one of "),
-        ("mesh run", "--out PATH is missing; `warpgs mesh --help` lists what it takes"),
-        ("convert a", "TARGET is missing; `warpgs convert --help` lists what it takes"),
-        ("demo", "FOLDER is missing; `warpgs demo --help` lists what it takes"),
-        ("view --port x run", f"--port: {WHOLE} 'x'; `warpgs view --help` lists what it takes"),
-        ("farm", "JOBS and --out PATH are missing; `warpgs farm --help` lists what it takes"),
+        ("mesh run", "--out PATH is missing; `warpgs mesh --help` lists its arguments"),
+        ("convert a", "TARGET is missing; `warpgs convert --help` lists its arguments"),
+        ("demo", "FOLDER is missing; `warpgs demo --help` lists its arguments"),
+        ("view --port x run", f"--port: {WHOLE} 'x'; `warpgs view --help` lists its arguments"),
+        ("farm", "JOBS and --out PATH are missing; `warpgs farm --help` lists its arguments"),
     ],
 )
 def test_a_wrong_command_line_is_one_line(words, error, tmp_path, capsys, monkeypatch):
@@ -54,5 +54,5 @@ def test_the_terminal_does_not_matter(columns, box, capsys, monkeypatch):
 def test_a_complaint_in_other_words_is_passed_on_in_one_line():
     """As another version of the parser may have them."""
     box = "╭─ Fault ────╮\n│ Something  │\n│ is wrong.  │\n│ ────────── │\n│ For more.. │\n╰────────────╯\n"
-    with pytest.raises(UsageError, match=r"^Something is wrong.; `warpgs fit --help` lists what it takes$"):
+    with pytest.raises(UsageError, match=r"^Something is wrong.; `warpgs fit --help` lists its arguments$"):
         refuse(dataclasses.make_dataclass("Flags", []), [], "warpgs fit", box)

@@ -36,7 +36,7 @@ def refuse(kind: type, arguments: list[str], program: str, complaint: str) -> No
     drawn = re.compile(r"[ ─╰╯-]+").fullmatch  # a line, with words on the help below it
     rows = [*takewhile(lambda row: not drawn(row), dropwhile(drawn, rows))]
     reason = _missing(kind, rows) or _wrong_value(" ".join(" ".join(rows).split()))
-    raise UsageError(f"{reason}; `{program} --help` lists what it takes")
+    raise UsageError(f"{reason}; `{program} --help` lists its arguments")
 
 
 def _refuse_unknown_flag(kind: type, arguments: list[str], program: str) -> None:
@@ -73,7 +73,7 @@ def _refuse_stray_word(kind: type, arguments: list[str], program: str, rows: lis
     hint = (
         f"did you mean {target} {words[0]}?"
         if target and (missing or Path(words[0]).suffix)
-        else f"`{program} --help` lists what it takes"
+        else f"`{program} --help` lists its arguments"
     )
     raise UsageError(f"{words[0]} is an extra argument; {hint}")
 
