@@ -15,7 +15,11 @@ def scalar(render):
 
 @pytest.mark.parametrize("colors", [None, 5], ids=["harmonics", "channels"])
 def test_absgrad_sums_the_magnitude_of_each_pixels_gradient(device, colors):
-    """Against one backward pass for each pixel, in float64; gradients keep their bits."""
+    """Against one backward pass for each pixel, in float64; gradients stay the same.
+
+    Where no channels are given, and on a CPU, they have the same bits. On CUDA float64 takes five channels in two passes, but
+    magnitudes take one: sums differ by rounding.
+    """
     gaussians, cam = leaves(hand_placed(device=device, degree=1)), camera(13, 11, cameras=2, device=device)
     values = None if colors is None else torch.randn(6, colors, generator=torch.Generator().manual_seed(0)).to(gaussians.means)
     found = []
@@ -24,7 +28,8 @@ def test_absgrad_sums_the_magnitude_of_each_pixels_gradient(device, colors):
         means2d = r.means2d
         v = torch.autograd.grad(scalar(r), list(gaussians.tensors().values()), retain_graph=True, allow_unused=True)
         found.append((means2d.grad, *(t for t in v if t is not None)))
-    assert all(torch.equal(a, b) for a, b in zip(*found))
+    error = 1e-13 if device.type == "cuda" and colors else 0.0  # of the largest value; a sum of 143 pixels rounds by 2e-14 at most
+    assert all(float((a - b).abs().max()) <= error * float(a.abs().max()) for a, b in zip(*found))
     absgrad, images = means2d.absgrad, [r.rgb, r.alpha, r.depth]  # before further passes add to it
     upstream = torch.autograd.grad(scalar(r), images, retain_graph=True)
     total = torch.zeros_like(means2d)
