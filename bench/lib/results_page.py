@@ -38,8 +38,8 @@ CAPTURES = {
 """Scene and number of training views of each row of the presets' result."""
 BEFORE_DECAY = "default:method.hier=true,optimizer.opacities_decay=0"
 """`default` as it was before decision 023."""
-BEFORE_SMOOTH = "default:loss.smooth_weight=0,steps=3000"
-"""`default` as it was before decision 024."""
+ONE_LAYER = "default:method.hier=false,optimizer.opacities_decay=0.001"
+"""`default` with up to 9 views with alpha, as it was measured before it became so."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
 POSES = {
     "given": "given with the photographs",
@@ -140,26 +140,18 @@ def views() -> str:
     return markdown(["scene, views", "split", *heads], body, ["scene, views", "split"]) + source
 
 
-def few_views() -> str:
-    """Return the table of `default` with up to 9 opaque views beside its settings before decision 023."""
-    return _change_of_default("few_views_h100", BEFORE_DECAY, "two layers, no opacity decay")
-
-
-def smooth_depth() -> str:
-    """Return the table of `default` with up to 4 opaque views beside its settings before decision 024."""
-    return _change_of_default("few_views_smooth_h100", BEFORE_SMOOTH, "depth not smoothed, 3000 steps")
-
-
-def _change_of_default(name: str, before: str, words: str) -> str:
-    """Return the table of `default` beside its settings of before, over the seeds that both have."""
-    result, source = _result(name)
-    found, body = by_seed(result["rows"]), []
-    for row in (n for n in CAPTURES if (n, "default") in found):
-        own, base = found[row, "default"], found[row, before]
-        seeds = sorted(own.keys() & base.keys())
-        scores = [_scores([of[s] for s in seeds]) for of in (base, own)]
-        body.append([", ".join(map(str, CAPTURES[row])), *scores, _change(own, base, "psnr", 2)])
-    return table(["scene, views", words, "`default`", "change in PSNR"], body) + source
+def default_now() -> str:
+    """Return the table of `default` beside its scores in the table of all presets, which is older."""
+    result, source = _result("default_h100")
+    old, new = (by_seed(r["rows"]) for r in (_result("presets_h200")[0], result))
+    body = []
+    for row, (scene, count) in CAPTURES.items():
+        own = new.get((row, "default")) or new.get((row, ONE_LAYER))
+        if own:
+            before, now = (list(of.values()) for of in (old[row, "default"], own))
+            change = statistics.mean(r["psnr"] for r in now) - statistics.mean(r["psnr"] for r in before)
+            body.append([f"{scene}, {count}", str(len(now)), _scores(before), _scores(now), f"{change:+.2f}"])
+    return table(["scene, views", "seeds", "before", "`default`", "change in PSNR"], body) + source
 
 
 def coverage() -> str:
@@ -202,14 +194,21 @@ def strategies() -> str:
 
 
 def objects() -> str:
-    """Return the table on objects cut out, by the format of the scene."""
+    """Return the table on objects cut out: by the format of the scene, and with one layer beside two on the same objects."""
     result, source = _result("objects_h200")
-    body = []
-    for form in ("transforms", "colmap"):
-        rows = [r for r in result["rows"] if r["format"] == form]
-        psnr, alpha, empty = (statistics.mean(r[k] for r in rows) for k in ("psnr_white", "alpha_object", "alpha_empty"))
-        body.append([form, f"{psnr:.2f}", f"{alpha:.4f}", f"{empty:.4f}"])
-    return table(["scene format", "PSNR over white", "alpha in the object", "alpha outside"], body) + source
+    body = [[form, *_object_cells([r for r in result["rows"] if r["format"] == form])] for form in ("transforms", "colmap")]
+    head = ["PSNR over white", "alpha in the object", "alpha outside"]
+    by_format = table(["scene format", *head], body) + source
+    result, source = _result("one_layer_objects_h100")
+    one = {r["object"]: r for r in result["rows"] if r["preset"] == ONE_LAYER}
+    two = {r["object"]: r for r in result["rows"] if r["preset"] == "default" and r["object"] in one}
+    body = [[words, str(len(of)), *_object_cells(list(of.values()))] for words, of in (("two", two), ("one: `default`", one))]
+    return by_format + "\n" + table(["layers", "objects", *head], body) + source
+
+
+def _object_cells(rows: list[dict]) -> list[str]:
+    psnr, alpha, empty = (statistics.mean(r[k] for r in rows) for k in ("psnr_white", "alpha_object", "alpha_empty"))
+    return [f"{psnr:.2f}", f"{alpha:.4f}", f"{empty:.4f}"]
 
 
 def poses() -> str:
@@ -278,7 +277,7 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ladder, ablation, views, few_views, smooth_depth, coverage, mcmc, strategies, objects, poses, same_image, antialiasing,
+    ladder, ablation, views, default_now, coverage, mcmc, strategies, objects, poses, same_image, antialiasing,
     meshes, repeats,
 )  # fmt: skip
 

@@ -11,7 +11,7 @@ import torch
 
 from tests.tolerances import OPACITY_DECAY
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, SPARSE_VIEWS, settings_by_views
+from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA, settings_by_views
 from warpgs.pipeline.train.opacity_decay import LEAST_LOGIT, decay_opacities
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
@@ -48,9 +48,12 @@ def test_a_step_that_is_not_taken_changes_nothing():
 
 @pytest.mark.parametrize(
     ("views", "alpha", "few"),
-    [(EXTRAPOLATED_VIEWS + 1, None, True), (SPARSE_VIEWS, None, True), (SPARSE_VIEWS + 1, None, False), (3, 1.0, False)],
-)
-def test_few_opaque_views_have_one_layer_and_decay(views, alpha, few):
+    [
+        (EXTRAPOLATED_VIEWS + 1, None, True), (ONE_LAYER_VIEWS, None, True), (ONE_LAYER_VIEWS + 1, None, False),
+        (3, 1.0, True), (ONE_LAYER_VIEWS_ALPHA, 1.0, True), (ONE_LAYER_VIEWS_ALPHA + 1, 1.0, False),
+    ],
+)  # fmt: skip
+def test_few_views_have_one_layer_and_decay(views, alpha, few):
     """The choice is named; what is given holds."""
     train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6), alpha=alpha)] * views
     config, notes = settings_by_views(PRESETS["default"], train, "cuda")

@@ -28,7 +28,7 @@ def test_absgrad_sums_the_magnitude_of_each_pixels_gradient(device, colors):
         means2d = r.means2d
         v = torch.autograd.grad(scalar(r), list(gaussians.tensors().values()), retain_graph=True, allow_unused=True)
         found.append((means2d.grad, *(t for t in v if t is not None)))
-    error = 1e-13 if device.type == "cuda" and colors else 0.0  # of the largest value; a sum of 143 pixels rounds by 2e-14 at most
+    error = 1e-13 if device.type == "cuda" and colors else 0.0  # 143 pixels round by 2e-14 of the largest value at most
     assert all(float((a - b).abs().max()) <= error * float(a.abs().max()) for a, b in zip(*found))
     absgrad, images = means2d.absgrad, [r.rgb, r.alpha, r.depth]  # before further passes add to it
     upstream = torch.autograd.grad(scalar(r), images, retain_graph=True)

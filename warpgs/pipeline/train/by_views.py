@@ -27,9 +27,10 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot distinguish a view-dependent colour from an error of the shape."""
-OPACITIES_DECAY, SPARSE_VIEWS = 0.001, 9
-"""Fraction of every opacity that a step takes up to so many opaque views, with one layer; with more, or where views know their
-opacity, it takes none, and there are two layers: neither was measured there (docs/decisions/023-opacity-decay.md)."""
+OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 45, 9
+"""Fraction of every opacity that a step takes; and the opaque views, and views with alpha, up to which it does so and there is
+one layer. With more views it takes none, and there are two layers. 40 opaque views gain, 54 were not measured; 9 views with
+alpha gain, 12 do not (docs/decisions/023-opacity-decay.md)."""
 SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
 """Weight of the roughness of rendered depth up to so many opaque views, in fits of at least so many steps; else there is no
 such term: it was not measured with alpha, costs decibels with 9 views, and does not pay in 480 steps
@@ -40,16 +41,16 @@ decay of opacities with them; neither was measured elsewhere (docs/decisions/026
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: they are
 too few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
-CPU_PIXELS = 1.35e6
+CPU_PIXELS = 1.55e6
 """Pixels that two cores of a processor of 2.5 GHz train a second with about as many Gaussians; with fewer it is up to three
 times as many."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
 ONE_LAYER = 1.1
 """Time of a step on a CPU with one layer over that with two, of which fewer Gaussians grow."""
-MEANS_LR, SH_LR, CPU_RATES = 1.6e-4, 2.5e-3, 2.5
+MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
 """Learning rates of the means and of the constant colour, and the factor of both where the time of a CPU limits the steps of
-more than `SPARSE_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
+more than so many views (docs/decisions/025-time-on-a-cpu.md)."""
 LOST_DB = 0.18
 """PSNR that a fit on a CPU loses each time its steps are halved, at least [dB]; with many views it is more."""
 
@@ -108,10 +109,10 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
     opaque = all(v.alpha is None for v in train)
-    few = views <= SPARSE_VIEWS and opaque
+    one_layer = views <= (ONE_LAYER_VIEWS if opaque else ONE_LAYER_VIEWS_ALPHA)
     method = config.method
     if method.hier is None:
-        method = dataclasses.replace(method, hier=not few)
+        method = dataclasses.replace(method, hier=not one_layer)
     degree = config.sh_degree
     if degree is None:
         degree = sum(views >= n for n in DEGREES)
@@ -126,7 +127,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         pixels = config.batch * max(v.camera.width * v.camera.height for v in train)
         steps, limit = steps_on_cpu(wanted, views, pixels_of_steps(wanted, half, pixels) * (1.0 if method.hier else ONE_LAYER))
     rates = {"means_lr": MEANS_LR, "sh_lr": SH_LR}
-    if limit and views > SPARSE_VIEWS:
+    if limit and views > CPU_RATES_VIEWS:
         rates = {n: float(f"{CPU_RATES * rate:.3g}") for n, rate in rates.items()}
     optimizer = dataclasses.replace(optimizer, **{n: rate for n, rate in rates.items() if getattr(optimizer, n) is None})
     init = config.init
@@ -135,7 +136,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         init = dataclasses.replace(init, extrapolate=extrapolate)
     if optimizer.opacities_decay is None:
         decay = EXTRAPOLATED_DECAY if init.extrapolate else OPACITIES_DECAY
-        optimizer = dataclasses.replace(optimizer, opacities_decay=decay if few else 0.0)
+        optimizer = dataclasses.replace(optimizer, opacities_decay=decay if one_layer else 0.0)
     stopping, sh_every = config.stopping, config.sh_every
     if stopping.min_gain_db is None:
         stopping = dataclasses.replace(stopping, min_gain_db=0.0 if limit else MIN_GAIN_DB)
