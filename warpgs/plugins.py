@@ -107,7 +107,7 @@ class Registry(Generic[T]):
             return self._checked(name, name.__name__)
         if name in self._classes or name in self.names():
             return self._classes[name]
-        if ":" in name:
+        if isinstance(name, str) and ":" in name:
             own = name.rpartition(":")[2]
             in_study = f'; in a study: a preset in a .py file, with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(

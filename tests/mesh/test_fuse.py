@@ -16,7 +16,7 @@ from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.runs import mesh_of_run as run_mesh
 from warpgs.pipeline.runs.folder import METRICS_FILE, StoredRun
 from warpgs.render.rasterize import RasterizeOptions
-from warpgs.scene import Normalization
+from warpgs.scene import Gaussians, Normalization
 
 RENDER = RasterizeOptions()
 
@@ -79,9 +79,22 @@ def test_what_a_view_knows():
         surface_view(ball(), c, RENDER, "mode")
 
 
-def test_cameras_that_see_nothing_are_an_error():
-    with pytest.raises(DataError, match="no training view shows a surface"):
-        fuse(dataclasses.replace(ball(), logit_opacities=torch.full((3000,), -9.0)), cameras(ALL_SIDES[:2]), RENDER)
+@pytest.mark.parametrize("depth", ["median", "mean"])
+def test_cameras_that_see_nothing_are_an_error(depth):
+    """Of a transparent ball and of no Gaussians; also without cameras."""
+    options, views = MeshOptions(depth=depth), cameras(ALL_SIDES[:2])
+    nothing = Gaussians(*(t[:0] for t in ball().tensors().values()))
+    for gaussians in (dataclasses.replace(ball(), logit_opacities=torch.full((3000,), -9.0)), nothing):
+        with pytest.raises(DataError, match="no training view shows a surface"):
+            fuse(gaussians, views, RENDER, options)
+    with pytest.raises(UsageError, match="at least one camera"):
+        fuse(ball(), [], RENDER, options)
+
+
+def test_views_that_confirm_no_depth_are_an_error():
+    """Front and back: each sees its own side, and neither confirms the other."""
+    with pytest.raises(DataError, match="no depth of a training view is confirmed by another"):
+        fuse(ball(), cameras(ALL_SIDES[[0, 3]]), RENDER, MeshOptions(voxel=0.07))
 
 
 @pytest.fixture

@@ -161,6 +161,25 @@ def test_arguments_of_another_type_or_shape_are_named():
             (gaussians, dataclasses.replace(cam, K=skewed)),
         ),
         (
+            TypeError,
+            "camera.viewmat must be a numpy array or a tensor, not list",
+            (gaussians, dataclasses.replace(cam, viewmat=[[1.0]])),
+        ),
+        (TypeError, "camera.K must be .*, not NoneType", (gaussians, dataclasses.replace(cam, K=None))),
+        (TypeError, "camera.distortion must be .*, not list", (gaussians, dataclasses.replace(cam, distortion=[0.0]))),
+        (TypeError, "camera.K must hold real numbers, not complex128", (gaussians, dataclasses.replace(cam, K=1j * np.eye(3)))),
+        (
+            ValueError,
+            "camera.viewmat holds .* not finite",
+            (gaussians, dataclasses.replace(cam, viewmat=np.full((4, 4), np.nan))),
+        ),
+        (UsageError, "unknown camera model None", (gaussians, dataclasses.replace(cam, model=None))),
+        (
+            TypeError,
+            "quats must be dense, not torch.sparse",
+            (dataclasses.replace(gaussians, quats=gaussians.quats.to_sparse()), cam),
+        ),
+        (
             ValueError,
             "camera.K holds numbers that are not finite",
             (gaussians, dataclasses.replace(cam, K=cam.K * torch.tensor([[torch.nan, 1, 1], [1, 1, 1], [1, 1, 1]]))),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from warpgs.errors import UsageError
+from warpgs.errors import DataError, UsageError
 from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
 from warpgs.mesh.agreement import DepthMap, agreed, depth_map, neighbours
 from warpgs.mesh.grid import MAX_RESOLUTION, MIN_RESOLUTION, GridPlan, check_memory, plan_grid
@@ -82,11 +82,20 @@ def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap
         plan: The grid.
         maps: Depth of each view, which the others are compared with.
         like: Any tensor of the type and on the device of the grid, shape [...].
+
+    Raises:
+        DataError: No depth of a view is confirmed by another.
     """
-    grid = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like)
+    grid, confirmed = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like), False
     for view, others in zip(views("fusing depth"), neighbours(maps)):
         view = agreed(view, [maps[i] for i in others])
+        confirmed = confirmed or bool(((view.depth > 0) & torch.isfinite(view.depth)).any())
         integrate(grid, view.camera, view.depth, view.weights)
+    if not confirmed:
+        raise DataError(
+            "no depth of a training view is confirmed by another, so nothing is left for a mesh; fit again with more steps, or "
+            "with more photographs that show the same surfaces"
+        )
     return grid
 
 
@@ -109,10 +118,12 @@ def fuse(
         planned: Called with the grid, and its memory as text, before the grid is allocated.
 
     Raises:
-        DataError: No camera sees a surface.
+        DataError: No camera sees a surface, or none confirms what another sees.
         ResourceError: The grid does not fit into memory.
-        UsageError: A camera is orthographic, or an option is out of range.
+        UsageError: There is no camera, one is orthographic, or an option is out of range.
     """
+    if not cameras:
+        raise UsageError("fuse needs at least one camera that sees the surfaces")
     samples, maps = [], []
     views = SurfaceViews(gaussians, cameras, render, options.depth, stage)
     for view in views("finding surfaces"):

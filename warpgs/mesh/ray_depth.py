@@ -82,6 +82,8 @@ def surface_depth(
         z-depth [u] and fraction in [0, 1], shape [H, W] each; 0 and 0 where a pixel has no Gaussian.
     """
     height, width, k = ids.shape
+    if not len(gaussians):
+        return weights.new_zeros(height, width), weights.new_zeros(height, width)
     matrices, means = whitening(gaussians, camera)
     rows, columns = (torch.arange(n, dtype=means.dtype, device=means.device) + 0.5 for n in (height, width))
     x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])

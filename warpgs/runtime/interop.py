@@ -370,7 +370,7 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
         The sizes by letter.
 
     Raises:
-        TypeError: An argument is no tensor, or its scalar type is neither float32 nor float64, or types differ.
+        TypeError: An argument is no tensor, or sparse, or its scalar type is neither float32 nor float64, or types differ.
         ValueError: A shape or a device disagrees; the message names the argument, expected and found.
     """
     sizes: dict[str, int] = {}
@@ -378,6 +378,8 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
     for name, (tensor, pattern) in tensors.items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
+        if tensor.layout != torch.strided:
+            raise TypeError(f"{name} must be dense, not {tensor.layout}; {name}.to_dense() converts it")
         if first is None:
             first_name, first = name, tensor
             if tensor.dtype not in REALS:
