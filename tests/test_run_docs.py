@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.run_docs import ROOT, collect, pages, prepare, run_blocks, shortened
+from tools.run_docs import ROOT, collect, main, pages, prepare, run_blocks, shortened
 
 PAGE = """Words.
 
@@ -89,3 +89,12 @@ def test_every_page_can_be_read():
     blocks = [b for p in pages() for b in collect(p, Path(ROOT / p).read_text("utf-8"))]
     assert sum(bool(b.code) for b in blocks) > 20
     assert sum(len(b.left_out) for b in blocks) <= 26
+
+
+def test_the_program_shows_its_flags_and_names_an_unknown_page(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    assert "--install" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["docs/no.md"])
+    assert "no such page: docs/no.md" in capsys.readouterr().err

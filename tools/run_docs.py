@@ -6,12 +6,11 @@ the viewer once it says where it is.
 
 A block that cannot run here stands below a comment with the reason, `<!-- docs-run: REASON -->`; single lines that begin with
 what `LEFT_OUT` names are left out, too. Each is printed at the end with its reason.
-
-usage: python -m tools.run_docs [--install] [PAGE ...]    --install types docs/install.md in a fresh copy, with a network
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import shutil
@@ -245,13 +244,20 @@ def install(folder: Path) -> list[str]:
     return run_blocks(collect(INSTALL, (ROOT / INSTALL).read_text("utf-8"), ()), folder, None)
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str] | None = None) -> int:
     """Run all pages, or those named; return 1 where a block failed."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", nargs="*", help="a page, such as README.md or docs/mesh.md; all where none is given")
+    parser.add_argument("--install", action="store_true", help=f"type {INSTALL} in a fresh copy, with a network")
+    a = parser.parse_args(arguments)
+    unknown = [page for page in a.page if page not in pages()]
+    if unknown:
+        parser.error(f"no such page: {', '.join(unknown)}; give paths from the root of the project, such as docs/mesh.md")
     failed, left = [], []
     with tempfile.TemporaryDirectory(prefix="docs-run-") as name:
         made, programs = Path(name) / "made", Path(name) / "bin"
         made.mkdir()
-        if "--install" in arguments:
+        if a.install:
             failed = install(made)
             print("\n".join(failed) or f"{INSTALL}: installed")
             return int(bool(failed))
@@ -261,7 +267,7 @@ def main(arguments: list[str]) -> int:
         if why:
             print(f"what pages start from could not be made: {why}")
             return 1
-        for page in arguments or pages():
+        for page in a.page or pages():
             ran, wrong, rest = run_page(page, made, programs)
             if ran or rest:
                 print(f"{page}: {ran} blocks ran, {len(wrong)} failed, {len(rest)} left out", *wrong, sep="\n", flush=True)
@@ -272,4 +278,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
