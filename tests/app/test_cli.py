@@ -15,6 +15,7 @@ import torch
 from warpgs.app.cli import main
 from warpgs.export.ply import read_ply
 from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
+from warpgs.report import progress
 from warpgs.synthetic.demo import split_spec, write_demo
 
 
@@ -168,6 +169,17 @@ def test_export_equals_the_run(run, tmp_path):
     target = tmp_path / "x.ply"
     assert main(["export", str(run), "--to", str(target)]) == 0
     assert target.read_bytes() == (run / "point_cloud.ply").read_bytes()
+
+
+@pytest.mark.parametrize("command", ["export", "convert"])
+def test_a_terminal_names_the_file_being_written(run, tmp_path, monkeypatch, command):
+    lines = []
+    monkeypatch.setattr(progress, "is_live", lambda: True)
+    monkeypatch.setattr(progress._STATUS, "show", lines.append)
+    target = tmp_path / "x.spz"
+    words = [run, "--to", target] if command == "export" else [run / "point_cloud.ply", target]
+    assert main([command, *map(str, words)]) == 0
+    assert lines == [f"starting {command}", "writing x.spz"]
 
 
 def test_exported_points_are_in_the_files_coordinates(run, scene):

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import parse_flags
+from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 
 
@@ -25,6 +26,7 @@ def run(arguments: list[str], about: str) -> int:
     a = parse_flags(Convert, arguments, "warpgs convert", f"{about}\n\n{format_lines()}")
     from warpgs.pipeline.runs.export_model import convert
 
+    waiting()(f"writing {a.target.name}")
     for line in convert(a.source, a.target, filters_of(a), chosen_formats(a, a.target)):
         say(line)
     return 0

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.app.flags import parse_flags
+from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 
 
@@ -25,6 +26,7 @@ def run(arguments: list[str], about: str) -> int:
     page = "  .html: a page that shows the model in any browser"
     a = parse_flags(Export, arguments, "warpgs export", f"{about}\n\n{format_lines()}\n{page}")
     formats, filters = chosen_formats(a, a.to), filters_of(a)
+    waiting()(f"writing {a.to.name}")
     if a.to.suffix.lower() == ".html" and not formats:
         from warpgs.viewer.html import export_html
 
