@@ -115,8 +115,8 @@ def test_the_command_writes_in_units_of_the_files(stored, tmp_path, capsys):
     """What was chosen comes first; the voxel is in units of the files, and what no view saw is said."""
     assert main(["mesh", "run", "--out", str(tmp_path / "a.ply"), "--voxel", "0.16", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
-    assert text.index("0.16 units of the scene's files apart") < text.index("fusing depth: view 1 of 9")
-    assert "% of the volume was not observed by the 9 training views" in text and "triangles" in text
+    assert text.index("voxel 0.16 in units of the scene's files") < text.index("fusing depth: view 1 of 9")
+    assert "was not observed by the 9 training views" in text and "triangles extracted" in text
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
     count = int(head.split(b"element vertex ")[1].split()[0])
     vertices = np.frombuffer(body, [("x", "<f4", 3), ("c", "u1", 3)], count)["x"]

@@ -52,8 +52,8 @@ def mesh(
 
     def planned(plan: GridPlan, memory: str) -> None:
         say(
-            f"grid of {' x '.join(map(str, plan.shape))} points {plan.voxel / scale:.4g} units of the scene's files apart, "
-            f"{memory}; {100 * (1 - plan.inside):.1f} % of the observed surface is outside the grid and is left out"
+            f"grid: {' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} in units of the "
+            f"scene's files; {100 * (1 - plan.inside):.1f} % of the observed surface is outside the grid and left out"
         )
 
     with hold_folder(target.parent) as notes:
@@ -70,11 +70,12 @@ def _lines(found: FusedMesh, views: int) -> list[str]:
     """Return what a mesh is made of, for people."""
     mesh, lines = found.mesh, []
     lines.append(
-        f"{len(mesh.faces):,} triangles, {len(mesh.vertices):,} vertices, of {found.extracted:,} triangles in all; "
-        f"{found.removed:,} small parts removed"
+        f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; "
+        f"the mesh has {len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices"
     )
     lines.append(
-        f"{100 * found.unseen:.1f} % of the volume was not observed by the {views} training views; the mesh has holes there"
+        f"{100 * found.unseen:.1f} % of the volume, such as backs and insides, was not observed by the {views} training views; "
+        "the mesh is open there"
     )
     if found.uncolored:
         lines.append(f"{found.uncolored:,} vertices without an observed colour have that of their nearest neighbour")
