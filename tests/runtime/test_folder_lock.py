@@ -9,10 +9,10 @@ import sys
 import pytest
 
 from warpgs import temporary
-from warpgs.errors import ResourceError
+from warpgs.errors import ResourceError, UsageError
 from warpgs.files import LOCK, is_empty
 from warpgs.runtime import folder_lock
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import hold_file, hold_folder
 
 LEFT = ".warpgs-0123456789abcdef.tmp"
 HOLD = """
@@ -130,3 +130,15 @@ def test_a_killed_holder_gives_the_folder_free(tmp_path):
         assert (tmp_path / LOCK).is_file()
         with hold_folder(tmp_path):
             assert str(os.getpid()) in refusal(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("made.ply", "made.ply: is a folder"), (300 * "a", "too long; choose a shorter")]
+)
+def test_a_path_that_no_file_can_have_is_named_before_the_work(tmp_path, name, message):
+    """A folder, and a name beyond what the system takes; other names hold the folder of the file."""
+    (tmp_path / "made.ply").mkdir()
+    with pytest.raises(UsageError, match=message), hold_file(tmp_path / name):
+        pytest.fail("held")
+    with hold_file(tmp_path / "new" / "a.ply"):
+        assert "is writing there" in refusal(tmp_path / "new")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import errno
 import json
 import os
 import platform
 import shlex
+import stat
 import sys
 import time
 from collections.abc import Iterator
@@ -17,7 +19,7 @@ from typing import BinaryIO
 from filelock import lock_descriptor
 
 from warpgs import schema
-from warpgs.errors import FolderHeldError, ResourceError
+from warpgs.errors import FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK, remove_leftovers, writing_into
 from warpgs.output_folders import Folder, RefusedError, open_folder
 from warpgs.temporary import NO_LOCKS, sweep_temporary_files
@@ -60,6 +62,36 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
                 with contextlib.suppress(OSError), open_folder(folder.absolute().parent) as above:
                     above.rmdir(folder.name)  # where it is not empty, or in use, it stays
             raise
+
+
+@contextlib.contextmanager
+def hold_file(path: Path) -> Iterator[list[str]]:
+    """Hold the folder of a file that the block writes; see `hold_folder`.
+
+    Raises:
+        FolderHeldError: Another process holds the folder.
+        ResourceError: The folder cannot be written.
+        UsageError: The path cannot be a file's.
+    """
+    check_file_path(path)
+    with hold_folder(path.parent) as notes:
+        yield notes
+
+
+def check_file_path(path: Path) -> None:
+    """Check that a path can be that of a file to write, before the work: that it is no folder, and not too long.
+
+    Raises:
+        UsageError: It cannot.
+    """
+    try:
+        is_folder = stat.S_ISDIR(path.lstat().st_mode)
+    except OSError as e:
+        if e.errno == errno.ENAMETOOLONG:
+            raise UsageError(f"{path}: the name of the file is too long; choose a shorter one") from e
+        return  # it is not there, or `hold_folder` says more
+    if is_folder:
+        raise UsageError(f"{path}: is a folder, and a file is to be written; give the name of a file, such as one in it")
 
 
 def check_free(folder: Path) -> None:

@@ -18,7 +18,7 @@ from warpgs.pipeline.films.rig import up_of
 from warpgs.pipeline.runs.export_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import hold_file
 from warpgs.scene import Camera, Gaussians
 from warpgs.viewer.camera_conventions import camera_before, distance_ahead, fov_y
 from warpgs.viewer.packing import packed
@@ -173,7 +173,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
-    with hold_folder(target.parent) as held:
+    with hold_file(target) as held:
         cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
         title = target.stem.encode("utf-8", "replace").decode()  # of a name that is not UTF-8 what is
         notes = write_html(target, gaussians, middle_first(cameras), run.background, title)

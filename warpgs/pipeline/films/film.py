@@ -24,7 +24,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.report.coverage_image import coverage_image
 from warpgs.report.film import SUFFIXES, write_film
 from warpgs.report.images import frame_sheet, png, straight_alpha
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import check_file_path, hold_folder
 from warpgs.runtime.terminal import say
 from warpgs.scene import Camera, View
 
@@ -155,6 +155,8 @@ def render_film(
     """
     alone, one_size = _check_plan(plan, out, bool(coverage), sheet)
     folder, film = (out.parent, out) if alone else (out, out / FILM)
+    if alone:
+        check_file_path(out)
     files = [] if alone else [folder / f"{name}.png" for name, _ in plan.cameras]
     left = [] if alone else _older_images(folder, files)
     check, chosen, count = FrameCheck(plan.coverage), [], len(plan.cameras)

@@ -25,7 +25,7 @@ from warpgs.pipeline.runs.export_filters import (
     turned_line,
 )
 from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import hold_file
 from warpgs.scene import Camera, Gaussians
 
 ROUNDING = 1e-4
@@ -109,7 +109,7 @@ def _written(
         )
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
-    with hold_folder(target.parent) as notes:
+    with hold_file(target) as notes:
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
     lines += _changes(target, gaussians, kind) if type(kind).decode is not Format.decode else []
     lines += [kind.note] if kind.note else []
@@ -146,7 +146,7 @@ def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, f
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
         lines.append(turned_line(rotation))
-    with hold_folder(target.parent) as notes:
+    with hold_file(target) as notes:
         lines += write_cameras(target, cameras)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")

@@ -16,7 +16,7 @@ from warpgs.pipeline.films.rig import common_up
 from warpgs.pipeline.runs.folder import open_run
 from warpgs.pipeline.runs.request import choose_device
 from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import hold_file
 
 
 def mesh(
@@ -56,7 +56,7 @@ def mesh(
             f"scene's files; {100 * (1 - plan.inside):.1f} % of the observed surface is outside the grid and left out"
         )
 
-    with hold_folder(target.parent) as notes:
+    with hold_file(target) as notes:
         found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
         made = convert_mesh(found.mesh, run.normalization, "scene", "file")
         up = common_up(cameras)

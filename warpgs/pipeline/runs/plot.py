@@ -19,7 +19,7 @@ from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.folder import StoredRun, open_run
 from warpgs.report.progress import waiting
 from warpgs.report.scene_plot import ScenePlot, render_plot
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.runtime.folder_lock import hold_file
 from warpgs.scene import Camera
 
 PLOT = "plot.png"
@@ -134,9 +134,8 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
     axes = None if axes is None else axes[chosen]
     contents = ScenePlot(points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend)
-    tell("drawing the plot")
-    data = render_plot(contents, settings.size, settings.background)
-    with hold_folder(out.parent) as held:
-        write_bytes(out, data)
+    with hold_file(out) as held:
+        tell("drawing the plot")
+        write_bytes(out, render_plot(contents, settings.size, settings.background))
     what = "points of the reconstruction" if settings.points == "start" else "Gaussians"
     return [*held, *notes, f"{len(points):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]
