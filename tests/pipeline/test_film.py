@@ -98,7 +98,7 @@ def test_what_was_chosen_is_said(model):
     """Auto takes what suits the cameras; durations and frames are those asked for."""
     plan = plan_film(model, "auto", FilmSettings(frames=4))
     assert len(plan.cameras) == 4 and plan.notes[1:] == ["path spiral"]
-    assert plan.notes[0].startswith("5 training cameras look from one side, 6")
+    assert plan.notes[0].startswith("5 training cameras look from one side, over 6")
     plan = plan_film(model, "turntable", FilmSettings(seconds=0.5, fps=12, size=(64, 20), fov_y=0.5))
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)

@@ -59,7 +59,7 @@ class Rig:
         if self.span is None:
             return f"{NAMES[self.kind]}, from all sides" if self.kind == "ring" else NAMES[self.kind]
         degrees = math.degrees(self.span[1] - self.span[0])
-        return f"{NAMES[self.kind]}, {degrees:.0f} of 360 degrees" if self.kind != "free" else NAMES[self.kind]
+        return f"{NAMES[self.kind]}, over {degrees:.0f} of 360 degrees" if self.kind != "free" else NAMES[self.kind]
 
     def direction(self, azimuth: float, elevation: float) -> np.ndarray:
         """Return the unit vector [3] at an azimuth and an elevation [rad]."""
