@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from warpgs.pipeline.model.init import sweeps
+from warpgs.pipeline.model.init import extrapolates
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.runtime.terminal import Detail
@@ -131,10 +131,10 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     optimizer = dataclasses.replace(optimizer, **{n: rate for n, rate in rates.items() if getattr(optimizer, n) is None})
     init = config.init
     if init.extrapolate is None:
-        extrapolate = opaque and 2 <= views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS and sweeps(init, views)
-        init = dataclasses.replace(init, extrapolate=extrapolate)
+        init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
+        init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
     if optimizer.opacities_decay is None:
-        decay = EXTRAPOLATED_DECAY if init.extrapolate else OPACITIES_DECAY
+        decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
         optimizer = dataclasses.replace(optimizer, opacities_decay=decay if few else 0.0)
     stopping, sh_every = config.stopping, config.sh_every
     if stopping.min_gain_db is None:
