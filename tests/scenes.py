@@ -1,6 +1,7 @@
 """A tiny scene that Gaussians can fit exactly: three coloured ones, photographed by the rasterizer itself."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -61,3 +62,9 @@ def priors(views: list[View]) -> list[Prior]:
         disparity = 0.2 * y / height + 0.1 * (x / width) ** 2 + 0.5 * step
         found.append(Prior(disparity / disparity.max(), 0.5 + 0.4 * step, boundary, step, "a plane", "a step"))
     return found
+
+
+def view_stub(width: int = 504, height: int = 378, **changed: object) -> SimpleNamespace:
+    """What the choice of settings reads of a view; all its pixels count unless changed. Its image is small at any size."""
+    camera = SimpleNamespace(width=width, height=height)
+    return SimpleNamespace(**({"camera": camera, "image": np.ones((6, 8, 3)), "mask": None, "alpha": None} | changed))

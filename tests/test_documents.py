@@ -5,8 +5,8 @@ import json
 import re
 from collections import defaultdict
 from pathlib import Path
-from types import SimpleNamespace
 
+from tests.scenes import view_stub
 from warpgs import PRESETS
 from warpgs.pipeline.train import by_views
 from warpgs.pipeline.train.by_views import settings_by_views
@@ -58,7 +58,7 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
     counts = [int(cell.split()[0]) for cell in rows[0]]
     assert len(counts) >= 5
     for column, views in enumerate(counts):
-        train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6), alpha=None)] * views
+        train = [view_stub(8, 6)] * views
         config, _ = settings_by_views(PRESETS["default"], train, "cuda")
         chosen = (
             config.steps, config.sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,

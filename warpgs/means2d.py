@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import torch
@@ -22,6 +23,20 @@ class ProjectedMeans(torch.Tensor):
         if name != "absgrad":
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedMeans:
+        """Return the means with their gradients so far, in memory of their own; later passes do not add to them."""
+        copied = memo[id(self)] = self.detach().clone().as_subclass(ProjectedMeans)
+        for name in ("grad", "absgrad"):
+            if (found := getattr(self, name, None)) is not None:
+                setattr(copied, name, found.clone())
+        return copied
+
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Pickle the means and their ``absgrad``; as with every tensor, not their ``grad``."""
+        copied = copy.deepcopy(self)
+        copied.grad = None
+        return torch.Tensor.__reduce_ex__(copied, protocol)
 
 
 def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> None:

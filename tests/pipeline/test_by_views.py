@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import pytest
 
+from tests.scenes import view_stub
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.by_views import ONE_LAYER, settings_by_views
 from warpgs.pipeline.train.presets import PRESETS
@@ -18,7 +18,7 @@ from warpgs.pipeline.train.stopping import StoppingConfig
 @pytest.mark.parametrize(("views", "width", "height"), [(3, 126, 94), (3, 504, 378), (10, 900, 1600), (54, 504, 378)])
 def test_quick_is_never_slower_than_default(device, views, width, height):
     """At most 600 steps, and on a CPU at most as many as its time has for the default; a number that is given holds."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=width, height=height), alpha=None)] * views
+    train = [view_stub(width, height)] * views
     quick, default = (settings_by_views(PRESETS[name], train, device)[0].steps for name in ("quick", "default"))
     assert 0 < quick == min(600, default)
     given = dataclasses.replace(PRESETS["quick"], steps=700)
@@ -29,7 +29,7 @@ def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
     """With more than nine views, and only where steps are left out; rates that are given hold, and the loss is said."""
 
     def chosen(views, device, **optimizer):
-        train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=None)] * views
+        train = [view_stub()] * views
         config = PRESETS["default"]
         config = dataclasses.replace(config, optimizer=dataclasses.replace(config.optimizer, **optimizer))
         found, notes = settings_by_views(config, train, device)
@@ -45,7 +45,7 @@ def test_rates_rise_where_the_time_of_a_cpu_limits_many_views():
 
 def test_one_layer_has_fewer_steps_in_the_time_of_a_cpu():
     """Its steps take longer, so that both take the same time."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=None)] * 3
+    train = [view_stub()] * 3
     config = PRESETS["default"]
     one, two = (
         settings_by_views(dataclasses.replace(config, method=dataclasses.replace(config.method, hier=hier)), train, "cpu")[0]
@@ -58,7 +58,7 @@ def test_nothing_is_held_out_where_the_time_of_a_cpu_limits_the_steps():
     """All degrees of the harmonics are in use when growth begins, as with held-out blocks; a gain that is given holds."""
 
     def chosen(views, device, config=PRESETS["default"]):
-        train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=None)] * views
+        train = [view_stub()] * views
         return settings_by_views(config, train, device)[0]
 
     for views in (3, 12):

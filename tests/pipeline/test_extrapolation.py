@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from tests.pipeline.test_depth_points import known
-from tests.scenes import photos, seeds
+from tests.scenes import photos, seeds, view_stub
 from warpgs.geometry import in_image, project_points
 from warpgs.pipeline.model.extrapolation import BEYOND, BEYOND_PX, EXTRAPOLATED_OPACITY, REACH, STEP, extrapolated_points
-from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points, subsample
+from warpgs.pipeline.model.init import InitConfig, Start, initial_gaussians, initial_points, subsample
+from warpgs.pipeline.train import setup
 from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.opacity_decay import decay_opacities
@@ -134,13 +134,14 @@ def test_decay_spares_what_is_not_used():
     assert torch.equal(some[used], all_of_them[used]) and torch.equal(some[~used], logits[~used])
 
 
-@pytest.mark.parametrize("extrapolate", [True, False])
-def test_a_fit_spares_what_no_view_shows(device, extrapolate):
-    """A Gaussian far outside all images keeps its opacity to the bit, but decays without extrapolated points."""
+@pytest.mark.parametrize("extrapolated", [1, 0])
+def test_a_fit_spares_what_no_view_shows(device, extrapolated, monkeypatch):
+    """A Gaussian far outside all images keeps its opacity to the bit, but decays if no point is extrapolated."""
     cloud = seeds()
     lone = PointCloud(np.concatenate([cloud.points, [[500.0, 500, 500]]]), np.concatenate([cloud.colors, cloud.colors[:1]]))
+    monkeypatch.setattr(setup, "initial_points", lambda *given: Start(lone, "", None, extrapolated))
     config = FitConfig(
-        steps=4, sh_degree=0, init=InitConfig(source="points", extrapolate=extrapolate),
+        steps=4, sh_degree=0, init=InitConfig(source="points", extrapolate=True),
         optimizer=OptimizerConfig(opacities_decay=0.01, opacities_lr=1e-6),
     )  # fmt: skip
     trainer = Trainer(photos(3), lone, config, torch.device(device))
@@ -149,7 +150,7 @@ def test_a_fit_spares_what_no_view_shows(device, extrapolate):
         trainer.advance()
     lower = trainer.gaussians.logit_opacities < before
     far = trainer.gaussians.means.norm(dim=1) > 100
-    assert int(far.sum()) == 1 and bool(lower[far]) != extrapolate and lower[~far].float().mean() > 0.5
+    assert int(far.sum()) == 1 and bool(lower[far]) != bool(extrapolated) and lower[~far].float().mean() > 0.5
 
 
 @pytest.mark.parametrize(
@@ -159,7 +160,7 @@ def test_a_fit_spares_what_no_view_shows(device, extrapolate):
 )  # fmt: skip
 def test_few_opaque_views_have_extrapolated_points(views, alpha, device_kind, unseen):
     """In a whole fit that starts from a sweep; opacities then decay faster. What is given holds."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=alpha)] * views
+    train = [view_stub(alpha=alpha)] * views
     default = PRESETS["default"]
     config, notes = settings_by_views(default, train, device_kind)
     decay = 0.0 if alpha is not None else 0.0015 if unseen else 0.001
@@ -169,3 +170,23 @@ def test_few_opaque_views_have_extrapolated_points(views, alpha, device_kind, un
         given = dataclasses.replace(default, init=dataclasses.replace(default.init, **change))
         found = settings_by_views(given, train, device_kind)[0]
         assert not found.init.extrapolate and found.optimizer.opacities_decay == min(decay, 0.001)
+
+
+MASKED, FULL, DARK = np.eye(6, 8) > 0, np.ones((6, 8), bool), np.zeros((6, 8, 3))
+DARK[3, 3] = 1
+
+
+@pytest.mark.parametrize("extrapolate", [None, True])
+@pytest.mark.parametrize(
+    ("changed", "source", "views", "decay"),
+    [({}, "auto", 3, 0.0015), ({"mask": FULL}, "auto", 3, 0.0015), ({"mask": MASKED}, "auto", 3, 0.001),
+     ({"image": DARK}, "auto", 3, 0.001), ({}, "points", 3, 0.001), ({}, "hull", 3, 0.001), ({}, "random", 3, 0.001),
+     ({}, "sweep", 1, 0.001)],
+)  # fmt: skip
+def test_decay_changes_only_with_extrapolated_points(extrapolate, changed, source, views, decay):
+    """Not if a part of a view does not count, nor if the start searches for no depth; even where points are asked for."""
+    default = PRESETS["default"]
+    init = dataclasses.replace(default.init, source=source, extrapolate=extrapolate)
+    config, _ = settings_by_views(dataclasses.replace(default, init=init), [view_stub(**changed)] * views, "cuda")
+    assert config.optimizer.opacities_decay == decay
+    assert config.init.extrapolate == (decay == 0.0015 if extrapolate is None else extrapolate)

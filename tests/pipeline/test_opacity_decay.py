@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 
+from tests.scenes import view_stub
 from tests.tolerances import OPACITY_DECAY
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA, settings_by_views
@@ -55,7 +55,7 @@ def test_a_step_that_is_not_taken_changes_nothing():
 )  # fmt: skip
 def test_few_views_have_one_layer_and_decay(views, alpha, few):
     """The choice is named; what is given holds."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=8, height=6), alpha=alpha)] * views
+    train = [view_stub(alpha=alpha)] * views
     config, notes = settings_by_views(PRESETS["default"], train, "cuda")
     assert (config.optimizer.opacities_decay, config.method.hier) == ((0.001, False) if few else (0.0, True))
     assert ("one layer" in " ".join(notes)) == few

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from types import SimpleNamespace
 
 import pytest
 import torch
 
 from tests.pipeline.test_memory_plan import STEADY, instances, measured
 from tests.pipeline.test_normals_example import same_bits
-from tests.scenes import photos, seeds
+from tests.scenes import photos, seeds, view_stub
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
@@ -80,7 +79,7 @@ def test_confirmed_pixels_count_less():
 )
 def test_few_opaque_views_have_the_term(views, alpha, weight):
     """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""
-    train = [SimpleNamespace(camera=SimpleNamespace(width=504, height=378), alpha=alpha)] * views
+    train = [view_stub(alpha=alpha)] * views
     default = PRESETS["default"]
     config, _ = settings_by_views(default, train, "cuda")
     assert config.loss.smooth_weight == weight

@@ -1,5 +1,8 @@
 """Gradients of the projected means, as density strategies read them: summed over pixels, and summed by magnitude."""
 
+import copy
+import pickle
+
 import pytest
 import torch
 
@@ -110,3 +113,28 @@ def test_absgrad_takes_one_pass():
     for options in ({"features": torch.ones(5, 2)}, {"colors": torch.ones(5, 12)}):
         with pytest.raises(UsageError, match="absgrad takes at most 11 channels in colors and no features"):
             rasterize(gaussians, cam, RasterizeOptions(absgrad=True, **options))
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.filterwarnings("error")
+def test_means_can_be_copied_and_pickled(absgrad):
+    """Before and after the backward pass. A copy has memory of its own; like any tensor, a pickled one leaves out ``grad``."""
+    gaussians, cam = leaves(hand_placed()), camera(13, 11)
+    render = rasterize(gaussians, cam, RasterizeOptions(absgrad=absgrad))
+    means2d = render.means2d
+    for backward in (False, True):
+        if backward:
+            render.rgb.sum().backward()
+        copied, loaded = copy.deepcopy(means2d), pickle.loads(pickle.dumps(means2d))
+        for other in (copied, loaded):
+            assert type(other) is type(means2d) and torch.equal(other, means2d) and other.data_ptr() != means2d.data_ptr()
+            assert not other.requires_grad
+            if absgrad and backward:
+                assert torch.equal(other.absgrad, means2d.absgrad) and other.absgrad.data_ptr() != means2d.absgrad.data_ptr()
+            else:
+                with pytest.raises(AttributeError, match="absgrad"):
+                    other.absgrad  # noqa: B018
+        assert (copied.grad is not None) == backward
+        assert not backward or (torch.equal(copied.grad, means2d.grad) and copied.grad.data_ptr() != means2d.grad.data_ptr())
+    both = copy.deepcopy([means2d, means2d])
+    assert both[0] is both[1]

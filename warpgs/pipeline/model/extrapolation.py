@@ -42,7 +42,7 @@ def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> P
         views: Training views.
         depths: Geometrically consistent depth of each.
     """
-    if any(fitted_region(v)[0] is not None for v in views):
+    if not all_count(views):
         return NOTHING
     known = [i for i, d in enumerate(depths) if d.searched and d.valid.any()]
     filled = {i: complete(depths[i].depth, depths[i].valid, views[i].image) for i in known}
@@ -50,6 +50,11 @@ def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> P
     confirmed = [d.depth for d in depths]
     found += [_behind(views, i, filled[i], confirmed) for i in known]
     return joined((NOTHING, *found))
+
+
+def all_count(views: Sequence[View]) -> bool:
+    """Return whether all pixels of all views count in a fit."""
+    return all(fitted_region(v)[0] is None for v in views)
 
 
 def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:

@@ -16,7 +16,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
 from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds, joined
-from warpgs.pipeline.model.extrapolation import EXTRAPOLATED_OPACITY, extrapolated_points
+from warpgs.pipeline.model.extrapolation import EXTRAPOLATED_OPACITY, all_count, extrapolated_points
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
 from warpgs.pipeline.model.random_points import camera_depths, random_points
 from warpgs.priors.epipolar import EpipolarConfig, flow_depth
@@ -56,8 +56,8 @@ class InitConfig:
     """sweep, flow: width of the cells of points without consistent depth [px]; 0 leaves these areas empty."""
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind edges of depth
-    (docs/decisions/026-extrapolated-points.md). Then opacity decay spares Gaussians that a step does not use. None: by the
-    number of views."""
+    (docs/decisions/026-extrapolated-points.md). If there are some, opacity decay spares Gaussians that a step does not use.
+    There are none if a view has a mask, an alpha channel or a black background. None: by the number of views."""
     flow: str = "dis"
     """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
@@ -167,6 +167,14 @@ def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
 def sweeps(config: InitConfig, views: int) -> bool:
     """Return whether a fit of that many views starts from a sweep."""
     return config.source == "sweep" or (config.source == "auto" and 2 <= views <= config.sweep_up_to)
+
+
+def extrapolates(config: InitConfig, views: list[View]) -> bool:
+    """Return whether the start of a fit of these views has extrapolated points, where it finds depth."""
+    if not config.extrapolate or len(views) < 2:
+        return False
+    searches = config.source == "flow" or sweeps(config, len(views)) or (config.source == "auto" and any_given(views))
+    return searches and all_count(views)
 
 
 def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from warpgs.pipeline.model.init import sweeps
+from warpgs.pipeline.model.init import extrapolates
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import plan_phases
 from warpgs.runtime.terminal import Detail
@@ -27,10 +27,10 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot distinguish a view-dependent colour from an error of the shape."""
-OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 45, 9
+OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 60, 9
 """Fraction of every opacity that a step takes; and the opaque views, and views with alpha, up to which it does so and there is
-one layer. With more views it takes none, and there are two layers. 40 opaque views gain, 54 were not measured; 9 views with
-alpha gain, 12 do not (docs/decisions/023-opacity-decay.md)."""
+one layer. With more views it takes none, and there are two layers. Up to 51 opaque views were measured, and gain; 8 views with
+alpha gain, 9 do not (docs/decisions/023-opacity-decay.md)."""
 SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
 """Weight of the roughness of rendered depth up to so many opaque views, in fits of at least so many steps; else there is no
 such term: it was not measured with alpha, costs decibels with 9 views, and does not pay in 480 steps
@@ -132,10 +132,10 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     optimizer = dataclasses.replace(optimizer, **{n: rate for n, rate in rates.items() if getattr(optimizer, n) is None})
     init = config.init
     if init.extrapolate is None:
-        extrapolate = opaque and 2 <= views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS and sweeps(init, views)
-        init = dataclasses.replace(init, extrapolate=extrapolate)
+        init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
+        init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
     if optimizer.opacities_decay is None:
-        decay = EXTRAPOLATED_DECAY if init.extrapolate else OPACITIES_DECAY
+        decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
         optimizer = dataclasses.replace(optimizer, opacities_decay=decay if one_layer else 0.0)
     stopping, sh_every = config.stopping, config.sh_every
     if stopping.min_gain_db is None:

@@ -98,6 +98,8 @@ class Trainer:
         """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
+        self.extrapolated = made.start.extrapolated > 0
+        """Whether the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
         self._make_parts(train, made.start, scene_extent(cameras, cloud))
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)
@@ -169,7 +171,7 @@ class Trainer:
         limits = c.limits.at(1.0 if step >= self.steps else self.progress(step), self.radius, c.antialiased)
         decay = c.optimizer.opacities_decay
         assert decay is not None  # `settings_by_views` has chosen
-        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay, bool(c.init.extrapolate))
+        return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay, self.extrapolated)
 
     def next_view(self) -> int:
         """Return the number of the next view. The order is random; each view comes once before any comes again."""
