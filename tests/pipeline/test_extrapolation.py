@@ -163,7 +163,7 @@ def test_few_opaque_views_have_extrapolated_points(views, alpha, device_kind, un
     train = [view_stub(alpha=alpha)] * views
     default = PRESETS["default"]
     config, notes = settings_by_views(default, train, device_kind)
-    decay = 0.0 if alpha is not None else 0.0015 if unseen else 0.001
+    decay = 0.0015 if unseen else 0.001
     assert (config.init.extrapolate, config.optimizer.opacities_decay) == (unseen, decay)
     assert ("extrapolated points" in " ".join(notes)) == unseen
     for change in ({"extrapolate": False}, {"source": "random"}):
