@@ -11,8 +11,11 @@ import pytest
 from rich.console import Console
 
 from warpgs.app import doctor
+from warpgs.app.cli import main
 from warpgs.app.doctor import MISSING, NOTE, OK, Finding
 from warpgs.errors import ResourceError
+from warpgs.pipeline.runs import precompile
+from warpgs.report import progress
 from warpgs.runtime.kernel_cache import KernelCache
 
 
@@ -253,3 +256,11 @@ def test_what_native_code_says_of_a_driver_is_hidden(monkeypatch, capfd):
     monkeypatch.setitem(sys.modules, "warp", fake)
     monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: None)
     assert doctor._quiet_warp() is fake and fake.config.log_level == 1 and capfd.readouterr().err == ""
+
+
+def test_a_terminal_shows_that_kernels_are_compiled(monkeypatch):
+    lines = []
+    monkeypatch.setattr(progress, "is_live", lambda: True)
+    monkeypatch.setattr(progress._STATUS, "show", lines.append)
+    monkeypatch.setattr(precompile, "print_warming", lambda: None)
+    assert main(["doctor", "--warm"]) == 0 and lines == ["starting doctor", "compiling kernels"]

@@ -12,6 +12,7 @@ import pytest
 from tests.app import rank_that_dies
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
+from warpgs.report import progress
 from warpgs.runtime import rank_watch, ranks
 from warpgs.runtime.listening import is_loopback, loopback_interface
 from warpgs.synthetic.demo import write_demo
@@ -189,3 +190,12 @@ def test_another_host_keeps_its_interfaces(monkeypatch):
     assert ranks._stay_home("127.0.0.1") == "127.0.0.1"
     if sys.platform != "win32":
         assert os.environ["GLOO_SOCKET_IFNAME"] == loopback_interface() and os.environ["NCCL_SOCKET_IFNAME"] == "mine"
+
+
+@pytest.mark.parametrize("rank, shown", [("0", ["starting eval"]), ("1", [])])
+def test_a_terminal_shows_the_start_of_the_first_rank_only(monkeypatch, capsys, rank, shown):
+    lines = []
+    monkeypatch.setenv("RANK", rank)
+    monkeypatch.setattr(progress, "is_live", lambda: True)
+    monkeypatch.setattr(progress._STATUS, "show", lines.append)
+    assert main(["eval", "nowhere"]) == 3 and lines == shown

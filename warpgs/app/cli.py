@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib
+import os
 import sys
 
 from warpgs.app.failures import report_defect, report_no_memory
@@ -113,7 +114,7 @@ def _run(arguments: list[str]) -> int:
                 say(line)
             return 0
         with waiting() as wait:
-            if not ASKING & {*arguments}:  # until the command reports its own progress
+            if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
             with fast_imports():
                 command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")

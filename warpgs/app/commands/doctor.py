@@ -38,6 +38,7 @@ def run(arguments: list[str], about: str) -> int:
     if a.warm:
         with fast_imports():
             from warpgs.pipeline.runs.precompile import print_warming
+        waiting()("compiling kernels")
         print_warming()
         return 0
     from warpgs.app.doctor import diagnose, print_report
