@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any, NamedTuple, overload
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 import torch
 
-from warpgs.constants import FAR, K_TOLERANCE, Rule
+from warpgs.constants import FAR, Rule
 from warpgs.errors import ResourceError, UsageError
 from warpgs.kernels.blend_records import WIDTHS
 from warpgs.kernels.cameras.base import check_camera
@@ -19,6 +18,7 @@ from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.kernels.tiles import MAX_INSTANCES, InstanceMemory
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
+from warpgs.render.camera_checks import check_matrices
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
 from warpgs.render.compose import (
     bin_projected,
@@ -88,22 +88,16 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     return rule if (near, far) == (rule.near, rule.far) else replace(rule, near=near, far=far)
 
 
-def _matrices(K: Any) -> list[list[list[float]]]:
-    """Return matrices [..., 3, 3] as nested lists, [C][3][3]."""
-    listed: list[Any] = K.tolist() if hasattr(K, "tolist") else torch.as_tensor(K).tolist()
-    return [listed] if len(np.shape(K)) == 2 else listed
-
-
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
-    Nothing is read from a GPU: a K there is taken as it is, other values are not checked, and a Gaussian that is not finite is
+    Nothing is read from a GPU: a camera there is taken as it is. Values of Gaussians are not checked; one that is not finite is
     culled.
 
     Raises:
         TypeError: An argument, or the size of the image, is of another type.
         UsageError: A background has nothing before it, or Gaussians have no colours.
-        ValueError: A shape is another, or K has a skew or another last row than 0, 0, 1.
+        ValueError: A shape is another, or the camera is none that `check_matrices` accepts.
     """
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
@@ -116,21 +110,7 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     for name, tensor in gaussians.tensors().items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}; torch.as_tensor makes one")
-    for name, rows in (("viewmat", 4), ("K", 3)):
-        shape = tuple(np.shape(getattr(camera, name)))
-        if len(shape) not in (2, 3) or shape[-2:] != (rows, rows):
-            raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
-    K = camera.K
-    if not (isinstance(K, torch.Tensor) and K.is_cuda):
-        if not all(math.isfinite(value) for matrix in _matrices(K) for row in matrix for value in row):
-            raise ValueError(f"camera.K holds numbers that are not finite: {_matrices(K)}")
-        # as numbers, which takes a third of the time of tensors
-        fixed = ((abs(m[0][1]), abs(m[1][0]), abs(m[2][0]), abs(m[2][1]), abs(m[2][2] - 1)) for m in _matrices(K))
-        if not all(value <= K_TOLERANCE for values in fixed for value in values):
-            raise ValueError(
-                "camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
-                "undistort images with skew"
-            )
+    check_matrices(camera)
     for name in ("width", "height"):
         size = getattr(camera, name)
         if not isinstance(size, (int, np.integer)):
@@ -255,9 +235,9 @@ def rasterize(
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other, a
             transform of torch.func is active, or a second derivative is requested.
-        ValueError: A shape or device is wrong (the message names argument, expected and found); ``camera.K``, unless it is on a
-            GPU, has a skew, a last row other than 0, 0, 1, or a non-finite number; the near or far plane is out of range; a
-            pixel is outside the image; or lists differ in length.
+        ValueError: A shape or device is wrong (the message names argument, expected and found); ``camera.K`` has a skew, or
+            ``camera.viewmat`` scales or shears, or either has a wrong last row or a non-finite number (neither is checked on a
+            GPU); the near or far plane is out of range; a pixel is outside the image; or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")

@@ -1,0 +1,91 @@
+"""Checks of the matrices of cameras. Those on a GPU are taken as they are: a check would wait for the device."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
+from warpgs.scene import Camera
+
+
+def check_matrices(camera: Camera) -> None:
+    """Check the shapes of ``viewmat`` and ``K``, and their values where they are in main memory.
+
+    Raises:
+        ValueError: A shape is another; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
+            scales or shears, or has another last row than 0, 0, 0, 1.
+    """
+    for name, rows, tolerance, off, check in MATRICES:
+        given = getattr(camera, name)
+        shape = tuple(np.shape(given))
+        if len(shape) not in (2, 3) or shape[-2:] != (rows, rows):
+            raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(shape)}")
+        if isinstance(given, torch.Tensor) and given.is_cuda:
+            continue
+        # as numbers, which takes a third of the time of tensors
+        listed: Any = given.tolist() if hasattr(given, "tolist") else torch.as_tensor(given).tolist()
+        for i, matrix in enumerate(listed if len(shape) == 3 else (listed,)):
+            if not off(matrix) <= tolerance:  # the sum, which also is a NaN or infinite where a number is; few get further
+                check(matrix, f"camera.{name}[{i}]" if len(shape) == 3 else f"camera.{name}")
+
+
+def _skew_of(matrix: list[list[float]]) -> float:
+    """Return the sum of what the fixed entries of K are off by, not finite where an entry is not."""
+    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
+    return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
+
+
+def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the intrinsics are not those of a camera without skew."""
+    _check_finite(matrix, where)
+    (_, skew, _), (below, _, _), (left, middle, last) = matrix
+    if max(map(abs, (skew, below, left, middle, last - 1))) > K_TOLERANCE:
+        raise ValueError(
+            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
+            "undistort images with skew"
+        )
+
+
+def _products(matrix: list[list[float]]) -> tuple[float, ...]:
+    """Return the entries of R R^T - 1."""
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = matrix
+    return (
+        a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1,
+        a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
+    )  # fmt: skip
+
+
+def _stretch_of(matrix: list[list[float]]) -> float:
+    """Return the sum of what R R^T and the last row of a pose are off by, not finite where an entry is not."""
+    (p, q, r, s), shift = matrix[3], matrix[0][3] + matrix[1][3] + matrix[2][3]
+    return sum(map(abs, _products(matrix))) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * shift
+
+
+def _check_pose(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the pose is not rigid, except that it may mirror: then the mirrored image is right."""
+    _check_finite(matrix, where)
+    p, q, r, s = matrix[3]
+    if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
+        raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
+    off = max(map(abs, _products(matrix)))
+    if not off <= POSE_TOLERANCE:  # products of wild numbers overflow
+        raise ValueError(
+            f"{where} scales or shears: R R^T is off by {off:.2g} for its upper left 3 x 3 block R. Give a rotation; of a "
+            "scaled pose, divide the first three rows by the scale, which divides depths, too"
+        )
+
+
+def _check_finite(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where a number of the matrix is not finite."""
+    if not all(math.isfinite(value) for row in matrix for value in row):
+        raise ValueError(f"{where} holds numbers that are not finite: {matrix}")
+
+
+MATRICES = (
+    ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
+)  # fmt: skip
+"""Matrices of a camera: rows, tolerance, what they are off by, and the check of one that is off by more."""
