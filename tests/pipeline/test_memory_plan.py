@@ -199,6 +199,13 @@ def test_kernels_declare_what_they_allocate(device):
     assert abs(declared["blending"] - unseen - most) <= 2 * slack
 
 
+def test_the_order_of_tiles_is_part_of_a_sampling_event():
+    """On CUDA it takes 33 numbers a tile while a view is rendered; later in a step the image's gradient takes more."""
+    one, other = (StepSizes(240, 200, 56, cuda=cuda, count=2000, instances=9000) for cuda in (True, False))
+    order = 15 * 13 * 132
+    assert blend.step_bytes(one)["sampling"] - blend.step_bytes(other)["sampling"] == order < 12 * one.pixels
+
+
 @dataclasses.dataclass(frozen=True)
 class Copies(LossTerm):
     """A term that keeps copies of the render, their squares, and gradients of both."""

@@ -1,6 +1,7 @@
 """The public op: shapes, gradients through everything, options, and errors."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -236,3 +237,31 @@ def test_opacity_factors_multiply_opacities_and_hide():
         assert all(bool(v[0].any()) and not bool(v[1].any()) for v in gradients if v.shape != (3, 4))
     with pytest.raises(ValueError, match="opacity_factors"):
         rasterize(gaussians, camera, RasterizeOptions(opacity_factors=torch.ones(2)))
+
+
+def test_a_pose_that_scales_or_shears_is_refused():
+    """Also one camera of a batch, one that is not finite, and another last row. Rounding and a mirrored camera pass."""
+    gaussians, cam = three_gaussians(), ring(3)[0]
+    rotation, eye = cam.viewmat, np.eye(4)
+    scaled, sheared, moved, unknown = 1.01 * rotation, rotation.copy(), rotation.copy(), rotation.copy()
+    huge = 1e200 * rotation
+    scaled[3, 3] = huge[3, 3] = 1
+    sheared[0] += 0.01 * sheared[1]
+    moved[3, 0] = 0.1
+    unknown[1, 1] = np.nan
+    for wrong, words in (
+        (scaled, r"camera.viewmat\S* scales or shears: R R\^T is off by 0.02"), (sheared, "off by 0.01"),
+        (moved, "last row 0, 0, 0, 1"),
+        (unknown, r"camera.viewmat\S* holds numbers that are not finite"), (huge, "R R.* off by inf"),
+    ):  # fmt: skip
+        for viewmat in (wrong, torch.from_numpy(wrong), np.stack([rotation, wrong])):
+            with pytest.raises(ValueError, match=words):
+                rasterize(gaussians, dataclasses.replace(cam, viewmat=viewmat))
+    many = functools.reduce(lambda a, b: a @ b, [torch.from_numpy(rotation).float()] * 1000)
+    many[:, 3] = torch.from_numpy(rotation[:, 3])
+    rasterize(gaussians, dataclasses.replace(cam, viewmat=many))
+    K = cam.K.copy()
+    K[0, 2] = cam.width - K[0, 2]
+    eye[0, 0] = -1
+    mirrored = rasterize(gaussians, dataclasses.replace(cam, viewmat=eye @ rotation, K=K)).rgb
+    assert torch.allclose(mirrored.flip(1), rasterize(gaussians, cam).rgb, atol=1e-5)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-
-TOLERANCE = 1e-3
-"""Largest entry of R R^T - 1 that is put down to rounding in the file."""
 
 
 def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
@@ -22,7 +20,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
     R = viewmat[:3, :3]
     # entries of a rotation are at most 1; the bound keeps the squares of wild ones from overflowing
     error = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 1e3 else np.inf
-    if error > TOLERANCE:
+    if error > POSE_TOLERANCE:
         raise DataError(
             f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give pure rotations"
         )

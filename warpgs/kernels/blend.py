@@ -26,10 +26,11 @@ def step_bytes(sizes: StepSizes) -> Needs:
     kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
     lean = not (sizes.depth or sizes.cutout)  # only colour has a gradient
     upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
+    order = blend_cuda.order_bytes(sizes) if sizes.cuda else 0  # gone before the loss, which takes more
     whole = images + upstream if sizes.chunked else 0  # images of the frame stand beside those of a chunk
     return {
         BINNING: whole, LOSS: images + (0 if sizes.chunked else kept), BLENDING: kept + slots + images + (whole or upstream),
-        PROJECTION: images + upstream, SAMPLING: 3 * images,
+        PROJECTION: images + upstream, SAMPLING: 3 * images + order,
     }  # fmt: skip
 
 

@@ -238,6 +238,12 @@ def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
     return FLOAT * STRIDE * sizes.instances, state * sizes.instances
 
 
+def order_bytes(sizes: StepSizes) -> int:
+    """Return the bytes of the order of the tiles, which the forward pass gives back at its end."""
+    columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
+    return FLOAT * RANKS * columns * rows
+
+
 def forward(
     projected: torch.Tensor,
     tiles: Tiles,

@@ -1,4 +1,4 @@
-"""Checks of the arrays of a camera before it is rendered."""
+"""Checks of the arrays of a camera. Values on a GPU are not checked: that would wait for the device."""
 
 from __future__ import annotations
 
@@ -8,31 +8,34 @@ from typing import Any
 import numpy as np
 import torch
 
-from warpgs.constants import K_TOLERANCE
+from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
 from warpgs.scene import Camera
 
 
 def check_arrays(camera: Camera) -> None:
-    """Check types, shapes and values of a camera's arrays, and the type of its size.
-
-    Nothing is read from a GPU: a pose or K there is taken as it is.
+    """Check types and shapes of a camera's arrays, their values where they are in main memory, and the type of its size.
 
     Raises:
         TypeError: An array is neither of numpy nor a tensor, or not of real numbers; or the size is not of integers.
-        ValueError: A shape is another, a number is not finite, or K has a skew or another last row than 0, 0, 1.
+        ValueError: A shape is another; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
+            scales or shears, or has another last row than 0, 0, 0, 1.
     """
-    for name, rows in (("viewmat", 4), ("K", 3), ("distortion", 0)):
-        array: Any = getattr(camera, name)
-        if name == "distortion" and array is None:
+    for name, rows, tolerance, off, check in MATRICES:
+        given: Any = getattr(camera, name)
+        _check_type(name, given)
+        if given.ndim not in (2, 3) or tuple(given.shape[-2:]) != (rows, rows):
+            raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(given.shape)}")
+        if getattr(given, "is_cuda", False):
             continue
-        _check_type(name, array)
-        if rows and (array.ndim not in (2, 3) or tuple(array.shape[-2:]) != (rows, rows)):
-            raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(array.shape)}")
-        # as numbers, which takes a third of the time of tensors
-        if not (getattr(array, "is_cuda", False) or all(map(math.isfinite, array.reshape(-1).tolist()))):
-            raise ValueError(f"camera.{name} holds numbers that are not finite: {array.tolist()}")
-    if not getattr(camera.K, "is_cuda", False):
-        _check_intrinsics(camera.K)
+        listed = given.tolist()  # as numbers, which takes a third of the time of tensors
+        for i, matrix in enumerate(listed if given.ndim == 3 else (listed,)):
+            if not off(matrix) <= tolerance:  # the sum, which also is a NaN or infinite where a number is; few get further
+                check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
+    distortion: Any = camera.distortion
+    if distortion is not None:
+        _check_type("distortion", distortion)
+        if not (getattr(distortion, "is_cuda", False) or all(map(math.isfinite, distortion.reshape(-1).tolist()))):
+            raise ValueError(f"camera.distortion holds numbers that are not finite: {distortion.tolist()}")
     for name in ("width", "height"):
         size = getattr(camera, name)
         if not isinstance(size, (int, np.integer)):
@@ -50,11 +53,59 @@ def _check_type(name: str, array: Any) -> None:
         raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
 
 
-def _check_intrinsics(K: Any) -> None:
-    """Raise ValueError where matrices [..., 3, 3] have a skew or another last row than 0, 0, 1."""
-    for m in K.reshape(-1, 3, 3).tolist():
-        if not max(abs(m[0][1]), abs(m[1][0]), abs(m[2][0]), abs(m[2][1]), abs(m[2][2] - 1)) <= K_TOLERANCE:
-            raise ValueError(
-                "camera.K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
-                "undistort images with skew"
-            )
+def _skew_of(matrix: list[list[float]]) -> float:
+    """Return the sum of what the fixed entries of K are off by, not finite where an entry is not."""
+    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
+    return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
+
+
+def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the intrinsics are not those of a camera without skew."""
+    _check_finite(matrix, where)
+    (_, skew, _), (below, _, _), (left, middle, last) = matrix
+    if max(map(abs, (skew, below, left, middle, last - 1))) > K_TOLERANCE:
+        raise ValueError(
+            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
+            "undistort images with skew"
+        )
+
+
+def _products(matrix: list[list[float]]) -> tuple[float, ...]:
+    """Return the entries of R R^T - 1."""
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = matrix
+    return (
+        a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1,
+        a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
+    )  # fmt: skip
+
+
+def _stretch_of(matrix: list[list[float]]) -> float:
+    """Return the sum of what R R^T and the last row of a pose are off by, not finite where an entry is not."""
+    (p, q, r, s), shift = matrix[3], matrix[0][3] + matrix[1][3] + matrix[2][3]
+    return sum(map(abs, _products(matrix))) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * shift
+
+
+def _check_pose(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the pose is not rigid, except that it may mirror: then the mirrored image is right."""
+    _check_finite(matrix, where)
+    p, q, r, s = matrix[3]
+    if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
+        raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
+    off = max(map(abs, _products(matrix)))
+    if not off <= POSE_TOLERANCE:  # products of wild numbers overflow
+        raise ValueError(
+            f"{where} scales or shears: R R^T is off by {off:.2g} for its upper left 3 x 3 block R. Give a rotation; of a "
+            "scaled pose, divide the first three rows by the scale, which divides depths, too"
+        )
+
+
+def _check_finite(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where a number of the matrix is not finite."""
+    if not all(math.isfinite(value) for row in matrix for value in row):
+        raise ValueError(f"{where} holds numbers that are not finite: {matrix}")
+
+
+MATRICES = (
+    ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
+)  # fmt: skip
+"""Matrices of a camera: rows, tolerance, what they are off by, and the check of one that is off by more."""

@@ -90,7 +90,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
     """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
 
-    Values of Gaussians are not checked: one that is not finite is culled.
+    Values of Gaussians are not checked; one that is not finite is culled.
 
     Raises:
         TypeError: An argument, or what the camera holds, is of another type.
@@ -230,8 +230,8 @@ def rasterize(
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other, a
             transform of torch.func is active, or a second derivative is requested.
         ValueError: A shape or device is wrong (the message names argument, expected and found); an array of ``camera``, unless
-            it is on a GPU, holds a non-finite number, or K a skew or a last row other than 0, 0, 1; the near or far plane is
-            out of range; a pixel is outside the image; or lists differ in length.
+            it is on a GPU, holds a non-finite number, ``K`` has a skew, ``viewmat`` scales or shears, or either has a wrong
+            last row; the near or far plane is out of range; a pixel is outside the image; or lists differ in length.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
