@@ -222,6 +222,8 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "no view 'x.png'" in failure(capsys, 3, "fit", str(scene), "--out", str(tmp_path / "c"), "--split", "train=x.png")
     assert "not understood" in failure(capsys, 2, "fit", str(scene), "--out", str(tmp_path / "d"), "--split", "third:3")
     assert "holds no run" in failure(capsys, 3, "eval", str(tmp_path))
+    (tmp_path / "model.spz").touch()
+    assert "model.spz: is a file, not the folder of a run" in failure(capsys, 3, "eval", str(tmp_path / "model.spz"))
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
     assert "differs from the run" in (said := failure(capsys, 2, *again)) and "(downscale was 1" in said
     assert "leave out --frames" in failure(capsys, 2, "render", str(run), "--path", "views", "--frames", "2")

@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from warpgs.app.cli import main
+from warpgs.app.flags import parse_flags
 from warpgs.app.wrong_words import refuse
 from warpgs.errors import UsageError
 
@@ -24,7 +25,8 @@ WHOLE = "expected an integer of at most 2^63 - 1, got"
         ("fit scene --out --steps 3", "--out needs a value; `warpgs fit --help` lists its arguments"),
         ("fit scene --out run --steps abc", f"--steps: {WHOLE} 'abc'; `warpgs fit --help` lists its arguments"),
         ("fit scene --out run --seed 1.5", f"--seed: {WHOLE} '1.5'; `warpgs fit --help` lists its arguments"),
-        ("fit scene --out run --method.hier x", "--method.hier: 'x' is not one of "),
+        ("fit scene --out run --method.hier x", "--method.hier: expected true, false or none, got 'x'"),
+        ("fit scene --out run --depth-mean 1 2", "--depth-mean needs 3 values, got 2; `warpgs fit --help` lists"),
         ("mesh run", "--out PATH is missing; `warpgs mesh --help` lists its arguments"),
         ("convert a", "TARGET is missing; `warpgs convert --help` lists its arguments"),
         ("demo", "FOLDER is missing; `warpgs demo --help` lists its arguments"),
@@ -39,6 +41,27 @@ def test_a_wrong_command_line_is_one_line(words, error, tmp_path, capsys, monkey
     output = capsys.readouterr()
     assert output.err.startswith(f"warpgs: {error}") and len(output.err.splitlines()) == 1 and not output.out
     assert not any(tmp_path.iterdir())
+
+
+@dataclasses.dataclass(frozen=True)
+class Open:
+    """Settings that may be left open."""
+
+    switch: bool | None = True
+    whole: int | None = 1
+    number: float | None = 1.0
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("--switch none --whole none --number None", Open(None, None, None)),
+        ("--switch true --whole 3", Open(True, 3)),
+        ("--switch False --number 2", Open(False, 1, 2.0)),
+    ],
+)
+def test_open_settings_take_none_and_switches_in_any_case(words, found):
+    assert parse_flags(Open, words.split(), "warpgs fit", "") == found
 
 
 @pytest.mark.parametrize(("columns", "box"), [("30", True), ("30", False), ("100", True)])

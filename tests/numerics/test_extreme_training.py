@@ -358,7 +358,7 @@ def test_views_of_which_nothing_counts(device):
     first = initial_gaussians(seeds(), POINTS, 0, fit.context.extent, device)
     assert all(torch.equal(a, b) for a, b in zip(fit.gaussians.tensors().values(), first.tensors().values()))
     taken([hidden[0], views[1]], seeds(), device, steps=4)
-    with pytest.raises(DataError, match="every pixel of the training views is masked out"):
+    with pytest.raises(DataError, match="all pixels of the training views are masked out"):
         Trainer(hidden, None, FitConfig(init=InitConfig(source="random")), device)
 
 

@@ -116,6 +116,21 @@ def test_extrapolated_points_come_last():
     assert sum(are) == fewer.extrapolated > 0 and all(are[-fewer.extrapolated :])
 
 
+def test_a_start_without_extrapolated_points_says_why():
+    """Where they were asked for: with masks, and where the start is not from depth."""
+    views, _ = known()
+    corner = np.ones(views[0].image.shape[:2], bool)
+    corner[:4, :4] = False
+    masked = [dataclasses.replace(v, mask=corner) for v in views]
+    config = InitConfig(source="sweep", merge_px=4, fill_px=8, extrapolate=True)
+    random = dataclasses.replace(config, source="random", random_count=200)
+    for given, settings, reason in ((masked, config, "none extrapolated, since masks"), (views, random, "sweep or flow")):
+        start = initial_points(given, None, settings, np.random.default_rng(0))
+        assert reason in start.how and start.extrapolated == 0
+        plain = dataclasses.replace(settings, extrapolate=False)
+        assert "extrapolated" not in initial_points(given, None, plain, np.random.default_rng(0)).how
+
+
 def test_extrapolated_gaussians_start_more_opaque():
     """All others with the opacity of the settings."""
     view, depth = card()

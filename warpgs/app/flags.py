@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import io
 import re
+import types
 import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, TypeVar
@@ -94,16 +95,34 @@ def _number(words: list[str]) -> float:
     return number
 
 
+def _switch(words: list[str]) -> bool:
+    """Return True or False for its word, in any case; ValueError for another word."""
+    found = {"true": True, "false": False}.get(words[0].lower())
+    if found is None:
+        raise ValueError(f"expected true, false or none, got {words[0][:40]!r}")
+    return found
+
+
+PARSERS: dict[Any, Any] = {int: _whole, float: _number, bool: _switch}
+"""Functions that return the value of a word, by its type."""
+
+
 def _number_rule(info: Any) -> Any:
-    """Return the parser of a number; None for other types."""
+    """Return the parser of a number, or of a number or switch that may be None; None for other types."""
     import tyro
 
-    parsers: dict[Any, Any] = {int: _whole, float: _number}
-    if info.type not in parsers:
+    union = typing.get_origin(info.type) in (typing.Union, types.UnionType)
+    kinds = [k for k in (typing.get_args(info.type) if union else (info.type,)) if k is not types.NoneType]
+    if len(kinds) != 1 or kinds[0] not in PARSERS or (kinds[0] is bool and not union):  # a switch alone is --name or --no-name
         return None
+    kind = kinds[0]
+    name = "{None,True,False}" if kind is bool else "{None}|" * union + kind.__name__.upper()
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar=info.type.__name__.upper(), instance_from_str=parsers[info.type],
-        is_instance=lambda value: isinstance(value, (int, info.type)) and not isinstance(value, bool),
+        nargs=1, metavar=name,
+        instance_from_str=lambda words: None if union and words[0].lower() == "none" else PARSERS[kind](words),
+        is_instance=lambda value: (
+            (union and value is None) or (isinstance(value, (int, kind)) and isinstance(value, bool) == (kind is bool))
+        ),
         str_from_instance=lambda value: [str(value)],
     )  # fmt: skip
 

@@ -99,6 +99,9 @@ def _wrong_value(reason: str) -> str:
         value, flag, choices = found.groups()
         listed = re.findall(r"'([^']*)'", choices)
         return f"{flag}: {value[:MAX_SHOWN]!r} is not one of {', '.join(listed)}"
+    if found := re.match(r"Error parsing (.+?): .*input length (\d+) did not match expected argument count (\d+)", reason):
+        flag, given, count = found.groups()
+        return f"{flag} needs {count} values, got {given}"
     if found := re.match(r"Error parsing (.+?): (.*)", reason):
         flag, why = found.groups()
         one = re.search(r"expected .*?, got .*?(?= - <class|$)", why)  # of the types that may stand there, the number

@@ -15,6 +15,7 @@ from warpgs.colors import base_coefficients
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
+from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds, joined
 from warpgs.pipeline.model.extrapolation import EXTRAPOLATED_OPACITY, all_count, extrapolated_points
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
@@ -148,12 +149,21 @@ def consistent_points(
         )
         if len(cloud) >= MIN_POINTS:
             extrapolated = extrapolated_points(views, depths) if config.extrapolate else NOTHING
-            notes[-1] += f", {len(extrapolated):,} extrapolated where no view looks" if len(extrapolated) else ""
+            if config.extrapolate:
+                notes[-1] += f", {_number_extrapolated(views, len(extrapolated))}"
             how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
             return Start(joined((cloud, extrapolated)), how, depths, len(extrapolated))
         reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
     cloud, how = random_points(views, config.random_count, generator)
     return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
+
+
+def _number_extrapolated(views: list[View], count: int) -> str:
+    """Return how many points are extrapolated, for the user, and why there are none."""
+    if count:
+        return f"{count:,} extrapolated where no view looks"
+    parts = any(fitted_region(v)[0] is not None for v in views)
+    return "none extrapolated" + (", since masks, alpha or black leave out parts of the views" if parts else "")
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
@@ -227,7 +237,10 @@ def initial_points(
             return Start(cloud, how)
         cloud, made = random_points(views, config.random_count, generator)
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
-    return on_object(_found_points(views, points, config, generator, device, progress), views)
+    found = on_object(_found_points(views, points, config, generator, device, progress), views)
+    if config.extrapolate and found.depths is None:
+        return found._replace(how=f"{found.how}\nno extrapolated points: they need a start by sweep or flow")
+    return found
 
 
 def _found_points(

@@ -116,7 +116,10 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         points.append(candidates[:wanted])
         colors.append(view.image[rows[:wanted], columns[:wanted]])
     if not points:
-        raise DataError("no random start: every pixel of the training views is masked out; check the masks' polarity")
+        raise DataError(
+            "no random start: all pixels of the training views are masked out or transparent; check --mask-keeps and the alpha "
+            "channel of the images"
+        )
     with_matches = sum(s.has_matches for s in sources)
     how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
     objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)

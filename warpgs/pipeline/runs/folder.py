@@ -134,6 +134,8 @@ def read_record(folder: Path) -> dict[str, Any]:
         record = schema.read(path, folder)
     except FileNotFoundError as e:
         raise DataError(f"{folder}: holds no run ({CONFIG} is missing); give a folder that `warpgs fit --out` filled") from e
+    except NotADirectoryError as e:
+        raise DataError(f"{folder}: is a file, not the folder of a run; give a folder that `warpgs fit --out` filled") from e
     except (OSError, schema.SchemaError) as e:
         raise DataError(f"{path}: cannot be read ({e}); give a folder that `warpgs fit --out` filled") from e
     if not isinstance(record, dict) or "config" not in record:
