@@ -118,8 +118,8 @@ class Rule:
 
 RULES = {
     "exact": Rule("exact"),
-    # Faster and less accurate, as measured in docs/trade.md. A stop of 1e-2 would save more before opaque walls, and make
-    # gradients there wrong by a third.
+    # Faster and less accurate, as measured in docs/trade.md. A stop of 1e-2 would save more time in front of opaque surfaces,
+    # but gradients there would be wrong by a third.
     "balanced": Rule("balanced", alpha_cut=2.0 / 255.0, transmittance_stop=1e-3),
     "fast": Rule("fast", alpha_cut=4.0 / 255.0, transmittance_stop=1e-3),
     # gsplat: exclusive stop. Its extent of 3.33 sigma never binds: sqrt(2 ln 255) = 3.329. The clamp of

@@ -88,7 +88,7 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
     for name, (kind, values) in attributes.items():
         views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
         accessor = {"bufferView": len(accessors), "componentType": 5126, "count": len(values), "type": kind}
-        if name == "POSITION":  # glTF wants the bounds of positions
+        if name == "POSITION":  # glTF requires the bounds of positions
             accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         accessors.append(accessor)
         start += values.nbytes

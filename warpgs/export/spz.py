@@ -255,7 +255,7 @@ def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version
 def _fixed(data: np.ndarray) -> np.ndarray:
     """Return coordinates of 24 bits [P, 9], signed, as integers [P, 3]."""
     fixed = np.zeros((len(data), 3, 4), "u1")
-    fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, whose shift down keeps the sign
+    fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, since an arithmetic shift down keeps the sign
     return fixed.reshape(-1, 12).view("<i4") >> 8
 
 

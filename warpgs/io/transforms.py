@@ -63,7 +63,7 @@ def read_json(path: Path) -> dict:
         raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
     try:
         check_depth(values, MAX_DEPTH)
-    except SchemaError as e:  # or the text of an error could not name its values
+    except SchemaError as e:  # else the error message could not name its values
         raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels; write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise DataError(f"{path}: has no list 'frames'; write it again")

@@ -185,7 +185,7 @@ def make_backward(
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
     name += ".absgrad" * absgrad
     options = {"enable_backward": False, "grid_stride": False, "module": name}
-    # many chunks want many warps at a time more than they want registers, unless channels fill these
+    # many chunks need many warps at a time more than registers, unless channels fill the registers
     small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
     registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 

@@ -1,4 +1,4 @@
-"""Records of the backward blending kernel in plain Warp: what it knows of pixels, and the gradient of a Gaussian."""
+"""Records of the backward blending kernel in plain Warp: the values of pixels, and the gradient of a Gaussian."""
 
 import functools
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""Choice of the grid: where the surfaces are, how fine they can be told apart, and the memory that takes."""
+"""Choice of the grid: its extent, its voxel size, and its memory."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def plan_grid(
     Args:
         points: Points of the surfaces [u], shape [N, 3].
         footprints: Width of a pixel at each [u], shape [N].
-        voxel: Distance of the grid points [u]; None for what ``resolution`` gives.
+        voxel: Distance of the grid points [u]; None to derive it from ``resolution``.
         resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
             what the median pixel shows.
 

@@ -1,7 +1,7 @@
-"""HEIC photographs, as phones take them: coded again as JPEG by a process of its own.
+"""HEIC photographs, as phones take them: coded again as JPEG by a separate process.
 
-pi-heif (libheif and libde265, LGPL) reads them. A file that is broken on purpose can end the process that it reads in, so it is
-called in another one, once for all photographs.
+pi-heif (libheif and libde265, LGPL) reads them. A malicious file can crash the process that reads it, so one separate process
+reads all photographs.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Frames of a video that show most: evenly spaced in time, the sharpest of each stretch."""
+"""Frames of a video: the sharpest of each of equally long parts."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     import cv2
 
     _check_container(path)
-    with utf8_name(path) as name, hidden_stderr():  # of a broken file OpenCV and FFmpeg say the same, in their own words
+    with utf8_name(path) as name, hidden_stderr():  # for a broken file, both would print the error, too
         capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():

@@ -88,7 +88,7 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
     is the second camera's centre in the frame of the first.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is not a pinhole.
     """
     check_pinhole(first)
     check_pinhole(second)
@@ -183,7 +183,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
     some = valid.any(0)
     if mode in ("least_sensitive", "nearest_first"):
-        # infinite sensitivity of a valid candidate still comes before an invalid one
+        # a valid candidate of infinite sensitivity still sorts before an invalid one
         rank = np.minimum(sensitivities, np.finfo(float).max) if mode == "least_sensitive" else np.zeros(depths.shape)
         best = np.argmin(np.where(valid, rank, np.inf), axis=0)[None]
         depth, sensitivity = (np.take_along_axis(a, best, 0)[0] for a in (depths, sensitivities))

@@ -1,7 +1,7 @@
-"""Given depth brought to the scene's units, checked against what views confirm, and put in the place of searched depth.
+"""Given depth, converted to the scene's units, checked against consistent depth, and used instead of the sweep's depth.
 
-Derived in docs/decisions/022-given-depth.md. Lengths are compared with the references of their view: searched depth that other
-views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to them.
+Derived in docs/decisions/022-given-depth.md. Depths are compared with the references of their view: depth of the sweep that
+other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to them.
 """
 
 from __future__ import annotations

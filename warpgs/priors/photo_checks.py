@@ -1,7 +1,7 @@
 """Faults of photographs that explain a bad model: blur, and light or colours that differ from photograph to photograph.
 
-Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So it does not count
-what a photograph shows, only how (docs/scenes.md, "Photograph checks").
+Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So differences in content
+do not count, only those in blur and colour (docs/scenes.md, "Photograph checks").
 """
 
 from __future__ import annotations

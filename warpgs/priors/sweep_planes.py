@@ -128,5 +128,5 @@ def gray_of(view: View) -> np.ndarray:
 
 def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
     """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
-    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # float32's exp has other last digits on other processors
+    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # the rounding of float32's exp depends on the processor
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)

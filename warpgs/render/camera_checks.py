@@ -15,7 +15,7 @@ from warpgs.scene import Camera
 def check_arrays(camera: Camera) -> None:
     """Check types, shapes and values of a camera's arrays, and the type of its size.
 
-    Nothing is read from a GPU: a pose or K there is taken as it is.
+    Nothing is read from a GPU: poses and K in its memory are not checked.
 
     Raises:
         TypeError: An array is neither of numpy nor a tensor, or not of real numbers; or the size is not of integers.
@@ -40,7 +40,7 @@ def check_arrays(camera: Camera) -> None:
 
 
 def _check_type(name: str, array: Any) -> None:
-    """Raise TypeError where a value is no array of real numbers."""
+    """Raise TypeError where a value is not an array of real numbers."""
     if not isinstance(array, (np.ndarray, torch.Tensor)):
         raise TypeError(
             f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"

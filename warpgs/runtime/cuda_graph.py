@@ -126,7 +126,7 @@ class GraphPool:
         return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     def capturing(self) -> bool:
-        """Return whether somebody else captures a graph on the current stream."""
+        """Return whether other code captures a graph on the current stream."""
         return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
 
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
@@ -141,7 +141,7 @@ class GraphPool:
         self._aside.wait_stream(here)  # a capture sets numbers of torch's generator that graphs in flight may still read
         try:
             with torch.no_grad():
-                # holds the shared memory, which torch would lend to nobody once the last graph is gone
+                # holds the shared memory, which torch would not reuse once the last graph is gone
                 if self._keeper is None:
                     self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device), self._aside)
                 return CapturedGraph(work, self._aside, self._keeper.pool())

@@ -57,7 +57,7 @@ def loopback_of(name: str) -> str | None:
     """Return the loopback address of a host name or address, 127.0.0.1 before ::1; None for other hosts."""
     try:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
-    except (OSError, UnicodeError):  # it cannot be resolved; whoever connects to it says so
+    except (OSError, UnicodeError):  # it cannot be resolved; connecting to it raises the error
         return None
     if not found or not all(map(is_loopback, found)):
         return None

@@ -34,7 +34,7 @@ class Engine(Protocol):
         """Start a job; called while fewer than `slots` run."""
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return news; waits up to this time."""
+        """Return new events; waits up to this time."""
 
     def close(self) -> None:
         """End all that runs. A fit saves its state where it can, and is continued by the next farm."""

@@ -113,7 +113,7 @@ def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
         other: The other view.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is not a pinhole.
     """
     check_pinhole(camera)
     u, v, z = _seen_from(depth, camera, other.camera)
@@ -175,7 +175,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
         The coverage, on the device of ``depth``.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is not a pinhole.
     """
     counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
     least = torch.full_like(depth, torch.inf)

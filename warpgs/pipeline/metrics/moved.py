@@ -1,4 +1,4 @@
-"""Things that moved: places where one training view differs from a model that other views there agree with."""
+"""Detection of moved objects: places where one training view differs from the model while other views agree with it."""
 
 from __future__ import annotations
 

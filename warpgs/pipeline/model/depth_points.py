@@ -148,7 +148,7 @@ def coarse_points(
         depths: Geometrically consistent depth of each, confirmed by other views.
         merge_px: Width of the cells in which consistent points become one [px]; 0 keeps every pixel.
         fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
-            those of `complete`; none is in space that another view looks through, or beside a consistent point. Views without
+            those of `complete`; none is in space that another view sees through, or beside a consistent point. Views without
             estimated depth are left out, so that the work for each view is bounded.
         source: Name of the source in the notes, sweep or flow.
         known: Points of a reconstruction. Those that two of the views saw are taken where no depth is consistent, and their

@@ -45,7 +45,7 @@ class Box:
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Return finite numbers of a shape; UsageError where ``value`` is none."""
+    """Return finite numbers of a shape; UsageError if ``value`` is not that."""
     try:
         array = np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):

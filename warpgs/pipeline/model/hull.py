@@ -130,8 +130,8 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean colours [N, 3] of cells of that width [u] where they are seen, and the cells that are kept, bool [N].
 
-    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in like colours: the others
-    are parts of the hull that the object need not fill.
+    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in similar colours; the
+    others may be empty parts of the hull.
     """
     total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
     for shape in shapes:

@@ -103,7 +103,7 @@ class FitRequest:
 
 
 def check_overrides(overrides: Mapping[str, object]) -> None:
-    """Check that keywords of a fit are no options of reading a scene.
+    """Check that keywords of a fit are not options of `load_scene`.
 
     Raises:
         UsageError: One is.
@@ -117,7 +117,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
 
     Raises:
         ResourceError: CUDA was requested and is missing.
-        UsageError: The name is none of these.
+        UsageError: The name is unknown.
     """
     if isinstance(name, torch.device):
         device = name

@@ -128,9 +128,9 @@ class Gain:
     rather too small than too large."""
 
     def upper_bound_below(self, least: float, noises: float) -> bool:
-        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is no number.
+        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is NaN.
 
-        With few blocks the noise is large, so that a fit of unknown gain goes on.
+        With few blocks the noise is large, so that a fit of unknown gain continues.
         """
         return not self.mean + noises * self.noise >= least
 

@@ -1,6 +1,6 @@
 """Memory that a fit needs, added up from what its parts declare, and the means to keep to a limit.
 
-A step holds parameters with their moments throughout, and on top of them what its heaviest moment needs. Each part declares its
+A step holds parameters with their Adam moments throughout, plus the memory of its largest phase. Each part declares its
 bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The
 CUDA driver, Python and the compiled kernels need more on top. Not counted, since they are small: parameters of single views,
 and the buffers of learning rates and losses (`StepBuffers`).

@@ -369,7 +369,7 @@ class StepGraphs:
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
-            # a first run loads kernels and fills caches, which may not happen while capturing; it changes no parameter
+            # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
             buffers.stop.fill_(NOT_FINITE)
             buffers.view_rows.zero_()
             work()

@@ -260,7 +260,7 @@ class Trainer:
             error.view = chosen[done + error.slot]
             raise error
         if stop:
-            self.taker.clear()  # they are captured anew with more capacity
+            self.taker.clear()  # they are captured again with more capacity
         counts = [len(self.table)] * done
         if done == count:
             self._update()
