@@ -31,7 +31,7 @@ NEAR = 0.01
 
 FAR = 1e10
 """Farthest depth that is rendered [u]. This and the next five limits are far beyond any usual scene, and narrow enough that no
-product on the way to a gradient leaves float32 (docs/extremes.md): every rendered Gaussian has finite gradients, and float64
+product in the backward pass overflows float32 (docs/extremes.md): every rendered Gaussian has finite gradients, and float64
 renders the same ones."""
 
 FARTHEST_PIXEL = 1e9
@@ -63,7 +63,7 @@ FRUSTUM_MARGIN = 0.15
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 RIM_SAMPLES = 16
-"""Points between the axis and a position at which a lens must not fold back, the last of them the position itself."""
+"""Number of points between the axis and a position, inclusive, at which a lens must not fold back."""
 
 
 @document_fields

@@ -27,9 +27,9 @@ WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a disk, or of a user's part of one, that has no room left."""
+"""Errors of a full disk, or of an exhausted disk quota."""
 DESCRIPTORS = Path("/proc/self/fd")
-"""Folder in which Linux shows the open files and folders of this process, by which a library can be given a place in one."""
+"""Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
 
 @contextlib.contextmanager

@@ -59,7 +59,7 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def check_pinhole(camera: Camera) -> None:
-    """Check that a camera is a pinhole, for code that takes lines for lines.
+    """Check that a camera is a pinhole, for code that assumes that straight lines stay straight.
 
     Raises:
         UsageError: It is not.

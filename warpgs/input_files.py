@@ -16,7 +16,7 @@ from typing import BinaryIO
 from warpgs.output_folders import open_file
 
 MAX_BYTES = 2**34
-"""Size of the largest file that is read into memory where the caller names no smaller one [bytes]."""
+"""Default size of the largest file that is read into memory [bytes]."""
 NOT_REGULAR = "is not a regular file"
 """Reason for a pipe, a socket or a device."""
 PIECE = 1 << 20

@@ -21,7 +21,8 @@ MODELS = ("pinhole", "orthographic", "opencv", "fisheye")
 CENTRAL = ("pinhole", "opencv", "fisheye")
 """Camera models with a centre of projection, which a pinhole of the same K can replace."""
 NEWTON_STEPS = 30
-"""Steps of Newton's method for a way back; five reach float64's last digits for usual lenses, more are bisections."""
+"""Steps of Newton's method to invert the distortion; five reach float64's precision for usual lenses, further steps are
+bisections."""
 
 
 def check_known(model: str) -> None:

@@ -52,8 +52,8 @@ MAX_PIXEL_BYTES = 8
 """Most bytes of a pixel in a lossless WebP image; one that cannot be compressed takes little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
 """Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
-"""Most Gaussians per byte of a file, most pixels per Gaussian, and what any file may have of both: real ones have one in ten
-bytes, and one pixel each. Beyond, images are bombs."""
+"""Most Gaussians per byte of a file, most pixels per Gaussian, and the least of both limits for any file: real files have a
+Gaussian in ten bytes, and one pixel each. Beyond, images are bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 

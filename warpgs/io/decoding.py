@@ -14,7 +14,7 @@ from warpgs.io.image_formats.kinds import format_of
 from warpgs.io.unread_formats import unread_format
 
 MAX_PIXELS = 100_000_000
-"""Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
+"""Default of the largest number of pixels of an image; decoded, it takes 1.2 GB."""
 FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
 """Bytes that a pixel may take in a file, four channels as float32, and bytes for all else in it."""
 BYTES_PER_PIXEL = 32

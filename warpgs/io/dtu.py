@@ -63,7 +63,7 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
                     if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:
                         raise ValueError(f"{key} is too large for a 4 x 4 matrix")
                     matrices[key] = archive[key].astype(np.float64)
-    except Exception as e:  # numpy and zipfile raise a dozen types on foreign bytes
+    except Exception as e:  # numpy and zipfile raise a dozen types on malformed files
         raise DataError(f"{path}: cannot be read as an archive of arrays ({type(e).__name__}: {e}); copy it again") from e
     for key, matrix in matrices.items():
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():

@@ -27,7 +27,7 @@ MIN_FOCAL = 1e-3
 MAX_DISTORTION = 1e4
 """Largest distortion coefficient; beyond it, or an intrinsic beyond `MAX_INTRINSIC` [px], a file is taken for broken."""
 MIN_FOLD = 1e-9
-"""Inverse of a squared radius; a lens that folds back farther out does so beyond any image."""
+"""Inverse of a squared radius; a fold of the lens beyond that radius lies outside any image."""
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,7 @@ def _read_array(path: Path, max_pixels: int) -> np.ndarray:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
-    except Exception as e:  # numpy raises a dozen types on foreign bytes
+    except Exception as e:  # numpy raises a dozen types on malformed files
         raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); write it again") from e
     if not isinstance(found, np.ndarray):
         found.close()

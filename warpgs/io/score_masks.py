@@ -14,7 +14,7 @@ from warpgs.io.images import list_images
 from warpgs.scene import View
 
 FOLDER = "idrmasks"
-"""Subfolder of a scene that is taken where no other folder is named: the name under which DTU's masks are published."""
+"""Default subfolder of a scene: the name under which DTU's masks are published."""
 ASPECT_TOLERANCE = 0.02
 """Largest relative difference of aspects: undistorted DTU images differ by about a percent from the originals' masks."""
 

@@ -8,7 +8,7 @@ import warp as wp
 from warpgs.kernels.falloff import STRIP, make_functions
 
 BATCH = 64
-"""Gaussians that are copied together, so that many loads are under way at once."""
+"""Gaussians that are copied together, so that many loads overlap."""
 TOGETHER = 16
 """Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
 

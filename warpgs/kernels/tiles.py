@@ -48,7 +48,7 @@ class Tiles:
     counts: torch.Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
     tile_ids: torch.Tensor
-    """Tile of each instance, int32, shape [M]; the number of tiles where none was found after all."""
+    """Tile of each instance, int32, shape [M]; the number of tiles if the kernel found no such tile."""
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
     visible: int = 0
@@ -65,8 +65,8 @@ class Visible(NamedTuple):
     sums: torch.Tensor
     """Running sums of `running_counts`, int64, shape [S]."""
     capacity: int
-    """Number of visible Gaussians to allocate for, at most the number of all. Where there are more, which the last of the sums
-    tells, the lists must not be used."""
+    """Number of visible Gaussians to allocate for, at most the number of all. If there are more, which the last of the sums
+    shows, the lists must not be used."""
 
 
 @dataclass(frozen=True)

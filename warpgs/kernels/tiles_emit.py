@@ -8,7 +8,7 @@ from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 
 EACH = 4
-"""Items that a thread of short kernels takes on CUDA: to load one alone, it would wait longer than it works."""
+"""Items of a thread of short kernels on CUDA: with a single item, waiting for its load would take longer than the work."""
 
 
 @functools.cache

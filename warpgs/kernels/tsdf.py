@@ -29,7 +29,7 @@ class DistanceGrid:
     truncation: float
     """Largest distance from a surface that is stored [u]."""
     distances: torch.Tensor
-    """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; of no meaning at weight 0."""
+    """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
     weights: torch.Tensor
     """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
 

@@ -19,7 +19,8 @@ MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
 TRUNCATION = 4.0
 """Truncation in voxels."""
 FENCE = 3.0
-"""Interquartile ranges outside the quartiles from where a coordinate is far out (Tukey, 1977: Exploratory Data Analysis)."""
+"""Multiples of the interquartile range outside the quartiles beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
+Data Analysis)."""
 QUANTILES = (0.005, 0.995)
 """Quantiles of the surface points along an axis between which the grid lies, if the fences are wider."""
 GRID_BYTES = 8

@@ -10,7 +10,7 @@ from warpgs.scene import Mesh
 
 MAX_JUMP = 1.1
 """Largest difference of the distances at two neighbouring grid points, over the truncation, that a surface may lie between.
-With less, what is seen at a grazing angle is left out; with more, skirts hang behind the edges of what a view sees. Chosen, as
+With less, surfaces at grazing angles are left out; with more, false triangles extend behind depth edges. Chosen, as
 the truncation was, on a demo scene of another seed than the one that is reported (docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
     "no surface inside the grid; give another --voxel (larger; smaller where it is near the size "

@@ -31,7 +31,7 @@ from warpgs.poses.record import record_of, write_record
 from warpgs.poses.video import is_video, write_frames
 
 MIN_PHOTOGRAPHS = 3
-"""Fewest photographs: of two, nothing checks the focal length and the depths that they give each other."""
+"""Fewest photographs: with two, nothing checks the focal length and the depths."""
 FRAMES = 60
 """Default number of frames from a video."""
 LINKS = 6

@@ -105,7 +105,7 @@ def main(path: str) -> None:
         answer(json.dumps({"file": i}))
         try:
             copy = _coded_again(Path(source), job["max_pixels"])
-        except Exception as e:  # decoders raise a dozen types on foreign bytes; the caller names the file
+        except Exception as e:  # decoders raise a dozen types on malformed files; the caller names the file
             answer(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
             return
         write_bytes(Path(target), copy)

@@ -17,7 +17,7 @@ from warpgs.runtime.native_output import hidden_stderr
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Endings of video files."""
 SHARPNESS_SIDE = 640
-"""Longer side at which frames are compared for sharpness [px]: what noise and compression add is averaged away."""
+"""Longer side at which frames are compared for sharpness [px]: small enough to average out noise and compression artefacts."""
 MAX_FRAMES = 100_000
 """Longest video that is read [frames]: an hour at 25 a second."""
 MAX_FRAME_PIXELS = 2**26

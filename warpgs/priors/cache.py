@@ -19,7 +19,7 @@ from warpgs.runtime.folders import cache_home, private_folder
 from warpgs.runtime.terminal import say
 
 CODE = 1
-"""Version of the code between image and maps; it counts up whenever the same inputs give other maps."""
+"""Version of the code between image and maps; increased whenever the same inputs would produce other maps."""
 
 
 def cache_folder() -> Path:

@@ -53,11 +53,11 @@ class PairDepth:
     """Depths of N pixels of a view from their matches in a second view."""
 
     depth: np.ndarray
-    """z-depth in the first view [u], float64, shape [N]; NaN where the geometry has no answer."""
+    """z-depth in the first view [u], float64, shape [N]; NaN if undefined."""
     residual: np.ndarray
     """Distance of the match from the epipolar line [px], shape [N]."""
     sensitivity: np.ndarray
-    """|dz/dpx| [u/px], shape [N]; infinite where a slide of half a pixel leads behind a camera or to infinity."""
+    """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
     valid: np.ndarray
     """True where both depths are positive, the parallax suffices, the nearest point of the line is in the second image and all
     is finite."""

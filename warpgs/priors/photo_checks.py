@@ -36,7 +36,7 @@ MAX_FEATURES = 1000
 MAX_PIXELS = 100_000
 """Number of pixels to which a photograph is reduced for the search of features; sharpness is measured at its full size."""
 FINE, COARSE = 1.0, 2.0
-"""Standard deviations of the Gaussian filters that part fine detail from coarse [px]."""
+"""Standard deviations of the Gaussian filters that separate fine from coarse detail [px]."""
 PATCH = 15
 """Side of the square around a match in which detail and colour are measured [px]."""
 NOISE = 0.1 / 255**2

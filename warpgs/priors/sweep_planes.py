@@ -18,8 +18,8 @@ NOISE = (2 / 255) ** 2
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
 UNIT = 4096
-"""Cost 1 in the 16-bit integers that volumes hold: to touch memory for the first time takes as long as to compute what
-goes there, and this is half of float32's."""
+"""Cost 1 in the 16-bit integers of cost volumes: they need half the memory of float32, and first access to memory takes as long
+as the computation."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16

@@ -34,7 +34,7 @@ from warpgs.runtime.derivatives import first_order
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
-"""Equal calls in a row from which on kernels are captured. Where a capture did not pay, the number doubles for the next."""
+"""Equal calls in a row from which on kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
 """Capacity for visible Gaussians and instances, as a multiple of the most that such calls were seen to have."""
 SPARE = 1024
@@ -262,7 +262,7 @@ class Recorder:
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the calls at hand; None where they were too few."""
+        """Rasterizer of the current calls; None if they were too few."""
         self.min_calls = MIN_CALLS
         """Equal calls in a row from which on kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False

@@ -45,8 +45,8 @@ TILE_SIZES = (8, 16)
 
 BOUND_ROUNDING = 2.0**-29
 """Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
-colour is off by at most 2 e: an alpha moves its weight between its own colour and those behind, and the weights sum to 1. The
-unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
+colour is off by at most 2 e: alpha shifts weight between its own colour and those behind, and the weights sum to 1. The unit of
+float64 is 2^29 times finer than that of float32, so e is at most 2^-30 if the error of a float32 alpha is at most one half."""
 
 
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")

@@ -23,7 +23,7 @@ MAX_GRAPHS = 8
 MIN_REPLAYS = 30
 """Replays that pay for one capture."""
 FREE_CAPTURES = 16
-"""Captures of a function that need not have paid: a loop takes a while until its addresses repeat."""
+"""Captures of a function that are allowed without a gain: at the start of a loop, addresses do not repeat yet."""
 SMALL_BYTES = 2**16
 """Size of a workspace up to which it is kept, because allocating it at each call takes longer."""
 

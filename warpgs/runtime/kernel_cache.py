@@ -26,7 +26,7 @@ class KernelCache(NamedTuple):
     folder: Path
     """Folder, without the part that names Warp's version."""
     refused: str
-    """Reason why the usual folder is not taken; empty where it is."""
+    """Reason why the usual folder is not used; empty if it is used."""
 
 
 @functools.cache

@@ -23,7 +23,7 @@ from warpgs.runtime.terminal import say
 HOST = "127.0.0.1"
 """Address that servers listen at: only this machine reaches it."""
 NAMES = (HOST, "localhost")
-"""Names under which a browser may ask for a server, at any port: that of an SSH tunnel may differ from ours."""
+"""Host names that a browser may request, at any port: that of an SSH tunnel may differ from the server's."""
 TOKEN_BYTES = 24
 """Random bytes of a token: 32 letters."""
 _PLAIN = re.compile(r"[A-Za-z0-9._/-]*")

@@ -20,7 +20,7 @@ MAX_MODEL_BYTES = 2**31
 
 
 def read_model(path: Path) -> bytes:
-    """Return the bytes of an ONNX file that needs nothing but itself.
+    """Return the bytes of an ONNX file, checked to need no other files.
 
     Raises:
         DataError: It cannot be read, is not an ONNX model, or needs other files or foreign operators.

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 JOIN_SECONDS = 300.0
 """Time in which all processes must have come [s]."""
 EXCHANGE_TIME = timedelta(days=1)
-"""Time that an exchange may take: the first rank may write a checkpoint meanwhile, and who is lost is noticed otherwise."""
+"""Time that an exchange may take: the first rank may write a checkpoint meanwhile, and a lost rank is detected separately."""
 
 
 class Ranks:

@@ -11,7 +11,7 @@ from typing import Any
 
 STOPPING = tuple(s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)))  # Windows has no SIGHUP
 AGAIN = 0.05
-"""Time after which a signal that Python threw away is sent again [s]."""
+"""Time after which a signal that Python discarded is sent again [s]."""
 
 
 def _heeded() -> list[signal.Signals]:

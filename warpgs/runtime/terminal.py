@@ -13,9 +13,9 @@ from warpgs.runtime.output_streams import say_lost
 T = TypeVar("T")
 
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Categories of characters that move the cursor, turn the direction of text, end a line, or are half of one."""
+"""Categories of characters that move the cursor, change the direction of text, end a line, or are surrogates."""
 JOINERS = "\u200c\u200d"
-"""Characters of these categories that scripts and emoji need, and that change nothing but the letters beside them."""
+"""Exceptions that scripts and emoji need; they affect only adjacent letters."""
 
 
 class Detail(str):

@@ -15,7 +15,7 @@ class Event:
     name: str
     """Name of the job."""
     state: str
-    """running; or the last news: done, failed, held (another process works on it) or crashed (its process ended)."""
+    """running; or the last event: done, failed, held (another process works on it) or crashed (its process ended)."""
     message: str = ""
     """Reason of a crash."""
     step: int = 0

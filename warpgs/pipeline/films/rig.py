@@ -26,7 +26,7 @@ MAX_GAP = math.radians(150)
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
-"""Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
+"""Length of the mean of the cameras' upward unit directions above which they agree."""
 MIN_SWING = math.radians(6)
 """Smallest range of azimuths of a film, for cameras above each other."""
 

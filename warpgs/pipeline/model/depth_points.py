@@ -20,10 +20,10 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 NOTHING = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 """No points."""
 FREE_SPACE = 0.95
-"""A filled point nearer to another view than this fraction of the depth found there would hide what that view sees."""
+"""A filled point nearer to another view than this fraction of that view's depth would occlude its surface."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
-"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: what is far takes few
-planes, what is near many."""
+"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: few planes for
+distant surfaces, many for near ones."""
 MIN_KNOWN = 10
 """Known points that a view must hold to bound its depths."""
 

@@ -27,8 +27,8 @@ DEPTH_PX, COLOR_PX = 31, 6
 REACH, BEHIND_PX, BEHIND_COLOR_PX = 24, 8, 3
 """Reach of a far surface behind a near one; width of its cells, a point each; and reach of the mean of its colour [px]."""
 STEP, EDGE = 1.02, 1.15
-"""Factors of depth: between two pixels, above which a surface ends rather than slants; and of the far side over the near one,
-from which there is a point."""
+"""Ratios of depth: that of neighbouring pixels above which a surface ends; and that of the far to the near side above which
+points are added."""
 SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and direction of the four neighbours of a pixel."""
 

@@ -81,7 +81,8 @@ class LimitConfig:
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
     max_reach: float = 1 / 3
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
-    a third, three of them reach no camera; larger ones beside or behind training cameras are a fog before other views."""
+    a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras are fog in front of
+    other views."""
     min_pixels: float = 0.2**0.5
     """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
     most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""

@@ -73,7 +73,7 @@ class StepTeller:
         """Start before the first step; ``progress`` is None for a fit that shows none."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
-        """The last step that took longer than those to come will; kernels that were compiled by then."""
+        """The last step that compiled kernels and so took longer; the number of kernels compiled by then."""
 
     def __call__(self, r: StepReport) -> None:
         """Take one report."""

@@ -27,8 +27,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
-"""Places in the last tensor that is summed, behind loss and squared error: how many processes were told to stop; and from where
-on each slot says why it stops the step."""
+"""Positions in the last summed tensor, after loss and squared error: the number of processes that were asked to stop; and the
+first of the slots' reasons to stop the step."""
 
 
 def update_by_sums(
@@ -70,7 +70,7 @@ class BatchSteps:
         self.slots = StepBuffers(buffers.device, 1, len(tree.slots))
         """Settings and results of this process's slots."""
         self.told_to_stop = False
-        """Whether this process was told to stop, which all hear of in the next step."""
+        """Whether this process was asked to stop; the next step tells all others."""
         self.sums: SlotSums | None = None
         """Sums over slots, of the sizes of the last step."""
         self._graphs = self._updates = None

@@ -45,7 +45,7 @@ class Layout:
     table: Table
     """The Gaussians with their columns."""
     view_bytes: int
-    """Bytes of all views, those included that are kept beside them."""
+    """Bytes of all views, including data kept beside them."""
     graphs: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
     sums: int = 0
@@ -127,7 +127,7 @@ class MemoryPlan:
     chunked_at_cap: bool = False
     """True where steps at the cap do."""
     graph_refused: bool = False
-    """True where captured steps would not keep to the limit, and steps are taken one by one."""
+    """True if captured steps would exceed the limit, so that steps are taken one by one."""
 
     def to_json(self) -> dict:
         """Return plain values for metrics.json."""

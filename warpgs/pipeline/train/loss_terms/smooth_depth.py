@@ -24,7 +24,7 @@ MIN_ALPHA = 0.3
 EDGE = 0.1
 """Difference of colour between both neighbours, mean of the channels, at which the weight falls to 1/e."""
 BOUND = 0.1
-"""Largest value of a pixel: beyond it nothing pulls."""
+"""Largest value of a pixel: beyond it the gradient is 0."""
 CONFIRMED = 0.2
 """Weight of pixels with consistent depth."""
 MAPS = 12
