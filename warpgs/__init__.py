@@ -125,7 +125,8 @@ _HOMES = {
     }.items()
     for name in names
 }
-"""Module of each public name: they load on first use, since torch and Warp cost seconds that `warpgs --help` must not pay."""
+"""Module of each public name: modules load on first use, since importing torch and Warp takes seconds, which would delay
+`warpgs --help`."""
 
 
 def __getattr__(name: str) -> object:

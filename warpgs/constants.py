@@ -36,7 +36,7 @@ NEAR = 0.01
 
 FAR = 1e10
 """Farthest depth that is rendered [u]. This and the next five limits are far beyond any usual scene, and narrow enough that no
-product on the way to a gradient leaves float32 (docs/extremes.md): every rendered Gaussian has finite gradients, and float64
+product in the backward pass overflows float32 (docs/extremes.md): every rendered Gaussian has finite gradients, and float64
 renders the same ones."""
 
 FARTHEST_PIXEL = 1e9
@@ -68,7 +68,7 @@ FRUSTUM_MARGIN = 0.15
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 RIM_SAMPLES = 16
-"""Points between the axis and a position at which a lens must not fold back, the last of them the position itself."""
+"""Number of points between the axis and a position, inclusive, at which a lens must not fold back."""
 
 
 @document_fields
@@ -123,8 +123,8 @@ class Rule:
 
 RULES = {
     "exact": Rule("exact"),
-    # Faster and less accurate, as measured in docs/trade.md. A stop of 1e-2 would save more before opaque walls, and make
-    # gradients there wrong by a third.
+    # Faster and less accurate, as measured in docs/trade.md. A stop of 1e-2 would save more time in front of opaque surfaces,
+    # but gradients there would be wrong by a third.
     "balanced": Rule("balanced", alpha_cut=2.0 / 255.0, transmittance_stop=1e-3),
     "fast": Rule("fast", alpha_cut=4.0 / 255.0, transmittance_stop=1e-3),
     # gsplat: exclusive stop. Its extent of 3.33 sigma never binds: sqrt(2 ln 255) = 3.329. The clamp of

@@ -58,10 +58,10 @@ def checked_normalization(normalization: Normalization | None, units: str, where
 
 
 def check_stored(gaussians: object) -> None:
-    """Check that Gaussians are given by log scales and logits, as files hold them, in tensors whose shapes agree.
+    """Check that Gaussians have log scales and logits, as in files, and tensors of matching shapes.
 
     Raises:
-        TypeError: They are of another kind, or one is no tensor.
+        TypeError: They are of another kind, or one is not a tensor.
         ValueError: A shape disagrees.
     """
     if not isinstance(gaussians, Gaussians):

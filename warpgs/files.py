@@ -1,4 +1,4 @@
-"""Writing of files so that nothing is lost: a new file appears whole or not at all, and no link leads it elsewhere."""
+"""Writing of files so that nothing is lost: a new file appears whole or not at all, and is never written through a link."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
 """Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of a disk, or of a user's part of one, that has no room left."""
+"""Errors of a full disk, or of an exhausted disk quota."""
 DESCRIPTORS = Path("/proc/self/fd")
-"""Folder in which Linux shows the open files and folders of this process, by which a library can be given a place in one."""
+"""Folder in which Linux lists the open files and folders of this process; libraries can open paths through it."""
 
 
 @contextlib.contextmanager
@@ -193,7 +193,7 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file (UTF-8) as `write_bytes` does; bytes of names that are no text are `readable` in it."""
+    """Replace a text file (UTF-8) as `write_bytes` does; bytes of names that are not text are `readable` in it."""
     write_bytes(path, readable(text).encode())
 
 
@@ -224,7 +224,7 @@ def read_file(path: Path, below: Path) -> bytes:
 
     Args:
         path: The file.
-        below: Folder that it lies in; no link on the way from there is followed.
+        below: Folder that contains it; no link below that folder is followed.
 
     Raises:
         DataError: It cannot be read, or is a link or no regular file.
@@ -278,7 +278,7 @@ def make_folder(folder: Path) -> bool:
         ResourceError: It cannot be created, or is behind a link that is not followed.
     """
     try:
-        made = not os.path.exists(folder)  # False for what Path.exists raises an error about
+        made = not os.path.exists(folder)  # False where Path.exists would raise an error
         if is_below(folder):
             open_folder(folder, make=True).close()
         else:
@@ -295,7 +295,7 @@ def make_folder(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def writing_into(folder: Path) -> Iterator[bool]:
-    """Make a folder where it is missing, and follow no link below it in this block; gives whether it was made.
+    """Make a folder if it is missing, and follow no link below it in this block; yields whether it was made.
 
     Raises:
         ResourceError: It cannot be created or opened, or is behind a link that is not followed.
@@ -336,5 +336,5 @@ def remove_leftovers(folder: Path) -> None:
             sweep(found)
     except RefusedError as e:
         raise ResourceError(f"{folder}: cannot be written, as {e}") from e
-    except OSError:  # it is not there, or cannot be looked into: nothing is in anybody's way
+    except OSError:  # the folder is missing or cannot be read: nothing has to be removed
         return

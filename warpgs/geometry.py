@@ -59,7 +59,7 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def check_pinhole(camera: Camera) -> None:
-    """Check that a camera is a pinhole, for code that takes lines for lines.
+    """Check that a camera is a pinhole, for code that assumes that straight lines stay straight.
 
     Raises:
         UsageError: It is not.
@@ -104,7 +104,7 @@ def inverse(m: np.ndarray) -> np.ndarray:
 
 def nearest_rotation(m: np.ndarray) -> np.ndarray:
     """Return the rotation nearest to m [3, 3] of positive determinant: its polar factor, by Newton (Higham 1986)."""
-    for _ in range(10):  # from a matrix that is orthogonal to 0.1 it takes five; more change nothing
+    for _ in range(10):  # five steps suffice for a matrix that is orthogonal to 0.1; further steps change nothing
         c = cofactors(m)
         nearer = 0.5 * (m + c / (m[0] * c[0]).sum())
         if (nearer == m).all():
@@ -241,15 +241,15 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
         return depth.new_zeros(height, width, 3)
     rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (height, width))
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).view(-1, 2)
-    shown = ~(depth <= 0)  # of a NaN too: it must not vanish
+    shown = ~(depth <= 0)  # True for a NaN, so that it reaches the result
     depth = torch.where(shown, depth, 1)
     points = back_project_tensors(camera, pixels, depth.reshape(-1)).view(height, width, 3)
-    size = (depth / camera.K[0, 0]).detach()[1:-1, 1:-1, None]  # of a pixel: in any unit of length, lengths are around 1
+    size = (depth / camera.K[0, 0]).detach()[1:-1, 1:-1, None]  # of a pixel; lengths divided by it are around 1
     right = (points[1:-1, 2:] - points[1:-1, :-2]) / size
     down = (points[2:, 1:-1] - points[:-2, 1:-1]) / size
     normals = torch.linalg.cross(down, right)
     square = normals.square().sum(-1, keepdim=True)
-    # the root in float64: float32's has other last digits on other processors (MKL)
+    # the root in float64, since the rounding of float32's depends on the processor (MKL)
     normals = normals / torch.where(square == 0, 1, square).double().sqrt().to(depth.dtype)
     inner = shown[1:-1, 1:-1] & shown[1:-1, 2:] & shown[1:-1, :-2] & shown[2:, 1:-1] & shown[:-2, 1:-1]
     return torch.nn.functional.pad(torch.where(inner[..., None], normals, 0), (0, 0, 1, 1, 1, 1))

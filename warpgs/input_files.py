@@ -1,7 +1,7 @@
 """Opening of input files: regular files alone, of bounded size, so that no pipe hangs a command and no device fills its memory.
 
-Every file that somebody else may have written is opened here. What is wrong with it is an OSError whose ``strerror`` is the
-reason; callers turn it into a `DataError` with their own remedy, for which `unread_reason` gives the words.
+Every untrusted file is opened here. An unreadable one raises an OSError with the reason as its ``strerror``; callers turn it
+into a `DataError` with a remedy, with the text of `unread_reason`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import BinaryIO
 from warpgs.output_folders import open_file
 
 MAX_BYTES = 2**34
-"""Size of the largest file that is read into memory where the caller names no smaller one [bytes]."""
+"""Default size of the largest file that is read into memory [bytes]."""
 NOT_REGULAR = "is not a regular file"
 """Reason for a pipe, a socket or a device."""
 PIECE = 1 << 20
@@ -63,7 +63,7 @@ def read_input(path: str | os.PathLike[str], most: int = MAX_BYTES, below: Path 
     """Return the contents of a regular file of at most ``most`` bytes; ``below`` as in `open_input`.
 
     Raises:
-        OSError: It cannot be opened or read, is no regular file, or is larger.
+        OSError: It cannot be opened or read, is not a regular file, or is larger.
     """
     with open_input(path, below) as file:
         size = os.fstat(file.fileno()).st_size
@@ -83,7 +83,7 @@ def read_start(path: str | os.PathLike[str], count: int) -> bytes:
     """Return the first bytes of a regular file, at most ``count``.
 
     Raises:
-        OSError: It cannot be opened or read, or is no regular file.
+        OSError: It cannot be opened or read, or is not a regular file.
     """
     with open_input(path) as file:
         return file.read(count)
@@ -93,7 +93,7 @@ def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str
     """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`.
 
     Raises:
-        OSError: It cannot be opened or read, or is no regular file.
+        OSError: It cannot be opened or read, or is not a regular file.
     """
     with open_input(path, below) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

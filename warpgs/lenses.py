@@ -21,7 +21,8 @@ MODELS = ("pinhole", "orthographic", "opencv", "fisheye")
 CENTRAL = ("pinhole", "opencv", "fisheye")
 """Camera models with a centre of projection, which a pinhole of the same K can replace."""
 NEWTON_STEPS = 30
-"""Steps of Newton's method for a way back; five reach float64's last digits for usual lenses, more are bisections."""
+"""Steps of Newton's method to invert the distortion; five reach float64's precision for usual lenses, further steps are
+bisections."""
 
 
 def check_known(model: str) -> None:
@@ -77,7 +78,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
 
 
 def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
-    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN if there is none.
+    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1, else NaN.
 
     An orthographic camera has them at (u, v, 1) for every depth.
 
@@ -115,8 +116,8 @@ def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
 def on_lens(model: str, distortion: Array | None, positions: Array, samples: int = 64) -> Array:
     """Return a mask [...], True where the lens is not folded between its axis and positions in the camera [..., 3].
 
-    The fold is looked for at ``samples`` points on the way; positions behind a pinhole count as folded, none of an
-    orthographic camera does.
+    The fold is searched at ``samples`` points along the way. Positions behind a pinhole count as folded, those of an
+    orthographic camera never do.
     """
     library, z = _library(positions), positions[..., 2]
     if model == "orthographic":

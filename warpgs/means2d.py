@@ -42,8 +42,8 @@ class ProjectedMeans(torch.Tensor):
 def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> None:
     """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`.
 
-    ``passes`` is a list that gets an entry for each pass, where the nodes of autograd see to that; None has a hook do it, whose
-    call takes longer.
+    ``passes`` is a list that gets an entry for each pass, which autograd nodes append; with None a hook does it, which is
+    slower.
     """
     if not projected.requires_grad:
         return

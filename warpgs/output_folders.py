@@ -1,8 +1,8 @@
 """Folders that this process writes into: the one that the user names may be a link, below it no link is followed.
 
 `output_folder` opens such a folder for a block. Everything below it is then reached from its descriptor, folder by folder,
-without following links, so that nobody can lead a write or a read elsewhere. Of folders in each other the outermost counts.
-Windows has no descriptors of folders: there each name on the way is looked at before it is used.
+without following links, so that no other program can redirect a write or a read. Of nested folders the outermost counts.
+Windows has no descriptors of folders: there each part of a path is checked for links before it is used.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ def is_below(path: Path) -> bool:
 
 
 def open_folder(path: Path, make: bool = False) -> Folder:
-    """Open a folder, to use its entries: below an open `output_folder` without following links, else wherever the path leads.
+    """Open a folder, to use its entries: below an open `output_folder` without following links, elsewhere with links.
 
     Args:
         path: The folder.
@@ -249,7 +249,7 @@ def open_file(path: Path, below: Path) -> BinaryIO:
 
     Raises:
         OSError: It cannot be opened, or is a link.
-        RefusedError: It is no regular file.
+        RefusedError: It is not a regular file.
     """
     with output_folder(below), open_folder(path.parent) as folder:
         return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
@@ -297,7 +297,7 @@ def _entered(above: Folder, name: str, make: bool) -> Folder:
 
 
 def _identity(folder: Folder) -> tuple[int, int]:
-    """Return the numbers by which the system knows a folder."""
+    """Return the numbers that identify a folder to the system."""
     found = os.stat(folder.path) if folder.descriptor is None else os.fstat(folder.descriptor)
     return found.st_dev, found.st_ino
 

@@ -201,7 +201,7 @@ def _line_about(cls: type) -> str:
     if text := getattr(cls, "description", ""):
         return str(text)
     text = cls.__dict__.get("__doc__") or ""
-    if text.startswith(f"{cls.__name__}("):  # what dataclasses write where there is no docstring
+    if text.startswith(f"{cls.__name__}("):  # the docstring that a dataclass gets by default
         return ""
     return re.split(r"(?<!\bal)\.(?: |$)", " ".join(text.split("\n\n")[0].split()))[0]
 
@@ -241,7 +241,7 @@ def _import_module(name: str) -> ModuleType:
 
 def _load_file(path: Path) -> ModuleType:
     """Import a file by its path, once, under a name of its own."""
-    path = Path(os.path.realpath(path))  # Path.resolve raises a RuntimeError on links that lead round in circles
+    path = Path(os.path.realpath(path))  # Path.resolve raises a RuntimeError on circular links
     name = f"{_PREFIX}{path.stem}_{hashlib.sha256(os.fsencode(path)).hexdigest()[:8]}"
     if name in sys.modules:
         return sys.modules[name]

@@ -38,7 +38,7 @@ def parse(text: str | bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        SchemaError: It is no JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
+        SchemaError: It is not JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
     """
     if len(text) > MAX_BYTES:
         raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
@@ -88,7 +88,7 @@ def read(path: Path, below: Path | None = None) -> Any:
 
     Args:
         path: The file.
-        below: Folder, such as a run's, that the file lies in: no link on the way from there is followed. None for a file that
+        below: Folder, such as a run's, that contains the file; no link below that folder is followed. None for a file that
             the user names.
 
     Raises:
@@ -109,7 +109,7 @@ def flag(value: Any, place: str) -> None:
 
 
 def text(value: Any, place: str) -> None:
-    """Allow text that can be a path: without a zero byte, and with no half of a character but those of undecodable names."""
+    """Allow text that can be a path: no zero byte, and no surrogates except those of undecodable bytes in names."""
     if not isinstance(value, str):
         _refuse(value, place, "text")
     try:

@@ -1,7 +1,7 @@
 """Temporary files and folders, each locked by its owner: any process removes one without a lock.
 
-The system gives a lock free when its holder ends, killed or not. So a temporary file of a process at work is never taken for a
-leftover, and nothing of a killed one stays for longer than until the next command.
+The system releases a lock when its holder ends, killed or not. So a temporary file of a running process is never removed as a
+leftover, and the next command removes the files of a killed process.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class TemporaryFile:
         if sys.platform == "win32":  # no open file is removed there; elsewhere the lock holds until it is gone
             self.close()
         try:
-            with contextlib.suppress(OSError):  # it hides nothing: what is left over is ours by name
+            with contextlib.suppress(OSError):  # no error is hidden: leftovers are recognised by name
                 self._folder.unlink(self.name)
         finally:
             self.close()
@@ -87,7 +87,7 @@ class TemporaryFile:
 
 
 class TemporaryFolder:
-    """A new folder that its owner removes, or gives another name; the lock beside it shows that the owner is at work."""
+    """A new folder that its owner removes or renames; the lock beside it shows that the owner is running."""
 
     def __init__(self, above: Folder, prefix: str = ".warpgs-", mode: int = 0o777):
         """Make the folder.
@@ -139,7 +139,7 @@ def temporary_folder() -> TemporaryFolder:
     What killed commands of this user left there is removed.
 
     Raises:
-        OSError: There is no place for it.
+        OSError: There is no writable folder for it.
     """
     sweep_temporary_files()
     return TemporaryFolder(open_folder(system_folder()), "warpgs-", 0o700)
@@ -218,7 +218,7 @@ def _owned(descriptor: int) -> bool:
     try:
         return lock_descriptor(descriptor, blocking=False) and os.fstat(descriptor).st_nlink > 0
     except OSError as e:
-        if e.errno in NO_LOCKS:  # nobody else can lock it either, and so nobody removes it
+        if e.errno in NO_LOCKS:  # other processes cannot lock it either, so none removes it
             return True
         raise
 
@@ -232,7 +232,7 @@ def _locked(descriptor: int) -> bool:
 
 
 def _unlocked(folder: Folder, name: str, descriptor: int) -> None:
-    """Remove a locked file, and then give its lock free; Windows removes no open file."""
+    """Remove a locked file, and then release its lock; Windows removes no open file."""
     if sys.platform == "win32":
         os.close(descriptor)
     try:

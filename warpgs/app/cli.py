@@ -80,7 +80,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     if arguments is None:
         use_utf8_names()
-    with contextlib.suppress(OSError):  # without a place for temporary files: what needs one says so
+    with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
         system_folder()
     words = sys.argv[1:] if arguments is None else arguments
     prints = words[:1] in ([], *([name] for name in PRINTING)) and "--warm" not in words

@@ -110,7 +110,7 @@ def _find(name: str) -> object:
 
 
 def _package(package: Package) -> Finding:
-    """Import a package: an installed one may still lack a system library."""
+    """Import a package, since an installed package may still lack a system library."""
     try:
         module = importlib.import_module(package.module) if package.imported else _find(package.module)
     except Exception as e:
@@ -200,7 +200,7 @@ def _quiet_warp():
     before = warp.config.log_level
     warp.config.log_level = warp.LOG_ERROR
     try:
-        with hidden_stderr():  # native code says where there is no driver, whatever the level
+        with hidden_stderr():  # native code warns if there is no driver, at any log level
             warp.init()
     finally:
         warp.config.log_level = before

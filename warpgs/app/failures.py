@@ -23,7 +23,7 @@ def missing_package(error: Exception) -> str:
 def report_defect(error: Exception, arguments: list[str]) -> int:
     """Keep the traceback for a bug report; the user sees one line. Returns the exit code.
 
-    A package that was installed with warpgs and is gone is no defect: it is named instead.
+    A dependency that has been uninstalled is not a defect of warpgs: the error names it.
     """
     import tempfile
     import traceback

@@ -1,4 +1,4 @@
-"""`warpgs fit --help` on one screen. Importing it costs nothing: no settings, no torch; tests hold it against the code."""
+"""`warpgs fit --help` on one screen, without importing settings or torch; tests compare the text with the code."""
 
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 

@@ -1,4 +1,4 @@
-"""Flags from settings: a dataclass of settings as a command line that takes its names, defaults and help texts from it."""
+"""Flags from settings: a command line with the names, defaults and help texts of a dataclass of settings."""
 
 import contextlib
 import dataclasses
@@ -81,14 +81,14 @@ MAX_NUMBER = 3e38
 
 
 def _whole(words: list[str]) -> int:
-    """Return the whole number that a word stands for; ValueError where it is none, or none of 64 bits."""
+    """Return the integer that a word stands for; ValueError if it is not an integer of 64 bits."""
     if not re.fullmatch(r"[+-]?[0-9][0-9_]{0,40}", words[0]) or abs(number := int(words[0])) > MAX_WHOLE:
         raise ValueError(f"expected an integer of at most 2^63 - 1, got {words[0][:40]!r}")
     return number
 
 
 def _number(words: list[str]) -> float:
-    """Return the number that a word stands for; ValueError where it is none, not finite, or beyond float32."""
+    """Return the number that a word stands for; ValueError if it is not a number, not finite, or beyond float32."""
     plain = re.fullmatch(r"[+-]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][+-]?[0-9]+)?", words[0])
     if not plain or not abs(number := float(words[0])) <= MAX_NUMBER:
         raise ValueError(f"expected a finite number of at most {MAX_NUMBER:g}, got {words[0][:40]!r}")

@@ -15,7 +15,7 @@ from warpgs.plugins import flag_group
 
 
 def format_lines() -> str:
-    """Return the formats by suffix, each with a description, for people."""
+    """Return the formats by suffix, each with a description for the user."""
     return listed("formats", {f.suffix: f.description for f in all_formats()})
 
 
@@ -68,7 +68,7 @@ def chosen_formats(a: Any, target: Path) -> list[Format]:
         target: The file to write.
 
     Raises:
-        UsageError: There is no such format, or options are given of a format that is not written.
+        UsageError: There is no such format, or an option belongs to another format.
     """
     named = [] if a.format is None else [_found(a.format)]
     written = next((type(f) for f in [*named, *all_formats()] if f.fits(target)), Format)

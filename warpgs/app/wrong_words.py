@@ -40,7 +40,7 @@ def refuse(kind: type, arguments: list[str], program: str, complaint: str) -> No
 
 
 def _refuse_unknown_flag(kind: type, arguments: list[str], program: str) -> None:
-    """Raise UsageError for the first word that looks like a flag and is none of a dataclass of flags."""
+    """Raise UsageError for the first word that looks like a flag but is not one of a dataclass of flags."""
     known = {*flag_names(kind), "--help"}
     for word in arguments:
         flag = word.partition("=")[0].replace("_", "-")
@@ -91,7 +91,7 @@ def _missing(kind: type, rows: list[str]) -> str:
 
 
 def _wrong_value(reason: str) -> str:
-    """Return tyro's reason, in a line of its own, in the words of our errors."""
+    """Return tyro's reason as one line, worded as our errors are."""
     if found := re.match(r"Missing value for argument '(.+?)'\. Expected (\d+)", reason):
         flag, count = found.groups()
         return f"{flag} needs {'a value' if count == '1' else f'{count} values'}"

@@ -73,7 +73,7 @@ def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
     """
     import torch
 
-    with np.errstate(over="ignore", invalid="ignore"):  # what leaves float32 becomes an infinity, which is named below
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinities, which the error below names
         single = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
     for name, array in single.items():
         for part in parts(len(array)):

@@ -1,8 +1,8 @@
 """The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more per harmonic and channel.
 
 Chunks of 256 Gaussians share the bounds between which positions (11, 10, 11 bits), log scales (11, 10, 11) and colours (8 each)
-are fractions; rotations have 2 bits for the largest component and 10 for each other. Gaussians near each other in the file are
-stored best when they are near each other in space: `warpgs.export.formats` says so of this format.
+are fractions; rotations have 2 bits for the largest component and 10 for each other. The loss is least when Gaussians that are
+neighbours in the file are neighbours in space; so an export sorts them (``sorted``).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def start_of(path: Path) -> bytes:
     """Return the bytes of a PLY file up to the longest header, which is checked.
 
     Raises:
-        DataError: The file cannot be read, or is no PLY.
+        DataError: The file cannot be read, or is not a PLY file.
     """
     try:
         head = read_start(path, MAX_HEADER_BYTES)

@@ -36,7 +36,7 @@ GLB, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 MAX_PARTS = 100_000
 """Most lists and objects in a document, each of which takes some thirty times as much memory as text."""
 MAX_VALUES = 300_000
-"""Most commas in a document: each parts two values, which take up to a hundred bytes."""
+"""Most commas in a document: each separates two values, which take up to a hundred bytes."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TINY = 1e-37
@@ -88,7 +88,7 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
     for name, (kind, values) in attributes.items():
         views.append({"buffer": 0, "byteOffset": start, "byteLength": values.nbytes, "target": 34962})
         accessor = {"bufferView": len(accessors), "componentType": 5126, "count": len(values), "type": kind}
-        if name == "POSITION":  # glTF wants the bounds of positions
+        if name == "POSITION":  # glTF requires the bounds of positions
             accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         accessors.append(accessor)
         start += values.nbytes

@@ -37,8 +37,8 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
     Args:
         path: The file; an existing one is replaced.
         mesh: The mesh.
-        up: Upward direction in the mesh's coordinates, any length, shape [3]: a .glb file carries the rotation that turns it to
-            +y, as glTF wants it. None for +y. PLY has no upward direction.
+        up: Upward direction in the mesh's coordinates, any length, shape [3]: a .glb file contains the rotation that turns it
+            to +y, as glTF requires. None for +y. PLY has no upward direction.
 
     Raises:
         DataError: A number is not finite, a triangle names a vertex that is missing, or the file would be too large.

@@ -70,7 +70,7 @@ def write_ply(
     path = Path(path)
     normalization = checked_normalization(normalization, units, f"{path}: not written")
     in_file = convert_gaussians(gaussians, normalization, units, "file")
-    for g in (gaussians, in_file):  # finite numbers may leave float32 on the way
+    for g in (gaussians, in_file):  # finite numbers may overflow float32 in the conversion
         arrays = arrays_of(g)
         check_finite(path, arrays)
 
@@ -186,7 +186,7 @@ def _check_properties(path: Path, vertex: Element) -> int:
     rest = sum(bool(re.fullmatch(r"f_rest_[0-9]+", name)) for name in names)
     if rest not in _REST_COUNTS:
         raise ply_error(path, f"it has {rest} f_rest properties, but degrees 0 to 4 have 0, 9, 24, 45 or 72")
-    # Normals carry nothing, and some tools leave them out.
+    # Normals are unused, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
     if missing == ["scale_2"]:
         raise ply_error(path, "its Gaussians are flat (2DGS), without scale_2, which this program does not render")

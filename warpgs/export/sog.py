@@ -52,8 +52,8 @@ MAX_PIXEL_BYTES = 8
 """Most bytes of a pixel in a lossless WebP image; one that cannot be compressed takes little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
 """Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
-"""Most Gaussians per byte of a file, most pixels per Gaussian, and what any file may have of both: real ones have one in ten
-bytes, and one pixel each. Beyond, images are bombs."""
+"""Most Gaussians per byte of a file, most pixels per Gaussian, and the least of both limits for any file: real files have a
+Gaussian in ten bytes, and one pixel each. Beyond, images are bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -177,7 +177,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
             name = meta[part]["files"][i]
             return _pixels(path, str(name), _member(path, archive, name, most), n)
 
-        # one attribute after another, the largest first, so that little lies in memory beside the result
+        # one attribute after another, the largest first, to limit the peak memory
         sh = _harmonics(path, meta, n, pixels, lambda name: _member(path, archive, name, MAX_PIXEL_BYTES * MAX_PALETTE_PIXELS))
         opacities = _colors(_book(path, meta["sh0"]), pixels("sh0", 0), sh)
         quats = _quats(path, pixels("quats", 0), n)
@@ -253,7 +253,7 @@ def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:
-    """Return a file of the archive of at most ``most`` bytes, read into memory only, so that its name leads nowhere."""
+    """Return a file of the archive of at most ``most`` bytes, read into memory only: its name is never a path."""
     if not isinstance(name, str) or name not in archive.namelist():
         raise malformed(path, f"{str(name)[:40]!r} is not in the archive")
     if archive.getinfo(name).file_size > most:

@@ -33,7 +33,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The file is empty, its size is no multiple of 32 bytes, or an axis length is negative.
+        DataError: The file is empty, its size is not a multiple of 32 bytes, or an axis length is negative.
     """
     if not data:
         raise malformed(path, "it is empty")

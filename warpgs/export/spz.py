@@ -42,7 +42,7 @@ from warpgs.input_files import open_input, unread_reason
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
 VERSION = 3
-"""Version that is written by default: programs of any age read gzip."""
+"""Version that is written by default: old programs read gzip, too."""
 VERSIONS = (2, 3, 4)
 """Versions that are read and written."""
 MAGIC = 0x5053474E
@@ -52,7 +52,8 @@ MAX_FRACTIONAL_BITS = 24
 MAX_WINDOW = 2**26
 """Largest window of a zstd stream [bytes]."""
 MAX_RATIO, SMALL = 32, 65536
-"""Most bytes that a byte of a file may unpack to, and bytes that any file may: real ones have 2 or 3, a bomb has 1000."""
+"""Largest ratio of unpacked to packed bytes, and unpacked bytes that are always allowed: real files have a ratio of 2 or 3, a
+bomb 1000."""
 
 
 def fractional_bits(means: np.ndarray) -> int:
@@ -255,7 +256,7 @@ def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version
 def _fixed(data: np.ndarray) -> np.ndarray:
     """Return coordinates of 24 bits [P, 9], signed, as integers [P, 3]."""
     fixed = np.zeros((len(data), 3, 4), "u1")
-    fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, whose shift down keeps the sign
+    fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, since an arithmetic shift down keeps the sign
     return fixed.reshape(-1, 12).view("<i4") >> 8
 
 

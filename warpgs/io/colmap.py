@@ -26,7 +26,7 @@ MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 
 NATIVE_MODELS = {
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 8: ("SIMPLE_RADIAL_FISHEYE", 4), 9: ("RADIAL_FISHEYE", 5),
 }  # fmt: skip
-"""Models that are read where lenses are kept, and are not undistorted here."""
+"""Models that are only read with native lenses; undistortion is not implemented for them."""
 OTHER_MODELS = {7: "FOV", 10: "THIN_PRISM_FISHEYE"} | {number: name for number, (name, _) in NATIVE_MODELS.items()}
 STEMS = ("cameras", "images", "points3D")
 

@@ -14,7 +14,7 @@ from warpgs.io.image_formats.kinds import format_of
 from warpgs.io.unread_formats import unread_format
 
 MAX_PIXELS = 100_000_000
-"""Largest number of pixels of an image where the user names none; decoded, it takes 1.2 GB."""
+"""Default of the largest number of pixels of an image; decoded, it takes 1.2 GB."""
 FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
 """Bytes that a pixel may take in a file, four channels as float32, and bytes for all else in it."""
 BYTES_PER_PIXEL = 32
@@ -25,7 +25,7 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
     """Return the bytes of an image file; none with so many pixels is larger than what is read.
 
     Raises:
-        DataError: It is missing, cannot be read, or is no regular file.
+        DataError: It is missing, cannot be read, or is not a regular file.
     """
     try:
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
@@ -37,7 +37,7 @@ def read_image_start(path: Path, count: int) -> bytes:
     """Return the first bytes of an image file, at most ``count``.
 
     Raises:
-        DataError: It is missing, cannot be read, or is no regular file.
+        DataError: It is missing, cannot be read, or is not a regular file.
     """
     try:
         return read_start(path, count)
@@ -46,7 +46,7 @@ def read_image_start(path: Path, count: int) -> bytes:
 
 
 def _unreadable(path: Path, error: OSError) -> DataError:
-    if not os.path.exists(path):  # False for links that lead nowhere or round in circles
+    if not os.path.exists(path):  # False for broken and circular links
         what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
         return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
     return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
@@ -139,7 +139,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
             raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
     else:
         raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
-    del raw  # not to be held beside its copies
+    del raw  # free it before copies are made
     if values.ndim == 2:
         values = values[..., None]
     channels = values.shape[2]

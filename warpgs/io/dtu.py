@@ -34,7 +34,7 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
         raise DataError(f"{where}: the projection matrix is not finite or not invertible; calibrate again")
-    # M = K R by Gram-Schmidt from the last row, and K t by substitution: LAPACK's last digits go by the processor
+    # M = K R by Gram-Schmidt from the last row, and K t by substitution: LAPACK's rounding depends on the processor
     K, R, t = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     for i in (2, 1, 0):
         K[i, i + 1 :] = (R[i + 1 :] * M[i]).sum(1)
@@ -63,7 +63,7 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
                     if archive.zip.getinfo(f"{key}.npy").file_size > MAX_MATRIX_BYTES:
                         raise ValueError(f"{key} is too large for a 4 x 4 matrix")
                     matrices[key] = archive[key].astype(np.float64)
-    except Exception as e:  # numpy and zipfile raise a dozen types on foreign bytes
+    except Exception as e:  # numpy and zipfile raise a dozen types on malformed files
         raise DataError(f"{path}: cannot be read as an archive of arrays ({type(e).__name__}: {e}); copy it again") from e
     for key, matrix in matrices.items():
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():

@@ -35,7 +35,7 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
         name: As found in the file.
         where: Names the file in errors.
         root: The folder that must not be left, links followed; ``folder`` where None.
-        allow_outside: Let the name lead elsewhere.
+        allow_outside: Allow links that point outside the folder.
 
     Returns:
         The path; the file may not exist.

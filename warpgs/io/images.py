@@ -27,7 +27,7 @@ MIN_FOCAL = 1e-3
 MAX_DISTORTION = 1e4
 """Largest distortion coefficient; beyond it, or an intrinsic beyond `MAX_INTRINSIC` [px], a file is taken for broken."""
 MIN_FOLD = 1e-9
-"""Inverse of a squared radius; a lens that folds back farther out does so beyond any image."""
+"""Inverse of a squared radius; a fold of the lens beyond that radius lies outside any image."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,7 @@ def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
     K[:2, 2] -= 0.5
     image = cv2.remap(loaded.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     inside = (map_x >= -0.5) & (map_x <= width - 0.5) & (map_y >= -0.5) & (map_y <= height - 0.5)
-    # where the polynomial turns back, the map leads into the image again but to a ray that the lens sent elsewhere
+    # beyond the fold of the polynomial, the map returns into the image, but to the pixel of another ray
     x2 = ((np.arange(width) - K[0, 2]) / K[0, 0]) ** 2
     y2 = ((np.arange(height) - K[1, 2]) / K[1, 1]) ** 2
     inside &= y2[:, None] + x2 < _fold_radius2(lens.distortion)
@@ -238,7 +238,7 @@ def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tu
     height, width = upright
     if mask.shape == upright:
         return mask
-    # one pixel of the smaller of the two rasters is what rounding a size may cost
+    # rounding a size may change it by one pixel of the smaller raster
     if abs(mask.shape[1] * height - mask.shape[0] * width) > max(height, width, *mask.shape):
         raise DataError(
             f"{path}: its mask is {mask.shape[1]} x {mask.shape[0]} px, the image {width} x {height}: the aspects differ. "
@@ -288,7 +288,7 @@ def _over_background(loaded: LoadedImage, background: tuple[float, float, float]
     """Return an image with colours, premultiplied by their opacity, over a background."""
     image, alpha = np.ascontiguousarray(loaded.image, np.float32), loaded.alpha
     if alpha is not None:
-        alpha = np.clip(alpha, 0, 1)  # a mean of ones may come to more
+        alpha = np.clip(alpha, 0, 1)  # the mean of ones may be rounded above 1
         for channel, value in enumerate(background):
             image[..., channel] += np.float32(value) * (1 - alpha)
     return replace(loaded, image=image, alpha=alpha)

@@ -29,7 +29,7 @@ def read_rows(path: Path) -> np.ndarray:
         open_input(path).close()
         # mapped, because that holds the announced shape against the file's size before memory is taken
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as e:  # numpy raises a dozen types on foreign bytes
+    except Exception as e:  # numpy raises a dozen types on malformed files
         raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); copy it again") from e
     if not isinstance(rows, np.ndarray):
         rows.close()

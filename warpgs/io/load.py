@@ -185,7 +185,7 @@ def _finished(
     if points is not None:
         points = normalize_points(points, n, str(root))
     if score_masks is not None or (root / FOLDER).is_dir():
-        # a folder that the user names is its own bound, that of the scene must not lead out of it
+        # links of a folder that the user names must stay in it, those of the scene's own folder in the scene
         masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
         plain = replace(options, mask_keeps="white", maps=NO_MAPS)
         views, note = add_score_masks(views, masks, SceneFolder(bound, plain))

@@ -67,10 +67,10 @@ class MapFolder:
     """The maps of a folder, found by the names of images."""
 
     def __init__(self, folder: Path, flag: str, allow_outside: bool):
-        """List a folder; unless ``allow_outside``, no link below it may lead out of it.
+        """List a folder; unless ``allow_outside``, no link below it may point outside it.
 
         Raises:
-            DataError: The folder is missing or holds no map, two files are for one image, or a link leads out.
+            DataError: The folder is missing or holds no map, two files are for one image, or a link points outside.
         """
         self.folder, self.flag = folder, flag
         if not folder.is_dir():
@@ -135,7 +135,7 @@ def _read_array(path: Path, max_pixels: int) -> np.ndarray:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
-    except Exception as e:  # numpy raises a dozen types on foreign bytes
+    except Exception as e:  # numpy raises a dozen types on malformed files
         raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); write it again") from e
     if not isinstance(found, np.ndarray):
         found.close()
@@ -172,7 +172,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
     """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 for missing values.
 
     Raises:
-        DataError: The file is no map, or its values cannot be depths.
+        DataError: The file is not a map, or its values cannot be depths.
     """
     raw = _gray(path, read_numbers(path, max_pixels), "depth map")
     metric = options.depth_kind == "metric"
@@ -209,7 +209,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     Integers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
 
     Raises:
-        DataError: The file is no map, of another shape, or not in [0, 1].
+        DataError: The file is not a map, of another shape, or not in [0, 1].
     """
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
@@ -229,7 +229,7 @@ def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) 
     """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
 
     Raises:
-        DataError: The file is no map, or too many of its vectors have another length than 1.
+        DataError: The file is not a map, or too many of its vectors have another length than 1.
     """
     raw = read_numbers(path, max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:

@@ -65,7 +65,7 @@ def _intrinsics(K: np.ndarray, where: str) -> np.ndarray:
     if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
         raise DataError(f"{where}: K is not a matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
     K[0, 1] = 0.0
-    K[:2, 2] += 0.5  # the file counts pixels from the centre of the first one
+    K[:2, 2] += 0.5  # in the file, the centre of the first pixel is 0
     return K
 
 

@@ -13,7 +13,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
     """Return a pose [4, 4] with its rotation made exactly orthonormal.
 
     Raises:
-        DataError: The pose is not finite, or its upper left 3 x 3 block is no rotation; ``where`` is file and image.
+        DataError: The pose is not finite, or its upper left 3 x 3 block is not a rotation; ``where`` is file and image.
     """
     if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
         raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")

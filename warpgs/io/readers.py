@@ -19,7 +19,7 @@ from warpgs.plugins import Registry
 from warpgs.scene import Scene, View
 
 DEFAULT_MAX_SIDE = 1600
-"""Longest side of an image [px] where the user names neither a factor nor a side: a phone's 12 MP would take hours on a CPU."""
+"""Default of the longest side of an image [px]: 12 MP of a phone would take hours on a CPU."""
 
 
 def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:

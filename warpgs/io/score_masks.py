@@ -14,7 +14,7 @@ from warpgs.io.images import list_images
 from warpgs.scene import View
 
 FOLDER = "idrmasks"
-"""Subfolder of a scene that is taken where no other folder is named: the name under which DTU's masks are published."""
+"""Default subfolder of a scene: the name under which DTU's masks are published."""
 ASPECT_TOLERANCE = 0.02
 """Largest relative difference of aspects: undistorted DTU images differ by about a percent from the originals' masks."""
 
@@ -38,7 +38,7 @@ def _fit(path: Path, mask: np.ndarray, view: View) -> np.ndarray:
         )
     if mask.shape != (height, width):
         mask = cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.5
-    if view.mask is not None:  # what the lens did not see, or a mask file hides, shows no truth
+    if view.mask is not None:  # pixels outside the lens or under a mask file have no reference
         mask = mask & view.mask
     if not mask.any():
         raise DataError(f"{path}: the mask leaves no pixel of {view.name} to score; white keeps a pixel")

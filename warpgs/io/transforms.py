@@ -24,7 +24,7 @@ BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
-"""Keys of lens models that the five distortion terms of OpenCV cannot express; a fisheye's k4 is read where lenses are kept."""
+"""Keys of lens models that the five distortion terms of OpenCV cannot express; a fisheye's k4 is read with native lenses."""
 WHITE = (1.0, 1.0, 1.0)
 MAX_BYTES = 32 * 2**20
 """Largest file [bytes]; ten thousand frames take some ten million."""
@@ -63,7 +63,7 @@ def read_json(path: Path) -> dict:
         raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
     try:
         check_depth(values, MAX_DEPTH)
-    except SchemaError as e:  # or the text of an error could not name its values
+    except SchemaError as e:  # else the error message could not name its values
         raise DataError(f"{path}: is nested deeper than {MAX_DEPTH} levels; write it again") from e
     if not isinstance(values, dict) or not isinstance(values.get("frames"), list):
         raise DataError(f"{path}: has no list 'frames'; write it again")

@@ -68,7 +68,7 @@ def make_kernel(real, split: bool, lanes: int):
         m = values()
         s = values()
         for start in range(first, end, lanes):
-            # Warp counts negative indices from the end; only where the compiler sees that there are none, does it vectorise
+            # Warp counts negative indices from the end; the compiler vectorises only if it can exclude them
             base = wp.max(start, 0)
             phase = real(base % row) + real(0.5)
             if base + lanes <= end:
@@ -79,7 +79,7 @@ def make_kernel(real, split: bool, lanes: int):
                     s[lane] = f.decayed_square(square[i], g, beta2, rest2)
                     step = lr
                     if wp.static(split):
-                        # place in the row, from its middle, so that no rounding moves it to another
+                        # position in the row, from its middle, so that rounding cannot change the entry
                         place = (phase + real(lane)) / real(row)
                         step = wp.where((place - wp.floor(place)) * real(row) < real(head), head_lr, lr)
                     p[lane] = f.moved(parameter[i], m[lane], s[lane], step, root_correction2, eps)
@@ -142,7 +142,7 @@ def adam_scheduled(
         grad: Its gradient, same shape.
         exp_avg: Running mean of the gradient, same shape, contiguous.
         exp_avg_sq: Running mean of its square, same shape, contiguous.
-        lrs: What `scheduled_lrs` gives, float32, shape [3].
+        lrs: Result of `scheduled_lrs`, float32, shape [3].
         skip: Nothing changes where this is not 0, int32, shape [1].
         head: How many numbers of a row take the first learning rate; 0 for none.
         betas: Decay of the two running means.

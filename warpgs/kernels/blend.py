@@ -72,7 +72,7 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
             total = record()
             for k in range(wp.static(values)):
                 total[k] = totals[lane * count + k]
-            for later in range(1, counts[i]):  # without slots a start may be any number
+            for later in range(1, counts[i]):  # without slots, starts are undefined
                 v = v_slots[starts[i] + later]
                 for k in range(wp.static(values)):
                     total[k] += v[k]
@@ -242,7 +242,7 @@ class _Blend(torch.autograd.Function):
             check_slots(tiles)
         rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
         if save:
-            # all of it as saved tensors: those are freed once the gradient is taken
+            # all as saved tensors, which are freed after the backward pass
             ctx.save_for_backward(projected, backgrounds, rgb, depth, *rest, *tiles.tensors())
             ctx.tile_size, ctx.settings = tiles.size, settings
         ctx.set_materialize_grads(False)
@@ -314,8 +314,8 @@ def blend(
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
-        deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which takes less memory
-            and gives other bits each time; elsewhere it changes nothing.
+        deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less memory
+            but is not repeatable to the bit; elsewhere it has no effect.
         origin: Left and top [px] of the window that the tiles were made for.
         absgrad: Sum magnitudes of the mean's gradient over pixels, too. They are the gradient of the last two values of
             ``projected``, the half sides of the box.

@@ -8,7 +8,7 @@ import warp as wp
 from warpgs.kernels.falloff import STRIP, make_functions
 
 BATCH = 64
-"""Gaussians that are copied together, so that many loads are under way at once."""
+"""Gaussians that are copied together, so that many loads overlap."""
 TOGETHER = 16
 """Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
 
@@ -88,7 +88,7 @@ def make_batches(real, tile_size: int, channels: int):
         while j < count:  # a loop of its own, so that many loads are under way at once
             i = gaussian_ids[wp.max(last - j, 0)]
             if i < 0:
-                break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+                break  # never true; a loop that may end early is not vectorised, which here avoids slow gathers
             b.x[j & bits] = projected[i][0]
             j += 1
         j = int(0)

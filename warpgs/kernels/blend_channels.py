@@ -1,4 +1,4 @@
-"""Compositing of any number of channels: each Gaussian brings D values of its own instead of a colour.
+"""Compositing of any number of channels: each Gaussian has D values instead of a colour.
 
 The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). More channels take several passes over the same
 instances, and no memory but that of the image and the gradient (docs/blend.md, section 3).
@@ -78,7 +78,7 @@ def make_kernels(real, width: int):
     @wp.kernel(enable_backward=False, module=module)
     def add(
         begin: int, v: wp.array2d(dtype=real), counts: wp.array(dtype=int), first: int,
-        # outputs, to which is added
+        # outputs, which the kernel adds to
         v_projected: wp.array2d(dtype=real), v_colors: wp.array2d(dtype=real),
     ):  # fmt: skip
         row = begin + wp.tid()
@@ -120,7 +120,7 @@ def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
 def _groups(
     projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
 ) -> Iterator[_Group]:  # fmt: skip
-    """Yield the groups of all channels, ``width`` in each, in order; each must be done with before the next."""
+    """Yield the groups of all channels, ``width`` in each, in order; use each before the next is requested."""
     count, real = colors.shape[-1], interop.real_of(colors)
     colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
     inputs = [interop.rows(projected, real), interop.view(tiles.counts, wp.int32), interop.rows(colors, real)]
@@ -141,7 +141,7 @@ class _BlendChannels(torch.autograd.Function):
         image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
         found = None
         for group in _groups(projected, tiles, colors, backgrounds, _width(projected, colors.shape[-1], settings.absgrad)):
-            # the first pass gives all that does not depend on the channels
+            # the first pass computes everything that does not depend on the channels
             part = image[..., group.channels]
             whole = part.shape[-1] == group.backgrounds.shape[-1]
             rgb, *rest = composite(
@@ -173,7 +173,7 @@ class _BlendChannels(torch.autograd.Function):
                 break
             saved = [image[..., group.channels], *shared]
             if is_native(projected) and first > 0:
-                # states hold the channels; to keep those of all groups would take memory for each channel
+                # states hold the channels of one group, so that memory does not grow with the number of channels
                 again = composite(
                     group.projected, tiles, group.backgrounds, ctx.settings, save=True, image=image[..., :0]
                 )  # fmt: skip

@@ -168,7 +168,7 @@ def make_forward(real, tile_size: int, channels: int):
             while j < count:  # a loop of its own, so that many loads are under way at once
                 i = gaussian_ids[wp.max(first + j, 0)]
                 if i < 0:
-                    break  # never; but a loop that may end early is not vectorised, and here that would mean slow gathers
+                    break  # never true; a loop that may end early is not vectorised, which here avoids slow gathers
                 mx[j & bits] = projected[i][0]
                 j += 1
             for j in range(batch):
@@ -230,7 +230,7 @@ def make_forward(real, tile_size: int, channels: int):
                         while group < count:
                             o = group & bits
                             group += together
-                            for lane in range(together):  # without a branch, which would be mispredicted once for each Gaussian
+                            for lane in range(together):  # no branch, since it would be mispredicted once for each Gaussian
                                 list[reaching & bits] = o + lane
                                 reaching += hits[o + lane]
                         k = int(0)
@@ -314,14 +314,14 @@ def make_forward(real, tile_size: int, channels: int):
                     ends[o + lane] = end[p + lane]
                     lane += 1
             if across == side and pitch == per_pixel:
-                for k in range(per_row):  # few wide stores: a core waits for the cache lines of no more than 64
+                for k in range(per_row):  # few wide stores: at most 64 of a core can wait for cache lines
                     rgb[o * per_pixel + k] = joined[p * per_pixel + k]
             else:
                 lane = int(0)
                 while lane < across:
                     at_pixel = (first_pixel + lane) * pitch
                     if at_pixel < 0:
-                        break  # never; but vectorised, these stores would be slow scatters
+                        break  # never true; it prevents vectorisation, which would make these stores slow scatters
                     store_channels(at_pixel, wp.max(p + lane, 0), joined, rgb)
                     lane += 1
 

@@ -149,7 +149,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
     @wp.func(inline=True)
     def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[r.Pixels], s: wp.ref[r.Gradient]):
-        """Add what a pixel gives to the gradient of the channels and of the depth."""
+        """Add a pixel's contribution to the gradient of the channels and of the depth."""
         for c in range(wp.static(channels)):
             s.color[c * strip + lane] = at(s.color[c * strip + lane]) + w * at(pixels.g[c * stride + p])
         if wp.static(deep):
@@ -157,7 +157,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
     @wp.func(inline=True)
     def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[r.Gradient]):
-        """Add the magnitudes of what a pixel gives to the gradient of the mean, where they are requested."""
+        """Add the magnitudes of a pixel's contributions to the gradient of the mean, if they are requested."""
         if wp.static(absgrad):
             x = wp.static(channels * STRIP) + lane
             y = wp.static((channels + 1) * STRIP) + lane
@@ -178,7 +178,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
             row = at_int(g.begin[part * batch + j])
             end = at_int(g.end[part * batch + j])
             at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - at(g.x[j])))
-            # Falloffs apart, several strips at a time: each is a long chain of operations that wait for one another.
+            # Falloffs have a loop of their own, several strips at a time, since each is a long chain of dependent operations.
             k = int(0)
             while k < end - row:
                 for lane in range(strip):
@@ -257,7 +257,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
     @wp.func(inline=True)
     def hold(j: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
-        """Keep the sums of a Gaussian until those of others are there, too; half of the places in a strip are added here."""
+        """Keep the sums of a Gaussian until a group is complete; half of the places in a strip are added here."""
         o = (j & group_bits) * (values * half)
         for lane in range(half):
             held.halves[o + lane] = at(s.e1[lane]) + at(s.e1[half + lane])
@@ -280,7 +280,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
     def store(
         j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)
     ):  # fmt: skip
-        """Store the gradient of an instance, which the sums are but for factors that they share."""
+        """Store the gradient of an instance: the sums times factors that they share."""
         o = (j & group_bits) * values
         u11 = at(g.u11[j])
         u22 = at(g.u22[j])
@@ -372,7 +372,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
                 last -= 1
                 b.find_row_values(j & bits, top, gaussians, rows)
                 m.walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
-                # Apart from the walk, because what both need does not fit into 16 registers.
+                # Apart from the walk, since both together would need more than 16 registers.
                 sums = m.sum_up(j & bits, left, gaussians, rows, pixels, shades)
                 m.hold(j & bits, sums, held)
                 j += 1

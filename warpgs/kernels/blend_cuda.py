@@ -21,9 +21,9 @@ from warpgs.runtime.cuda_source import source
 from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128, 256)
-"""Instances that one warp of the backward pass takes: the first number in small images, to have enough warps, the next ones in
-larger images, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each
-multiple of this, so that several warps can share a long list. Multiples of 32."""
+"""Instances for one warp of the backward pass: the first number in small images, for enough warps; the next ones in larger
+images, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each multiple
+of this, so that several warps can share a long list. Multiples of 32."""
 MAX_TILES = (4096, 16384)
 """Tiles up to which the first and the second of these numbers are taken (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
@@ -185,7 +185,7 @@ def make_backward(
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
     name += ".absgrad" * absgrad
     options = {"enable_backward": False, "grid_stride": False, "module": name}
-    # many chunks want many warps at a time more than they want registers, unless channels fill these
+    # many chunks need many warps at a time more than registers, unless channels fill the registers
     small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
     registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 

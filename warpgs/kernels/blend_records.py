@@ -1,4 +1,4 @@
-"""Records of the backward blending kernel in plain Warp: what it knows of pixels, and the gradient of a Gaussian."""
+"""Records of the backward blending kernel in plain Warp: the values of pixels, and the gradient of a Gaussian."""
 
 import functools
 from types import SimpleNamespace
@@ -21,8 +21,8 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
     """Make the records for one scalar type, tile size and number of channels.
 
     A tile lies in columns as wide as a strip, one beside the other; entries of its pixels follow in that order. Vectors are
-    one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other, in a gradient with the
-    two magnitudes behind them where ``absgrad`` asks for these.
+    one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other, in a gradient followed by
+    the two magnitudes if ``absgrad`` is set.
     """
     # Records begin 8 bytes before a cache line, where the compiler puts them: with these, no strip lies in two lines.
     lead_reals = wp.types.vector(2, real)

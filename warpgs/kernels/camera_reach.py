@@ -25,7 +25,7 @@ def make_kernel():
         nearest = wp.length_sq(means[i] - centers[0])
         for j in range(1, centers.shape[0]):
             nearest = wp.min(nearest, wp.length_sq(means[i] - centers[j]))
-        # in float64: logarithms of float32 have other last digits on other processors
+        # in float64, since the rounding of float32's logarithm depends on the processor
         size = wp.sqrt(wp.float64(nearest)) * wp.float64(fraction)
         log_sizes[i] = wp.float32(wp.log(wp.max(size, wp.float64(1e-12))))
 

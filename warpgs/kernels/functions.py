@@ -25,8 +25,8 @@ def make_rotations(real):
 
     @wp.func
     def rotation(q: vec4) -> mat33:
-        # q is a unit quaternion wxyz. Every entry is of second degree, so what rounding takes from its length only scales the
-        # matrix; with ones on the diagonal it would turn it, and a needle's end would move across its width.
+        # q is a unit quaternion wxyz. Every entry is of second degree, so a rounding error of the length only scales the
+        # matrix. With ones on the diagonal it would rotate the matrix, and move a needle's end across its width.
         w = q[0]
         x = q[1]
         y = q[2]
@@ -121,7 +121,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
     @wp.func
     def finite3(v: vec3) -> wp.bool:
-        if wp.static(lanes):  # the other is a call
+        if wp.static(lanes):  # isfinite would be a function call
             return (v[0] - v[0]) + (v[1] - v[1]) + (v[2] - v[2]) == real(0.0)
         return wp.isfinite(v[0]) and wp.isfinite(v[1]) and wp.isfinite(v[2])
 

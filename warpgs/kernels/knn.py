@@ -66,7 +66,7 @@ def make_kernels(real):
         nearest = vec8()
         for j in range(MAX_NEIGHBORS):
             nearest[j] = real(wp.inf)
-        # The own box first: it gives a bound that rules out nearly all others.
+        # The point's own box first: its distances rule out nearly all other boxes.
         home = i // BOX
         for j in range(home * BOX, wp.min((home + 1) * BOX, points.shape[0])):
             if j != i:
@@ -85,7 +85,7 @@ def make_kernels(real):
                     for j in range(at * BOX, wp.min((at + 1) * BOX, points.shape[0])):
                         nearest = insert(nearest, k, wp.length_sq(points[j] - p))
             at += 1
-            while level < top and (at % BOX == 0 or at == starts[level + 1] - starts[level]):  # on from the box around
+            while level < top and (at % BOX == 0 or at == starts[level + 1] - starts[level]):  # leave the enclosing box
                 at = (at + BOX - 1) // BOX
                 level += 1
         total = real(0.0)

@@ -1,7 +1,7 @@
 """Median depth of binned Gaussians: where the transmittance of a pixel falls to one half.
 
-A pass of its own beside `blend`, which pays nothing for it: it ends as soon as each pixel of a tile is half covered. It decides
-alpha by the same operations as blending does, so that both agree to the pixel about what covers a half.
+A separate pass, so that `blend` does not become slower. It ends as soon as each pixel of a tile is half covered. It computes
+alpha by the same operations as blending does, so that both agree exactly on the Gaussian at one half.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Opacity decay: multiply every opacity by a factor, so that only what views keep asking for stays opaque.
+"""Opacity decay: multiply every opacity by a factor, so that only Gaussians that the views support stay opaque.
 
 After Binocular3DGS (Han et al. 2024, section 3.3), which multiplies by 0.995.
 """
@@ -22,7 +22,7 @@ def make_kernel():
         decayed: wp.array(dtype=float),
     ):  # fmt: skip
         i = begin + wp.tid()
-        # in float64: logarithms of float32 have other last digits on other processors
+        # in float64, since the rounding of float32's logarithm depends on the processor
         one, x = wp.float64(1.0), wp.float64(logits[i])
         # f o / (1 - f o) with o = 1 / (1 + exp(-x)); each form where its exponential is at most 1
         value = x + wp.log(factor) - wp.log(one + (one - factor) * wp.exp(wp.min(x, wp.float64(0.0))))

@@ -33,7 +33,7 @@ def make_kernel():
             size = wp.where(cameras[j, 8] > 0.5, distance, depth) / cameras[j, 6]
             if depth >= cameras[j, 7] * distance and size < smallest:
                 smallest = size
-        # in float64: logarithms of float32 have other last digits on other processors
+        # in float64, since the rounding of float32's logarithm depends on the processor
         size64 = wp.where(smallest < wp.inf, wp.float64(smallest) * wp.float64(fraction), wp.float64(0.0))
         log_sizes[i] = wp.float32(wp.log(wp.max(size64, wp.float64(1e-12))))
 

@@ -42,7 +42,7 @@ def make_kernel():
 
     @wp.func
     def at(first: wp.int32, lane: wp.int32) -> wp.int32:
-        """Return an index that the compiler can see is not negative; else it would fetch every lane on its own."""
+        """Return an index that the compiler can see is not negative; else it would load each lane separately."""
         return wp.max(first, 0) + lane
 
     @wp.func
@@ -220,7 +220,7 @@ def make_kernel():
                     for lane in range(LANES):
                         cost = totals[at(total + x, lane)] * share + 0.5 * totals[at(least + x, lane)]
                         scaled = int(wp.min(wp.max(cost, 0.0), 1.0) * levels + 0.5)
-                        # planes past the last are as bad as can be, which leaves paths as they are
+                        # planes past the last have the worst cost, so that paths do not change
                         rounded[lane] = wp.where(plane < planes, scaled, unit)
                     for lane in range(LANES):
                         found[at(into + x, lane)] = wp.int16(rounded[lane])

@@ -124,7 +124,7 @@ def check_round_trip(
     first: Camera, second: Camera, own: np.ndarray, found: np.ndarray, sensitivity: np.ndarray, *, most: float,
     min_parallax: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return where depths of a view lead back to their pixel by the depth that another view has where they are seen.
+    """Return where the round trip through another view's depth returns to the pixel.
 
     Args:
         first: Camera of the view.

@@ -145,7 +145,7 @@ def project_gradients(
     interop.launch(kernel, tasks, arguments, device, cost=cost * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]
-    # in float64, whose rounding no number of threads shows in float32
+    # in float64, so that the float32 result is the same for any number of threads
     return [*found, *(v.sum(1, dtype=torch.float64).to(v.dtype) for v in (v_viewmats, v_Ks))]
 
 

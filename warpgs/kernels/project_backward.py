@@ -45,9 +45,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
 
     @wp.struct
     class ShapeGradient:
-        """Gradients by way of the mean in the image, the factor and the depth of one projected Gaussian."""
+        """Gradients through the projected mean, the factor and the depth of one projected Gaussian."""
 
-        mean: vec3  # less the part that comes by way of the colour
+        mean: vec3  # without the part through the colour
         quat: vec4
         log_scale: vec3
         position: vec3  # of the position in the camera
@@ -170,7 +170,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
 
     @wp.func
     def centered(d: vec4, w: values) -> vec3:
-        """Return the gradient of the mean by way of its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
+        """Return the gradient of the mean through its viewing direction ``d``; ``w`` is that of the basis (section 5)."""
         v_centered = vec3()
         unit = vec3(d[0], d[1], d[2])
         if wp.static(lanes):

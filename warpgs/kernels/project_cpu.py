@@ -1,7 +1,7 @@
 """The forward kernel of `project` for the CPU, in plain Warp.
 
-A task takes `LANES` Gaussians. What is alike for all of them is computed in loops over the lanes, without branches, so that the
-compiler vectorises these; loads, calls of the C library, and colours take one Gaussian at a time.
+A task projects `LANES` Gaussians. Most operations are loops over the lanes without branches, which the compiler vectorises.
+Loads, calls of the C library, and colours are done for one Gaussian at a time.
 """
 
 import functools

@@ -115,14 +115,14 @@ def make_forward(
                 if k < sh_count:
                     color += y[k] * coefficients[n, k]
                     largest = wp.max(largest, wp.max(wp.abs(coefficients[n, k])))
-        if m.finite3(color) and largest <= real(LARGEST_COEFFICIENT):  # the maximum passes a NaN by, the colour has it
+        if m.finite3(color) and largest <= real(LARGEST_COEFFICIENT):  # the maximum ignores a NaN, the colour has it
             for channel in range(3):
                 projected[i, 6 + channel] = wp.max(color[channel], real(0.0))
         else:
             tile_counts[i] = 0
             store(projected, i, vec12())
 
-    # a loop over a grid's strides would hold the arguments in half as many registers again
+    # a grid-stride loop would need half as many registers more for the arguments
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def forward(
         begin: int,
@@ -189,7 +189,7 @@ def make_backward(
     clear_rows = make_native().clear_rows if native else None
     color_backward = make_color(bases).color_backward if native else None
 
-    # three blocks to a multiprocessor: as many registers as it wants
+    # three blocks to a multiprocessor: enough registers
     registers = {"cuda_max_registers": 168, "grid_stride": False} if native else {}
     variant = f".{parameters}.{bases}{'.antialiased' * antialiased}"
     module = f"warpgs.kernels.project.backward.cuda.{real.__name__}.{camera_model}{variant}"

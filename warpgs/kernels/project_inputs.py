@@ -80,7 +80,7 @@ class ProjectInputs(NamedTuple):
 @functools.lru_cache(maxsize=64)
 def nothing(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     """Return a tensor without entries [...], the same one each time: to ask for one takes 5 us."""
-    with torch.inference_mode(False):  # one of inference mode could not be saved for a backward pass
+    with torch.inference_mode(False):  # an inference-mode tensor could not be saved for a backward pass
         return torch.empty(shape, dtype=dtype, device=device)
 
 

@@ -111,7 +111,7 @@ def _on_cpu(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small
     """Return the sums of `scanline_costs`; a number of planes that is a multiple of `scanlines_cpu.LANES` saves a copy."""
     height, width, planes = costs.shape
     more = -planes % scanlines_cpu.LANES
-    if more:  # planes as bad as the worst: no path is better for them
+    if more:  # extra planes with the worst cost, which no path prefers
         costs = torch.nn.functional.pad(costs, (0, more), value=int(costs.max()))
     total, padded = torch.empty_like(costs, memory_format=torch.contiguous_format), planes + more
     flat = [interop.view(t.contiguous().view(-1), wp.int16) for t in (costs, total)]

@@ -18,7 +18,7 @@ def make_kernel():
 
     @wp.func
     def at(first: wp.int32, lane: wp.int32) -> wp.int32:
-        """Return an index that the compiler can see is not negative; else it would fetch every lane on its own."""
+        """Return an index that the compiler can see is not negative; else it would load each lane separately."""
         return wp.max(first, 0) + lane
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)

@@ -57,8 +57,8 @@ def make_functions(real):
     def at(first: wp.int32, lane: wp.int32) -> wp.int32:
         """Return an index that the compiler can see is not negative.
 
-        Warp counts negative ones from the end of the array. Where that cannot be ruled out, the loads of neighbouring lanes
-        are not known to be neighbours, and each lane is fetched on its own.
+        Warp counts negative ones from the end of the array. Where the compiler cannot exclude negative ones, it loads each lane
+        separately.
         """
         return wp.max(first, 0) + lane
 

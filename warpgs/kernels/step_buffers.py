@@ -1,6 +1,6 @@
 """Bookkeeping of a captured step: it reads its settings at the start, and stores its loss at the end.
 
-In torch these are some twenty kernels on a handful of numbers each, a tenth of a step's time.
+Torch would launch about twenty kernels on a few numbers each, a tenth of a step's time.
 """
 
 import functools
@@ -186,12 +186,12 @@ def end_step(
     Args:
         loss: Float32, shape []. Where it is not finite, ``stop`` becomes NOT_FINITE.
         mse: Mean squared error, float32, shape [].
-        counter: Number of the step, int64, shape [1]; one more where the batch goes on.
+        counter: Number of the step, int64, shape [1]; increased by one if the batch continues.
         stop: 0, or the reason to stop, int32, shape [1].
         history: Loss and mean squared error of each step, float32, shape [B, 2].
 
     Returns:
-        True where the batch goes on, bool, shape [1].
+        True if the batch continues, bool, shape [1].
     """
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
     inputs = [

@@ -48,7 +48,7 @@ class Tiles:
     counts: torch.Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
     tile_ids: torch.Tensor
-    """Tile of each instance, int32, shape [M]; the number of tiles where none was found after all."""
+    """Tile of each instance, int32, shape [M]; the number of tiles if the kernel found no such tile."""
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
     visible: int = 0
@@ -65,8 +65,8 @@ class Visible(NamedTuple):
     sums: torch.Tensor
     """Running sums of `running_counts`, int64, shape [S]."""
     capacity: int
-    """Number of visible Gaussians to allocate for, at most the number of all. Where there are more, which the last of the sums
-    tells, the lists must not be used."""
+    """Number of visible Gaussians to allocate for, at most the number of all. If there are more, which the last of the sums
+    shows, the lists must not be used."""
 
 
 @dataclass(frozen=True)
@@ -122,14 +122,14 @@ def step_bytes(sizes: StepSizes) -> Needs:
     ranges = 2 * FLOAT * columns * rows + (FLOAT + 8) * sizes.count  # of each tile; first slots and ends of each Gaussian
     sorting = (2 * 2 * FLOAT + 2 * 8) * sizes.count  # depths and order twice, two running sums of int64
     lists, kept = LIST_BYTES * sizes.instances, (LIST_BYTES - FLOAT) * sizes.instances
-    waiting = 0 if sizes.chunked else ranges + kept  # nothing of a chunk waits for the loss
+    waiting = 0 if sizes.chunked else ranges + kept  # no buffer of a chunk is kept for the backward pass
     return {BINNING: ranges + sorting + lists, LOSS: waiting, BLENDING: ranges + kept, SAMPLING: ranges + lists}
 
 
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
     """Raise ResourceError where the instances exceed the budget, or what kernels can number."""
     needed = total * BYTES_PER_INSTANCE
-    # asking what is free costs 0.1 ms or more: not worth it for a twentieth of the machine
+    # a query of the free memory takes at least 0.1 ms; small requests, below a twentieth of the memory, skip it
     countable = total <= MAX_INSTANCES
     if countable and budget_bytes is None and needed < installed_bytes(device) // 20:
         return
@@ -166,7 +166,7 @@ def _depth_order(
         if not sums_fit(count, tiles):
             many = torch.stack([(counts > 0).sum(), counts.sum(dtype=torch.int64)])
             _check_total(*reversed(many.tolist()), device, tiles, memory.budget)
-        # One read from the device, before the sorts, tells how many are visible and how many tiles they touch.
+        # One read from the device, before the sorts, returns the numbers of visible Gaussians and of touched tiles.
         packed = running_counts(counts, real, memory.allocator)
         visible, total = split_sum(int(packed[-1]), count)
         _check_total(total, visible, device, tiles, memory.budget)
@@ -245,7 +245,7 @@ def bin_tiles(
         ends = _slot_ends(order, counts, visible, make_kernels(real, native).ordered_counts, allocator)
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
         owners = allocator.workspace((total if slotted else 0,), torch.int32, device)
-        if memory.capacity is not None and not native:  # the kernel of CUDA writes what is left of the capacity
+        if memory.capacity is not None and not native:  # the CUDA kernel fills the unused capacity
             keys[:total].fill_(no_tile)
         overflow = starts if memory.capacity is None else memory.overflow
         inputs = [

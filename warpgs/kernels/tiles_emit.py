@@ -8,7 +8,7 @@ from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 
 EACH = 4
-"""Items that a thread of short kernels takes on CUDA: to load one alone, it would wait longer than it works."""
+"""Items of a thread of short kernels on CUDA: with a single item, waiting for its load would take longer than the work."""
 
 
 @functools.cache
@@ -179,11 +179,11 @@ def make_emit(real, slotted: bool):
             if row_begin < batch + 32 and row_end > batch and rows[1] > rows[0]:
                 slot += written
             batch += 32
-        # Two compilations of one formula may round apart, and then a margin tile is counted but not found again.
+        # Two compilations of one formula may round differently; then a tile at the margin is counted but not found again.
         while slot < end:
             write(slot, no_tile, i, keys, slots, owners)
             slot += 1
-        if j < count:  # what is left of the capacity is no tile's
+        if j < count:  # slots of the unused capacity belong to no tile
             slot = j + int(wp.min(ends[count - 1], wp.int64(capacity)))
             while slot < capacity:
                 keys[slot] = no_tile

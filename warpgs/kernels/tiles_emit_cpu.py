@@ -1,6 +1,6 @@
 """The kernel in plain Warp that writes the (Gaussian, tile) instances on a CPU.
 
-A task takes `LANES` Gaussians, as in `project_cpu`: their rows and columns are found in loops that the compiler vectorises.
+As in `project_cpu`, a task has `LANES` Gaussians; loops that the compiler vectorises find their rows and columns.
 """
 
 import functools
@@ -102,7 +102,7 @@ def make_emit(real, slotted: bool):
                     to += 1
                     key += 1
                 slot[lane] = to
-        # Two compilations of one formula may round apart, and then a margin tile is counted but not found again.
+        # Two compilations of one formula may round differently; then a tile at the margin is counted but not found again.
         for lane in range(used):
             to = slot[lane]
             while to < end[lane]:

@@ -29,7 +29,7 @@ class DistanceGrid:
     truncation: float
     """Largest distance from a surface that is stored [u]."""
     distances: torch.Tensor
-    """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; of no meaning at weight 0."""
+    """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
     weights: torch.Tensor
     """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
 
@@ -95,7 +95,7 @@ def make_kernels(real):
 
     @wp.func
     def depth_at(depth: wp.array2d(dtype=real), u: real, v: real, row: wp.int32, column: wp.int32, most: real) -> real:
-        """Return the depth between four pixels where they are of one surface, else that of the pixel itself."""
+        """Return the depth interpolated between four pixels where they show one surface, else that of the pixel itself."""
         nearest = depth[row, column]
         left = int(wp.floor(u - real(0.5)))
         top = int(wp.floor(v - real(0.5)))
@@ -206,7 +206,7 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
         In [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where nothing is known.
 
     Raises:
-        UsageError: The camera is no pinhole.
+        UsageError: The camera is not a pinhole.
     """
     check_pinhole(camera)
     real = interop.real_of(depth)
@@ -229,7 +229,7 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
     Raises:
         ResourceError: The grid has more points than kernels can number.
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        UsageError: The camera is no pinhole.
+        UsageError: The camera is not a pinhole.
         ValueError: A shape or device disagrees.
     """
     check_pinhole(camera)
@@ -265,7 +265,7 @@ def gather_colors(
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        UsageError: The camera is no pinhole.
+        UsageError: The camera is not a pinhole.
         ValueError: A shape or device disagrees.
     """
     check_pinhole(camera)

@@ -1,6 +1,6 @@
-"""Agreement of views on depth: what other views see into, and none of them sees at that depth, is left out of a mesh.
+"""Agreement of views on depth: points in front of the surfaces of other views, which no other view confirms, are left out.
 
-A fit of few views pays for depth only where two of them look. If only one view sees a surface, such as beside an occluding
+A fit of few views constrains depth only where two of them look. If only one view sees a surface, such as beside an occluding
 edge, its depth is unconstrained.
 """
 
@@ -87,9 +87,9 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
 def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
     """Return how far the points of a depth map [H, W] lie from the surface that another view has there, as a fraction of depth.
 
-    The nearest of the four depths around counts: what a pixel covers of a slanted surface has several. Infinite where the pixel
-    has no depth, outside of the other image and where all four have none. Without a product of matrices: its bits would depend
-    on the processor.
+    Of the four depths around, the nearest to the point counts, since depth varies within a pixel on a slanted surface. Infinite
+    where the pixel has no depth, outside of the other image and where all four have none. Without a product of matrices: its
+    bits would depend on the processor.
     """
     rotation, translation = relative_pose(camera, other.camera)
     height, width = depth.shape

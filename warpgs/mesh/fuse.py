@@ -42,7 +42,7 @@ class MeshOptions:
         """Check the options, before any view is rendered.
 
         Raises:
-            UsageError: One is out of its range, or two say the same.
+            UsageError: One is out of its range, or two exclude each other.
         """
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")

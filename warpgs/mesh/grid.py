@@ -1,4 +1,4 @@
-"""Choice of the grid: where the surfaces are, how fine they can be told apart, and the memory that takes."""
+"""Choice of the grid: its extent, its voxel size, and its memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
 TRUNCATION = 4.0
 """Truncation in voxels."""
 FENCE = 3.0
-"""Interquartile ranges outside the quartiles from where a coordinate is far out (Tukey, 1977: Exploratory Data Analysis)."""
+"""Multiples of the interquartile range outside the quartiles beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
+Data Analysis)."""
 QUANTILES = (0.005, 0.995)
 """Quantiles of the surface points along an axis between which the grid lies, if the fences are wider."""
 GRID_BYTES = 8
@@ -73,7 +74,7 @@ def plan_grid(
     Args:
         points: Points of the surfaces [u], shape [N, 3].
         footprints: Width of a pixel at each [u], shape [N].
-        voxel: Distance of the grid points [u]; None for what ``resolution`` gives.
+        voxel: Distance of the grid points [u]; None to derive it from ``resolution``.
         resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
             what the median pixel shows.
 

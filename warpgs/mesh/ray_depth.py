@@ -1,7 +1,7 @@
-"""Depth of a surface along each ray: where the Gaussians that make up a pixel are densest, and how much of them is there.
+"""Depth of a surface along each ray: where the Gaussians of a pixel are densest, and the fraction of their weight there.
 
-The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. A ray meets each Gaussian
-somewhere else: where its density along the ray is largest.
+The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. So each Gaussian has the depth
+at which its density along the ray is largest.
 """
 
 from __future__ import annotations

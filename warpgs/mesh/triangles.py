@@ -10,7 +10,7 @@ from warpgs.scene import Mesh
 
 MAX_JUMP = 1.1
 """Largest difference of the distances at two neighbouring grid points, over the truncation, that a surface may lie between.
-With less, what is seen at a grazing angle is left out; with more, skirts hang behind the edges of what a view sees. Chosen, as
+With less, surfaces at grazing angles are left out; with more, false triangles extend behind depth edges. Chosen, as
 the truncation was, on a demo scene of another seed than the one that is reported (docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
     "no surface inside the grid; give another --voxel (larger; smaller where it is near the size "
@@ -30,7 +30,7 @@ def extract(grid: DistanceGrid) -> Mesh:
     """Return the surface where distances are 0, without colours.
 
     It is left open where a view saw nothing: a triangle stays only where both grid points beside each of its vertices were
-    seen. Where distance jumps from before one surface to behind another, as at the edge of what a view sees, there is none.
+    seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
 
     Args:
         grid: The grid.
@@ -98,7 +98,7 @@ def decimate(mesh: Mesh, max_faces: int) -> Mesh:
         return mesh
     import pyvista
 
-    # around the middle and of size 1, since VTK decides in float32
+    # centred and scaled to size 1, since VTK computes in float32
     middle = mesh.vertices.mean(0)
     size = float(np.abs(mesh.vertices - middle).max()) or 1.0
     data = pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces)

@@ -1,4 +1,4 @@
-"""Words on photographs and their poses: why one has none, and what to photograph next."""
+"""Advice on photographs and their poses: why one has no pose, and what to photograph next."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from warpgs.poses.record import record_of, write_record
 from warpgs.poses.video import is_video, write_frames
 
 MIN_PHOTOGRAPHS = 3
-"""Fewest photographs: of two, nothing checks the focal length and the depths that they give each other."""
+"""Fewest photographs: with two, nothing checks the focal length and the depths."""
 FRAMES = 60
 """Default number of frames from a video."""
 LINKS = 6
@@ -46,7 +46,7 @@ def needs_poses(path: Path) -> bool:
         if is_video(path):
             return True
         return path.is_dir() and all(r.probe(path) is None for r in all_readers()) and bool(find_photographs(path))
-    except OSError:  # who reads it as a scene says what is wrong
+    except OSError:  # the scene reader reports the error
         return False
 
 
@@ -173,7 +173,7 @@ def _something_else(folder: Path) -> str:
 
 
 def _check(source: Path, out: Path, allow_outside: bool) -> None:
-    """Raise an error for a source or a target that cannot be, before any work."""
+    """Raise an error for an unusable source or target, before any work."""
     try:
         if not is_video(source) and not source.is_dir():
             there = NOT_REGULAR if source.exists() else "does not exist"

@@ -1,7 +1,7 @@
-"""HEIC photographs, as phones take them: coded again as JPEG by a process of its own.
+"""HEIC photographs, as phones take them: coded again as JPEG by a separate process.
 
-pi-heif (libheif and libde265, LGPL) reads them. A file that is broken on purpose can end the process that it reads in, so it is
-called in another one, once for all photographs.
+pi-heif (libheif and libde265, LGPL) reads them. A malicious file can crash the process that reads it, so one separate process
+reads all photographs.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ def main(path: str) -> None:
         answer(json.dumps({"file": i}))
         try:
             copy = _coded_again(Path(source), job["max_pixels"])
-        except Exception as e:  # decoders raise a dozen types on foreign bytes; the caller names the file
+        except Exception as e:  # decoders raise a dozen types on malformed files; the caller names the file
             answer(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
             return
         write_bytes(Path(target), copy)

@@ -147,7 +147,7 @@ def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
                 yield json.loads(line)
     except ProcessFailed as e:
         if disk_is_full(folder, e.errors):
-            # the work lies in a temporary folder beside the scene, whose name says nothing to the user
+            # the work folder is temporary, and its name means nothing to the user
             raise ResourceError(
                 f"{folder.parents[1]}: its disk is full, so pycolmap cannot write features and matches. Free some disk space, "
                 "or choose another --out"

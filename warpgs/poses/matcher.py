@@ -35,9 +35,10 @@ MAX_CHANNELS = 256
 MIN_COSINE = 0.82
 """Smallest cosine of the descriptors of a match: that of XFeat (Potje et al. 2024)."""
 TURN_SIDE, TURN_KEYPOINTS = 512, 512
-"""Longer side [px] and keypoints of a photograph when it is found out how photographs are turned to each other."""
+"""Longer side [px] and number of keypoints of a photograph for the search of rotations between photographs."""
 TURN_GAIN = 2
-"""Matches with a turned photograph over those with it upright from which it counts as turned: networks know no turns."""
+"""Ratio of matches with a photograph rotated to those with it upright, above which it counts as rotated: networks are not
+rotation invariant."""
 WHOLE = 2047
 """Factor of descriptors before they are rounded: sums of their products stay below 2^24, where float32 is exact."""
 

@@ -1,4 +1,4 @@
-"""Frames of a video that show most: evenly spaced in time, the sharpest of each stretch."""
+"""Frames of a video: the sharpest of each of equally long parts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from warpgs.runtime.native_output import hidden_stderr
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 """Endings of video files."""
 SHARPNESS_SIDE = 640
-"""Longer side at which frames are compared for sharpness [px]: what noise and compression add is averaged away."""
+"""Longer side at which frames are compared for sharpness [px]: small enough to average out noise and compression artefacts."""
 MAX_FRAMES = 100_000
 """Longest video that is read [frames]: an hour at 25 a second."""
 MAX_FRAME_PIXELS = 2**26
@@ -40,7 +40,7 @@ def _frames(path: Path) -> Iterator[np.ndarray]:
     import cv2
 
     _check_container(path)
-    with utf8_name(path) as name, hidden_stderr():  # of a broken file OpenCV and FFmpeg say the same, in their own words
+    with utf8_name(path) as name, hidden_stderr():  # for a broken file, both would print the error, too
         capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():

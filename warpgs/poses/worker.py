@@ -1,7 +1,7 @@
 """The process that calls pycolmap: features, matches, poses. It reads one job and prints lines of JSON.
 
-It is a process of its own for three reasons: pycolmap ends the process it runs in where something is wrong inside of it, cannot
-be interrupted, and its wheels contain code under the GPL (decision 017). Nothing else in warpgs imports it.
+It is a separate process for three reasons: pycolmap may end its own process on an internal error, it cannot be interrupted,
+and its wheels contain code under the GPL (decision 017). No other module of warpgs imports pycolmap.
 
 A line holds ``progress``, a text for the user, or ``result``, the last one.
 """
@@ -60,7 +60,7 @@ def extract(pycolmap: Any, job: dict[str, Any]) -> None:
     options = pycolmap.FeatureExtractionOptions()
     options.num_threads, options.use_gpu, options.sift.peak_threshold = job["threads"], False, PEAK
     arguments = (job["database"], job["images"])
-    step = max(job["threads"], len(job["names"]) // 20)  # each thread takes one photograph
+    step = max(job["threads"], len(job["names"]) // 20)  # each thread processes one photograph
     for begin in range(0, len(job["names"]), step):
         _say(progress=f"finding features: photograph {begin + 1} of {len(job['names'])}")
         mode, reader = pycolmap.CameraMode.AUTO, pycolmap.ImageReaderOptions()
@@ -146,11 +146,11 @@ def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
 def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
     """Return the models that grow photograph by photograph from a good pair; a kept focal length is EXIF's."""
     options = pycolmap.IncrementalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1  # else the last digits depend on which thread is done first
+    options.num_threads = options.mapper.num_threads = 1  # else the rounding depends on which thread finishes first
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
     options.min_model_size, options.min_num_matches = 2, MIN_INLIERS
     options.mapper.abs_pose_min_num_inliers = MIN_INLIERS
-    options.triangulation.ignore_two_view_tracks = False  # most points of a few photographs are seen by two of them
+    options.triangulation.ignore_two_view_tracks = False  # with few photographs most points are seen by only two
     options.ba_refine_focal_length = options.ba_refine_extra_params = not keep_focal
     registered = [2]
 

@@ -19,7 +19,7 @@ from warpgs.runtime.folders import cache_home, private_folder
 from warpgs.runtime.terminal import say
 
 CODE = 1
-"""Version of the code between image and maps; it counts up whenever the same inputs give other maps."""
+"""Version of the code between image and maps; increased whenever the same inputs would produce other maps."""
 
 
 def cache_folder() -> Path:
@@ -28,8 +28,8 @@ def cache_folder() -> Path:
     Without a home folder it is a private folder of this process, with a line on stderr.
 
     Raises:
-        ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE lies in one that is
-            not known.
+        ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE names an unknown home
+            folder.
     """
     if own := os.environ.get("WARPGS_CACHE"):
         asked = Path(os.path.expanduser(own))  # as a shell does, but not within quotes

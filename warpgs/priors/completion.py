@@ -7,7 +7,8 @@ import numpy as np
 from warpgs.priors.opencv import single_threaded_opencv
 
 SMOOTHNESS = (1e2, 1e4, 1e6)
-"""Strengths of the smoother, tried in turn; a stronger one reaches farther, and a pixel takes the first that reaches it."""
+"""Strengths of the smoother, tried in turn; a stronger one reaches farther, and the first that reaches a pixel is used
+there."""
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which neighbours stop having one depth, times e."""
 MIN_FRACTION = 1e-3

@@ -44,7 +44,7 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
         Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
 
     Raises:
-        DataError: The output is no map, or depth that is not positive.
+        DataError: The output is not a map, or depth that is not positive.
     """
     output = network.run(preprocessing.prepare(network, image))
     shape = output.shape

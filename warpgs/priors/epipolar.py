@@ -53,11 +53,11 @@ class PairDepth:
     """Depths of N pixels of a view from their matches in a second view."""
 
     depth: np.ndarray
-    """z-depth in the first view [u], float64, shape [N]; NaN where the geometry has no answer."""
+    """z-depth in the first view [u], float64, shape [N]; NaN if undefined."""
     residual: np.ndarray
     """Distance of the match from the epipolar line [px], shape [N]."""
     sensitivity: np.ndarray
-    """|dz/dpx| [u/px], shape [N]; infinite where a slide of half a pixel leads behind a camera or to infinity."""
+    """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
     valid: np.ndarray
     """True where both depths are positive, the parallax suffices, the nearest point of the line is in the second image and all
     is finite."""
@@ -88,7 +88,7 @@ def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, 
     is the second camera's centre in the frame of the first.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is not a pinhole.
     """
     check_pinhole(first)
     check_pinhole(second)
@@ -183,7 +183,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
     some = valid.any(0)
     if mode in ("least_sensitive", "nearest_first"):
-        # infinite sensitivity of a valid candidate still comes before an invalid one
+        # a valid candidate of infinite sensitivity still sorts before an invalid one
         rank = np.minimum(sensitivities, np.finfo(float).max) if mode == "least_sensitive" else np.zeros(depths.shape)
         best = np.argmin(np.where(valid, rank, np.inf), axis=0)[None]
         depth, sensitivity = (np.take_along_axis(a, best, 0)[0] for a in (depths, sensitivities))

@@ -93,7 +93,7 @@ def _backbone() -> torch.nn.Module:
 def build_matcher() -> torch.nn.Module:
     """Return XFeat in torch, ready to infer: an image [1, 3, h, w] to keypoints [K, 2], scores [K] and descriptors [K, 64].
 
-    Sides are multiples of 32 px. Keypoints are pixels of the input, centres at +0.5; a score of 0 is no keypoint.
+    Sides are multiples of 32 px. Keypoints are pixels of the input, centres at +0.5; a score of 0 means no keypoint.
     """
     import torch
     from torch.nn.functional import grid_sample, interpolate, max_pool2d, normalize, pixel_shuffle

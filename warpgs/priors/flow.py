@@ -79,7 +79,7 @@ def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, in
     h, w = flow.shape[:2]
     if (w, h) == (width, height) == (second or (width, height)):
         return flow
-    # in positions, not steps, so that images of two sizes come out right
+    # in positions, not offsets, so that images of two sizes are handled correctly
     x, y = np.meshgrid((np.arange(width) + 0.5) * w / width, (np.arange(height) + 0.5) * h / height)
     at = np.stack([x, y], 2)
     found = at + cv2.remap(flow, (at - 0.5).astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,7 +1,7 @@
-"""Given depth brought to the scene's units, checked against what views confirm, and put in the place of searched depth.
+"""Given depth, converted to the scene's units, checked against consistent depth, and used instead of the sweep's depth.
 
-Derived in docs/decisions/022-given-depth.md. Lengths are compared with the references of their view: searched depth that other
-views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to them.
+Derived in docs/decisions/022-given-depth.md. Depths are compared with the references of their view: depth of the sweep that
+other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to them.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from warpgs.scene import DEPTH_KINDS, GivenDepth, PointCloud, View, ViewDepth
 MIN_OVERLAP = 50
 """Fewest references of a view that a map is compared with or fitted to."""
 MAX_RATIO = 1.25
-"""Largest ratio of metric depth to its references, or of these to it, in the median of a view; beyond it they contradict."""
+"""Largest median ratio of metric depth to its references, or its inverse, in a view; a map beyond it is rejected."""
 NEAR = 0.05
 """Relative difference of depths up to which they count as one surface."""
 GOOD, MIN_GOOD = 0.1, 0.5
 """Largest relative difference from a reference of a good value of a fitted map, and the least fraction of good values."""
 EXACT = 0.015
-"""Median difference up to which a fitted map is taken for as good as a metric one; a network's is larger."""
+"""Median difference up to which a fitted map counts as good as a metric one; that of a network is larger."""
 MIN_CONFIDENCE = 0.5
 """Confidence from which a given depth may place Gaussians."""
 ROUNDS = 20
@@ -34,7 +34,7 @@ ROUNDS = 20
 NEIGHBORS = 4
 """Nearest other views that a map is compared with."""
 MAX_POINTS = 2**18
-"""Most pixels of a map that are compared; of more, a grid, whose pixels stand for those beside them."""
+"""Most pixels of a map that are compared; larger maps are subsampled on a grid."""
 SHOWN = 5
 """Views that a message names."""
 

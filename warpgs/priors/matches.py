@@ -65,7 +65,7 @@ def agreeing_matches(
         b: The second view.
         first: Features of the first.
         second: Features of the second.
-        min_angle: Smallest angle between the two rays [deg]; 0 where places are compared and their depth does not count.
+        min_angle: Smallest angle between the two rays [deg]; 0 if only the matches are used, not their depth.
 
     Returns:
         The rows of both features of each match, int, shape [N, 2]; and its point [u], shape [N, 3].

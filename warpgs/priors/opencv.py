@@ -25,7 +25,7 @@ def single_threaded_opencv() -> Iterator[None]:
 
 
 def without_ipp() -> None:
-    """Turn IPP off for the calling thread: it takes other instructions, with other last digits, on another processor."""
+    """Turn IPP off for the calling thread: its instructions, and so their rounding, depend on the processor."""
     import cv2
 
     cv2.ipp.setUseIPP(False)

@@ -1,7 +1,7 @@
 """Faults of photographs that explain a bad model: blur, and light or colours that differ from photograph to photograph.
 
-Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So it does not count
-what a photograph shows, only how (docs/scenes.md, "Photograph checks").
+Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So differences in content
+do not count, only those in blur and colour (docs/scenes.md, "Photograph checks").
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ MAX_FEATURES = 1000
 MAX_PIXELS = 100_000
 """Number of pixels to which a photograph is reduced for the search of features; sharpness is measured at its full size."""
 FINE, COARSE = 1.0, 2.0
-"""Standard deviations of the Gaussian filters that part fine detail from coarse [px]."""
+"""Standard deviations of the Gaussian filters that separate fine from coarse detail [px]."""
 PATCH = 15
 """Side of the square around a match in which detail and colour are measured [px]."""
 NOISE = 0.1 / 255**2

@@ -101,7 +101,7 @@ def read_side_file(model: Path) -> dict:
     """Return the entries of the JSON file beside a model; none without such a file.
 
     Raises:
-        DataError: The file is no JSON object, or holds a key or a value that means nothing.
+        DataError: The file is not a JSON object, or has an unknown key or value.
     """
     path = side_file(model)
     if not os.path.lexists(path):

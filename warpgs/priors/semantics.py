@@ -96,7 +96,7 @@ def _falloff(edge: np.ndarray) -> np.ndarray:
     if not edge.any():
         return np.zeros(edge.shape, np.float32)
     distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    squares = np.rint(distance.astype(float) ** 2)  # whole numbers, whatever the last digits of their roots
+    squares = np.rint(distance.astype(float) ** 2)  # whole numbers, without the rounding errors of their roots
     return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * squares).astype(np.float32)
 
 

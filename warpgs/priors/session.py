@@ -113,7 +113,7 @@ def _checked(path: Path, data: bytes, session: Any) -> Network:
     """Return the network of a session that has one input and one output; DataError for others."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
     for what, found in (("input", inputs), ("output", outputs)):
-        names = ", ".join(f.name for f in found)  # read in any case: one that is not UTF-8 fails here
+        names = ", ".join(f.name for f in found)  # read even if unused: names that are not UTF-8 fail here
         if len(found) != 1:
             raise DataError(f"{path}: it has {len(found)} {what}s ({names}); one is needed. Export it with that one alone")
     if inputs[0].type not in TYPES:

@@ -77,7 +77,7 @@ def _backend(
     if device.type == "cuda":
         needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())
         smallest = min(min(v.image.shape[:2]) for v in views.values())
-        # not by what is free now: a fit that is continued must find the same depths again
+        # not by the free memory: a resumed fit must find the same depths again
         if needed > GPU_FRACTION * installed_bytes(device):
             notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_FRACTION)} of memory for it")
         elif smallest > config.window // 2:  # torch mirrors no border wider than the image

@@ -18,8 +18,8 @@ NOISE = (2 / 255) ** 2
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
 UNIT = 4096
-"""Cost 1 in the 16-bit integers that volumes hold: to touch memory for the first time takes as long as to compute what
-goes there, and this is half of float32's."""
+"""Cost 1 in the 16-bit integers of cost volumes: they need half the memory of float32, and first access to memory takes as long
+as the computation."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
 PLANES_AT_ONCE = 16
@@ -128,5 +128,5 @@ def gray_of(view: View) -> np.ndarray:
 
 def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
     """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
-    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # float32's exp has other last digits on other processors
+    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # the rounding of float32's exp depends on the processor
     return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)

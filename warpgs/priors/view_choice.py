@@ -71,7 +71,7 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
         overlap[i] = (seen * close).mean(1)
         matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
         matching[i, i] = 0
-    return Sight(np.round(overlap, 9), np.round(matching, 9))  # last digits must not decide
+    return Sight(np.round(overlap, 9), np.round(matching, 9))  # rounding errors must not decide
 
 
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:

@@ -43,7 +43,7 @@ def check_arrays(camera: Camera) -> None:
 
 
 def _check_type(name: str, array: Any) -> None:
-    """Raise TypeError where a value is no array of real numbers."""
+    """Raise TypeError where a value is not an array of real numbers."""
     if not isinstance(array, (np.ndarray, torch.Tensor)):
         raise TypeError(
             f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"

@@ -85,7 +85,7 @@ class _BlendChunked(torch.autograd.Function):
             for image, part in zip(images, parts):
                 image[:, rows, columns] = part
             ctx.windows.append(settings.window)
-        # the inputs too, so that torch notices where they are changed before the gradient is taken
+        # the inputs too, so that torch detects changes to them before the backward pass
         ctx.save_for_backward(projected, backgrounds, colors, *inputs)
         ctx.frame = frame
         ctx.set_materialize_grads(False)

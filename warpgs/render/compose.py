@@ -1,4 +1,4 @@
-"""Project, bin, blend: the one way from Gaussians to images.
+"""Project, bin, blend: the steps from Gaussians to images.
 
 `rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. Camera
 model, channels, cut-offs and window of a render are in `RenderSettings` and `ProjectInputs`, and nowhere else.
@@ -54,7 +54,7 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
     """Return what a camera holds under a name as a tensor [C, ...], one for each of the poses ``like`` [C, 4, 4].
 
     Raises:
-        ValueError: It is neither one for all nor one for each.
+        ValueError: The number of entries is neither 1 nor that of the poses.
     """
     tensor, cameras = as_batch(array, like, axes), like.shape[0]
     own = list(tensor.shape[1:])

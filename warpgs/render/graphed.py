@@ -1,9 +1,9 @@
 """Rasterizer calls that repeat: on CUDA their kernels are captured as graphs, and replayed.
 
-At training sizes the host takes longer to launch twenty kernels than the GPU to run them. A loop repeats its calls: the same
-tensors, with other values in them, and another camera. Its memory requests repeat, too, and so torch gives it the same
-addresses. A graph that was captured at certain addresses is replayed where a call gets those again; elsewhere the kernels are
-launched one by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
+At training sizes, launching twenty kernels takes the host longer than running them takes the GPU. A training loop calls the
+rasterizer with the same tensors, new values and another camera. Its memory requests repeat as well, so torch allocates at the
+same addresses. A captured graph is replayed if a call has the addresses of the capture; otherwise the kernels are launched one
+by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from warpgs.runtime.derivatives import first_order
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
-"""Equal calls in a row from which on kernels are captured. Where a capture did not pay, the number doubles for the next."""
+"""Equal calls in a row from which on kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
 """Capacity for visible Gaussians and instances, as a multiple of the most that such calls were seen to have."""
 SPARE = 1024
@@ -91,7 +91,7 @@ class GraphedRasterizer:
         self._total_ready = torch.cuda.Event() if on_gpu else None
         self._table = wp.zeros(3, dtype=wp.uint64, device="cpu", pinned=on_gpu)
         self._addresses = self._table.numpy()
-        # by proxy, so that this object is freed, and its graphs with it, as soon as nobody holds it
+        # by proxy, so that this object and its graphs are freed with the last reference
         functions = [
             functools.partial(f, weakref.proxy(self))
             for f in (
@@ -116,7 +116,7 @@ class GraphedRasterizer:
             backgrounds: Colour behind everything, shape [C, 3]; None for black.
         """
         of_cameras = [t.contiguous() for t in inputs[5:8]]
-        self._addresses[:] = [t.data_ptr() for t in of_cameras]  # nobody reads them any more: the last call was waited for
+        self._addresses[:] = [t.data_ptr() for t in of_cameras]  # no longer read: the last call has finished
         (cameras, *projection), _ = self._forward_project(*inputs[:5])
         if self._total_ready is not None:
             self._total_ready.record(self._stream)
@@ -133,7 +133,7 @@ class GraphedRasterizer:
             images = _blended(projected, backgrounds, self, projection[1], images, block, passes)
             count_passes(projected, passes)
         if self._total_ready is not None:
-            self._total_ready.synchronize()  # not before: the device goes on meanwhile
+            self._total_ready.synchronize()  # not before, so that the device works meanwhile
         self.needed = Capacity(*split_sum(int(self._total[0]), projection[1].numel()))
         if not self.needed.within(self.capacity):
             return None
@@ -152,13 +152,13 @@ class GraphedRasterizer:
         cameras = allocator.output(((25 + self._coefficients) * self.cameras,), torch.float32, self.device)
         fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
-        self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # kept, since it is used up within the call
+        self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # no copy: used only within the call
         with interop.stream_of(self.device):
             wp.copy(self._host_total, interop.view(self._sums[-1:], wp.int64).array())
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
-        overflow = allocator.workspace((1,), torch.int32, self.device)  # not read: the sums tell before
+        overflow = allocator.workspace((1,), torch.int32, self.device)  # not read, since the sums show it first
         memory = InstanceMemory(
             None, self.capacity.instances, overflow, allocator, Visible(self._sums, self.capacity.visible)
         )  # fmt: skip
@@ -198,7 +198,7 @@ class GraphedRasterizer:
             RuntimeError: The number of Gaussians has changed since they were rendered.
         """
         *gaussians, cameras, projected, counts = saved
-        if gaussians[0].shape[0] != projected.shape[1]:  # by way of `.data`, which autograd does not see
+        if gaussians[0].shape[0] != projected.shape[1]:  # through `.data`, which autograd does not track
             raise RuntimeError(
                 f"{projected.shape[1]:,} Gaussians were rendered, and now there are {len(gaussians[0]):,}: render again first"
             )
@@ -262,7 +262,7 @@ class Recorder:
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the calls at hand; None where they were too few."""
+        """Rasterizer of the current calls; None if they were too few."""
         self.min_calls = MIN_CALLS
         """Equal calls in a row from which on kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
@@ -365,9 +365,9 @@ def call_key(
 def _can_capture(device: torch.device) -> bool:
     """Return whether calls can be captured now, on this device.
 
-    They cannot while somebody captures a graph, on another device than the current one, and with hooks on saved tensors:
-    checkpointing, which has such hooks, wants the same number of saved tensors each time. Nor where torch or Warp were told to
-    do what no graph can hold: to ask the driver for each tensor, or to check for errors after each kernel.
+    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors:
+    checkpointing, which has such hooks, needs the same number of saved tensors each time. Nor are they captured where torch
+    allocates each tensor from the driver, or Warp checks for errors after each kernel.
     """
     if _UNCACHED or wp.config.verify_cuda:
         return False

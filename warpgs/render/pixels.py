@@ -16,7 +16,7 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
     """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
 
     Raises:
-        TypeError: They are no tensor of integers.
+        TypeError: They are not a tensor of integers.
         ValueError: The shape is another.
     """
     if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:

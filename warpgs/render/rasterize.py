@@ -45,8 +45,8 @@ TILE_SIZES = (8, 16)
 
 BOUND_ROUNDING = 2.0**-29
 """Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
-colour is off by at most 2 e: an alpha moves its weight between its own colour and those behind, and the weights sum to 1. The
-unit of float64 is 2^29 times finer than that of float32, so e is at most 2^-30 where float32 knows alpha within a half."""
+colour is off by at most 2 e: alpha shifts weight between its own colour and those behind, and the weights sum to 1. The unit of
+float64 is 2^29 times finer than that of float32, so e is at most 2^-30 if the error of a float32 alpha is at most one half."""
 
 
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
@@ -135,7 +135,7 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     """Return channels [N, D] or [C, N, D] with an axis of cameras, [1, N, D] or [C, N, D].
 
     Raises:
-        TypeError: They are no tensor, or of another scalar type than the Gaussians.
+        TypeError: They are not a tensor, or of another scalar type than the Gaussians.
         ValueError: The shape or the device is another.
     """
     if values is None:
@@ -155,7 +155,7 @@ def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: tor
     channels = sum(layer.backgrounds.shape[1] + 4 for layer in layers)  # and alpha, depth, transmittance, sum of weights
     channels += 2 * heaviest
     needed = len(layers[0].backgrounds) * window[2] * window[3] * channels * like.element_size()
-    if needed < installed_bytes(like.device) // 20:  # asking for what is free takes 0.1 ms
+    if needed < installed_bytes(like.device) // 20:  # a query of the free memory takes 0.1 ms
         return
     free = available_bytes(like.device)
     if needed > free:
@@ -250,7 +250,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
-    degree = degree if options.colors is None else 0  # as little as can be of what is not shown
+    degree = degree if options.colors is None else 0  # as few unused pixels as possible
     named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
     pixels = None
     if options.pixels is not None:

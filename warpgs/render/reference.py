@@ -58,7 +58,7 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     directions, count = away / away.norm(dim=-1, keepdim=True), sh.coefficient_count(degree)
     colors = torch.einsum("nk,nkc->nc", sh.basis(directions)[:, :count], coefficients[visible, :count])
     colors = (colors + 0.5).clamp_min(0)
-    reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # a hair more than where alpha is the cut
+    reach = torch.sqrt(2 * torch.log(opacities / rule.alpha_cut))[:, None] + 0.01  # slightly beyond alpha = cut
     half = reach * torch.sqrt(torch.diagonal(covariances, dim1=-2, dim2=-1))
     return _Ellipses(pixels, half, (A, B, C), opacities, colors)
 

@@ -1,4 +1,4 @@
-"""The fastest rule within an error that is measured on the scene at hand."""
+"""The fastest rule within a given error, measured on the scene itself."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The settings of one render that are no tensors, as every way to render takes them."""
+"""The settings of one render other than tensors, shared by all ways to render."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ PALETTE_PIXELS = 2**18
 
 
 def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
-    """Return frames as 8-bit values, once it is known that there are some, of one size and not too many."""
+    """Return frames as 8-bit values, after checking their number and size."""
     result: list[np.ndarray] = []
     for frame in frames:
         pixels = np.round(np.clip(frame, 0, 1) * 255).astype(np.uint8)

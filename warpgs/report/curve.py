@@ -19,7 +19,7 @@ def ticks(low: float, high: float) -> list[float]:
 
 
 def tick_label(value: float) -> str:
-    """Return a number as written on axes: 20000 gives 20k."""
+    """Return a number as written on axes: 20000 becomes 20k."""
     if abs(value) >= 1e6:
         return f"{value / 1e6:g}M"
     return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"

@@ -64,13 +64,13 @@ def _encode(path: Path, temporary: str, frames: Iterable[np.ndarray], fps: int, 
         for frame in frames:
             height, width = (s // 2 * 2 for s in frame.shape[:2])
             if writer is None:
-                # for .webm OpenCV says on stderr that there is no such tag, and takes VP9 all the same
+                # for .webm OpenCV warns on stderr of an unknown tag, but writes VP9
                 with hidden_stderr() if path.suffix.lower() == ".webm" else contextlib.nullcontext():
                     writer = cv2.VideoWriter(temporary, cv2.VideoWriter_fourcc(*"vp09"), fps, (width, height))
                 if not writer.isOpened():
                     raise ResourceError(f"{path}: cannot be written; the folder is not writable, or OpenCV lacks a VP9 encoder")
             sizes.append((width, height))
-            # OpenCV drops a frame of another size without a word.
+            # OpenCV drops a frame of another size silently.
             if sizes[-1] != sizes[0]:
                 w, h = sizes[0]
                 raise DataError(f"{path}: frame {len(sizes) - 1} is {width} x {height} px, the first {w} x {h} px")

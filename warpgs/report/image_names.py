@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import PurePosixPath
 
 MOST_BYTES = 100
-"""Longest name that stays as it is, without suffix: any file system takes it."""
+"""Longest name that is kept unchanged, without suffix: any file system allows it."""
 NOT_EVERYWHERE = re.compile(
     r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.IGNORECASE
 )

@@ -1,4 +1,4 @@
-"""Overview image of cameras and points in space, rendered by pyvista in a process of its own."""
+"""Overview image of cameras and points in space, rendered by pyvista in a separate process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROBE = (
 
 
 def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
-    """Run Python code in a process of its own, since VTK ends the process where it cannot render; return success and reason."""
+    """Run Python code in a separate process, since VTK ends the process where it cannot render; return success and reason."""
     try:
         done = run_python(code, *arguments, timeout=TIMEOUT, environment={"VTK_DEFAULT_OPENGL_WINDOW": "vtkEGLRenderWindow"})
     except subprocess.TimeoutExpired:
@@ -97,7 +97,7 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
     low, high = seen.min(0), seen.max(0)
     eye, focus = (low + high) / 2, (low + high) / 2
     eye[2] -= max(float((high - low).max()), 1e-6) * 2
-    for _ in range(20):  # near content fills more of the image: move aside and to or fro until what is seen touches the edges
+    for _ in range(20):  # move the camera until the content touches the edges: near content looks larger
         depth = np.maximum(seen[:, 2] - eye[2], 1e-9)
         x, y = (seen[:, 0] - eye[0]) / depth, (seen[:, 1] - eye[1]) / depth
         nearest, middle = float(depth.min()), float(np.median(depth))

@@ -1,4 +1,4 @@
-"""Progress for people: the current stage, with a bar; in a terminal in place, elsewhere as plain lines."""
+"""Progress display: the current stage, with a bar; in a terminal in place, elsewhere as plain lines."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def waiting() -> Stages:
 class Progress:
     """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left.
 
-    Times are those of steps that compiled nothing: before one was taken, none is shown.
+    Times exclude steps that compiled kernels; none is shown before the first other step.
     """
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):

@@ -1,4 +1,4 @@
-"""Plots of a scene for people: cameras as pyramids among points, with a legend, rendered by pyvista in a process of its own."""
+"""Plots of a scene: cameras as pyramids among points, with a legend, rendered by pyvista in a separate process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Allocators, which provide a function's tensors by how long those live, so that captured kernels find them again.
+"""Allocators, which group a function's tensors by lifetime, so that captured kernels find them at the same addresses.
 
 For tensors that are at another address each time, `fetch` reads the address when the kernel runs.
 """
@@ -78,7 +78,7 @@ class Arena(Allocator):
         Args:
             sizes: Allocator that the function ran with before.
             byte: Any tensor of bytes on the device. (`new_empty` takes half the time of `torch.empty`.)
-            workspace: A block that nobody else uses now; None for one of its own.
+            workspace: A block that is not in use; None to allocate one.
         """
         self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
         """Output tensors, in the order in which the function asks for them."""
@@ -98,7 +98,7 @@ class Arena(Allocator):
 
     def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
         """Return the place of a saved tensor [...], the arguments of `part` after the block."""
-        begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # without entries it has no address
+        begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # an empty tensor has no address
         return begin, tuple(tensor.shape), tensor.dtype
 
     def output(self, shape, dtype, device):

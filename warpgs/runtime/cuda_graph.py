@@ -23,7 +23,7 @@ MAX_GRAPHS = 8
 MIN_REPLAYS = 30
 """Replays that pay for one capture."""
 FREE_CAPTURES = 16
-"""Captures of a function that need not have paid: a loop takes a while until its addresses repeat."""
+"""Captures of a function that are allowed without a gain: at the start of a loop, addresses do not repeat yet."""
 SMALL_BYTES = 2**16
 """Size of a workspace up to which it is kept, because allocating it at each call takes longer."""
 
@@ -126,7 +126,7 @@ class GraphPool:
         return torch.empty(0, dtype=torch.uint8, device=self.device)
 
     def capturing(self) -> bool:
-        """Return whether somebody else captures a graph on the current stream."""
+        """Return whether other code captures a graph on the current stream."""
         return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
 
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
@@ -141,7 +141,7 @@ class GraphPool:
         self._aside.wait_stream(here)  # a capture sets numbers of torch's generator that graphs in flight may still read
         try:
             with torch.no_grad():
-                # holds the shared memory, which torch would lend to nobody once the last graph is gone
+                # holds the shared memory, which torch would not reuse once the last graph is gone
                 if self._keeper is None:
                     self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device), self._aside)
                 return CapturedGraph(work, self._aside, self._keeper.pool())

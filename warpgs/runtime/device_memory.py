@@ -56,7 +56,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def no_memory_message(error: BaseException, purpose: str = "") -> str:
-    """Return the sentence for an error that says so, with what helps; ``purpose`` may say what for, as " for step 3"."""
+    """Return the message for a lack of memory, with remedies; ``purpose`` may state its use, such as " for step 3"."""
     reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
     return (
         f"no memory is left{purpose} ({reason[:200]}). Give the fit less with --memory-limit, fit smaller images with "

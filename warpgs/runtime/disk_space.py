@@ -1,4 +1,4 @@
-"""Full disks, told by what another process said before it failed, or by the room that is left."""
+"""Detection of full disks, from the error output of a failed process or from the free space."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Names of files that are not UTF-8: any bytes are a name on Linux, and Python holds those that are no text as surrogates.
+"""Names of files that are not UTF-8: any bytes are a name on Linux, and Python holds those that are not text as surrogates.
 
-Python opens such files. Libraries that take names as UTF-8 do not, and some end the process.
+Python opens such files. Libraries that expect UTF-8 fail on such names, and some end the process.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def use_utf8_names() -> None:
 
 @contextlib.contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
-    """Give a name of a file that a library can take: its own where that is UTF-8, else one by way of an open folder or file.
+    """Give a name of a file that a library can take: its own if that is UTF-8, else a path through an open folder or file.
 
     Args:
         path: The file. One to be written must have a name in UTF-8, in whatever folder.

@@ -1,4 +1,4 @@
-"""Locks on folders: one process at a time writes into a run folder; a second one gets an error with the owner."""
+"""Locks on folders: one process at a time writes into a run folder; a second one gets an error that names the first."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ MOST_LETTERS = 200
 
 @contextlib.contextmanager
 def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
-    """Hold a folder, which is made if it is missing, so that no other process writes into it meanwhile.
+    """Hold a folder, and make it if it is missing, so that no other process writes into it meanwhile.
 
-    The system gives the lock free when its holder ends, killed or not, and keeps it for processes in other containers, too; who
-    holds it stands in the lock file. What killed writers left in the folder, and where the system has temporary files, is
-    removed. In the block nothing below the folder is written through a link (`output_folder`). A folder that was made here and
-    is still empty when an error ends the block is removed as well; no other folder ever is.
+    The system releases the lock when its holder ends, killed or not. It also holds against processes in other containers. The
+    lock file names the holder. Leftovers of killed writers are removed from the folder and from the system's temporary files.
+    In the block nothing below the folder is written through a link (`output_folder`). A folder that was made here and is still
+    empty when an error ends the block is removed as well; other folders are never removed.
 
     Args:
         folder: The folder.
@@ -107,12 +107,12 @@ def check_free(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _held(folder: Folder) -> Iterator[bool]:
-    """Hold the lock of a folder; gives whether there are locks."""
+    """Hold the lock of a folder; yields whether the file system has locks."""
     while True:
         file = _open(folder)
         try:
             locked = _lock(file, folder.path)
-            # its last holder may have removed it between our two calls: then others lock a new one
+            # the last holder may have removed it between the two calls; then other processes lock a new file
             if not locked or os.fstat(file.fileno()).st_nlink:
                 break
         except BaseException:

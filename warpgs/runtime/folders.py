@@ -27,9 +27,9 @@ def cache_home() -> Path | None:
         found = home / "Library" / "Caches"
     else:
         base = Path(os.environ.get("XDG_CACHE_HOME") or "")
-        # the XDG rules ask to pass over a relative path
+        # the XDG rules require relative paths to be ignored
         found = base if base.is_absolute() else home / ".cache"
-    # relative is what an unknown or a relative HOME gives: a folder named ~ or the like in whatever folder we are called from
+    # an unknown or relative HOME results in a relative path, such as a folder named ~ in the current folder
     return found if found.is_absolute() else None
 
 

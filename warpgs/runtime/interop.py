@@ -167,7 +167,7 @@ def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
 
 def warp_stream(device: torch.device) -> wp.Stream:
     """Return torch's current stream of a CUDA device as Warp's object."""
-    # torch.cuda.current_stream makes a Python object each time, which takes ten times as long
+    # torch.cuda.current_stream creates a Python object each time and is ten times slower
     index = torch.cuda.current_device() if device.index is None else device.index
     return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
 
@@ -210,7 +210,7 @@ def _copied(struct):
 
 
 class _Recorded:
-    """A kernel with a launch that is recorded once and then only patched.
+    """A kernel whose launch is recorded once, and then only its arguments are replaced.
 
     ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
     here take, and at 140 us on a CPU of 2.6 GHz. The recorded launch keeps the packed arguments; a call writes pointers, sizes
@@ -235,7 +235,7 @@ class _Recorded:
             command = wp.launch(self.kernel, count, inputs=[0, *own], record_cmd=True, **where)
             command.fwd_args = None  # else the first call's arrays would stay in memory
             self.known = [None] * len(inputs)
-            self.command = command  # last: after an interrupt there is none
+            self.command = command  # set last: after an interrupt there is no launch
         else:
             self._patch(count, inputs)
         return self.command
@@ -256,7 +256,7 @@ class _Recorded:
                 seen = value.shape()
                 for size in seen[: packed.ndim]:
                     _check_size(size)  # it would wrap around
-                known[i] = None  # an interrupt here must leave nothing that is taken for known
+                known[i] = None  # an interrupt here must leave no half-written entry
                 packed.data = address
                 for axis in range(packed.ndim):
                     packed.shape[axis] = seen[axis]
@@ -333,7 +333,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         return
     warn_if_spinning()
     chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
-    left = iter(range(chunks))  # threads take the next range when they are done with one
+    left = iter(range(chunks))  # each thread processes the next range after finishing one
 
     def run() -> None:
         # a recorded launch of its own for each thread, which shares the packed arrays
@@ -351,7 +351,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
             working.append(_pool(threads).submit(run))
         for work in working:
             work.result()
-    except BaseException:  # an interrupt, too: the caller frees memory that the threads work in
+    except BaseException:  # on an interrupt, too, since the caller frees memory that the threads use
         wait(working)
         raise
 
@@ -370,7 +370,7 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
         The sizes by letter.
 
     Raises:
-        TypeError: An argument is no tensor, or sparse, or its scalar type is neither float32 nor float64, or types differ.
+        TypeError: An argument is not a tensor, or sparse, or its scalar type is neither float32 nor float64, or types differ.
         ValueError: A shape or a device disagrees; the message names the argument, expected and found.
     """
     sizes: dict[str, int] = {}

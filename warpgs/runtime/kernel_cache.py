@@ -1,4 +1,4 @@
-"""The folder of compiled kernels: the one that Warp would take, if it can be written and by nobody else; else a private one.
+"""The folder of compiled kernels: Warp's default, if this user and no other can write to it; else a private folder.
 
 Warp runs the kernels that it finds there, so anyone with write access can run code as this user.
 """
@@ -26,7 +26,7 @@ class KernelCache(NamedTuple):
     folder: Path
     """Folder, without the part that names Warp's version."""
     refused: str
-    """Reason why the usual folder is not taken; empty where it is."""
+    """Reason why the usual folder is not used; empty if it is used."""
 
 
 @functools.cache
@@ -34,7 +34,7 @@ def prepare_kernel_cache() -> KernelCache:
     """Choose the folder and tell Warp; to be called before `wp.init`. If it is a private one, a line is printed on stderr.
 
     Raises:
-        ResourceError: No folder at all can be written.
+        ResourceError: There is no writable folder.
     """
     import warp
 
@@ -73,7 +73,7 @@ def choose_kernel_cache(configured: str | None = None) -> KernelCache:
 
 
 def _usual(configured: str | None) -> tuple[Path | None, str]:
-    """Return the folder that is requested, or that Warp takes by itself; or None, and the reason."""
+    """Return the requested folder or Warp's default; or None, and the reason."""
     asked = configured or os.environ.get("WARP_CACHE_PATH")
     if asked:
         folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes

@@ -23,7 +23,7 @@ from warpgs.runtime.terminal import say
 HOST = "127.0.0.1"
 """Address that servers listen at: only this machine reaches it."""
 NAMES = (HOST, "localhost")
-"""Names under which a browser may ask for a server, at any port: that of an SSH tunnel may differ from ours."""
+"""Host names that a browser may request, at any port: that of an SSH tunnel may differ from the server's."""
 TOKEN_BYTES = 24
 """Random bytes of a token: 32 letters."""
 _PLAIN = re.compile(r"[A-Za-z0-9._/-]*")
@@ -57,7 +57,7 @@ def loopback_of(name: str) -> str | None:
     """Return the loopback address of a host name or address, 127.0.0.1 before ::1; None for other hosts."""
     try:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
-    except (OSError, UnicodeError):  # it cannot be resolved; whoever connects to it says so
+    except (OSError, UnicodeError):  # it cannot be resolved; connecting to it raises the error
         return None
     if not found or not all(map(is_loopback, found)):
         return None

@@ -42,7 +42,7 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
     of them compile; the others find the result. Once a module is loaded no lock is taken.
     """
     key = (module, device.context, block_dim)
-    if key in _LOADED:  # Warp sees by its hash whether a kernel has joined the module since
+    if key in _LOADED:  # Warp's hash shows whether the module has new kernels
         return module.load(device, block_dim=block_dim)
     cache, name = Path(wp.config.kernel_cache_dir), module.get_module_identifier(block_dim)
     locks = cache / "locks"
@@ -63,7 +63,7 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
 def exclusive(path: Path) -> Iterator[None]:
     """Hold a file, which is made if it is missing, so that one thread of one process at a time runs the body.
 
-    The system gives the file free when its holder ends, killed or not. A file system without locks is passed over: Warp puts a
+    The system releases the file when its holder ends, killed or not. A file system without locks is passed over: Warp puts a
     compiled module in place by renaming, so that two that compile it lose time and nothing else.
 
     Raises:

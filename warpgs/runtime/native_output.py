@@ -1,4 +1,4 @@
-"""Output of this process, that of native libraries included: hidden where it would only puzzle the user, or sent elsewhere."""
+"""Output of this process, including native libraries: hidden where it would confuse the user, or redirected."""
 
 from __future__ import annotations
 

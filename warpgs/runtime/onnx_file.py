@@ -129,7 +129,8 @@ def check_onnx(data: bytes, path: Path) -> None:
         path: Its name, for messages.
 
     Raises:
-        DataError: The bytes are no ONNX model, keep weights elsewhere (even where that file exists), or use custom operators.
+        DataError: The bytes are not an ONNX model, keep weights elsewhere (even where that file exists), or use custom
+            operators.
     """
     try:
         model = _message(memoryview(data))

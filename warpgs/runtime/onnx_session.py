@@ -1,4 +1,4 @@
-"""Sessions of onnxruntime for ONNX files that anybody may have written."""
+"""Sessions of onnxruntime for untrusted ONNX files."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ MAX_MODEL_BYTES = 2**31
 
 
 def read_model(path: Path) -> bytes:
-    """Return the bytes of an ONNX file that needs nothing but itself.
+    """Return the bytes of an ONNX file, checked to need no other files.
 
     Raises:
-        DataError: It cannot be read, is no ONNX model, or needs other files or foreign operators.
+        DataError: It cannot be read, is not an ONNX model, or needs other files or foreign operators.
     """
     try:
         data = read_input(path, MAX_MODEL_BYTES)
@@ -76,7 +76,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
             raise ResourceError(f"--onnx-provider {provider}: onnxruntime cannot use it ({first_line(e)}). {remedy}") from e
         raise DataError(f"{path}: onnxruntime {ort.__version__} cannot load it ({first_line(e)}); export it again, perhaps "
                         "with an older operator set") from e  # fmt: skip
-    # onnxruntime goes on without a provider whose libraries are missing
+    # onnxruntime continues without a provider if its libraries are missing
     if PROVIDERS[provider] not in session.get_providers():
         raise ResourceError(f"--onnx-provider {provider}: onnxruntime finds no {provider} libraries or device. {remedy}")
     return session

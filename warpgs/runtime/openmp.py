@@ -1,4 +1,4 @@
-"""OpenMP's idle threads, which sleep where warpgs is imported before torch, and otherwise spin."""
+"""OpenMP's idle threads: they sleep if warpgs is imported before torch, else they spin."""
 
 import functools
 import os

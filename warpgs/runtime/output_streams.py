@@ -1,7 +1,7 @@
 """Output that cannot be written: one line on stderr, and the command continues.
 
-A pipe whose reader has gone, a full disk, a closed descriptor, a terminal that has hung up: from the first write that fails
-on, output goes to the null device, that of native libraries too.
+Causes are a closed pipe, a full disk, a closed descriptor or a closed terminal. After the first failed write, all output goes
+to the null device, including that of native libraries.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def open_missing_descriptors() -> None:
 
 
 def _send_to_null(number: int) -> None:
-    """Let a descriptor lead to the null device; a process without any further descriptor keeps the one it has."""
+    """Point a descriptor at the null device; if no further descriptor can be opened, keep it."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
         if null == number:  # it was closed, and the lowest one free
@@ -65,7 +65,7 @@ class CarefulStream:
         Args:
             stream: The stream; None for one whose descriptor was closed when Python started.
             name: stdout or stderr.
-            goes_on: Say on stderr at once that the command goes on without this stream.
+            goes_on: Say on stderr at once that the command continues without this stream.
         """
         self.closed_at_start = stream is None
         self.stream: TextIO = io.StringIO() if stream is None else stream
@@ -97,7 +97,7 @@ class CarefulStream:
             self.write(line)
 
     def _lose(self, error: OSError | ValueError) -> None:
-        """Keep the first error, and let the descriptor lead nowhere: buffers are flushed once more when Python ends."""
+        """Keep the first error, and point the descriptor at the null device: buffers are flushed once more when Python ends."""
         if isinstance(error, ValueError) and not isinstance(error, OSError) and not self.stream.closed:
             raise error
         if self.failure is not None:
@@ -114,7 +114,7 @@ class CarefulStream:
 
 
 def say_lost(name: str, error: BaseException) -> None:
-    """Print on stderr that the command goes on without stdout; of a lost stderr nothing can be said."""
+    """Print on stderr that the command continues without stdout; of a lost stderr nothing can be said."""
     if name == "stdout":
         _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command goes on without it")
 
@@ -130,7 +130,7 @@ class CarefulOutput:
     """Streams of a command, and their state."""
 
     def __init__(self, stdout: CarefulStream, stderr: CarefulStream, is_product: bool):
-        """Keep both, and whether what goes to stdout is all that the command is called for."""
+        """Keep both streams, and whether stdout is the command's only result."""
         self.stdout, self.stderr, self.is_product = stdout, stderr, is_product
 
     def exit_code(self, code: int) -> int:
@@ -148,11 +148,11 @@ class CarefulOutput:
 
 @contextlib.contextmanager
 def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
-    """Put streams whose writes do not fail in the place of stdout and stderr.
+    """Replace stdout and stderr by streams whose writes do not raise.
 
     Args:
-        is_product: What goes to stdout is all that the command is called for. Then a failure is its own, but for a reader who
-            has seen enough; else the command goes on, and says so.
+        is_product: True if stdout is the command's only result. Then a failure to write fails the command, except
+            if the reader of a pipe has closed it; otherwise the command continues with one line on stderr.
     """
     open_missing_descriptors()
     before = sys.stdout, sys.stderr

@@ -20,15 +20,15 @@ def open_to_others(folder: Path, depth: int = 0) -> Path | None:
     if not hasattr(os, "getuid"):
         return None
     trusted = {os.getuid(), 0, Path(folder.anchor).stat().st_uid}
-    for above in folder.parents:  # whoever can write there can put another folder in the place of this one
+    for above in folder.parents:  # users with write access there can replace this folder
         found = above.stat()
-        sticky = found.st_mode & stat.S_ISVTX  # as /tmp: others cannot move what is not theirs
+        sticky = found.st_mode & stat.S_ISVTX  # as /tmp: users can move only their own files
         if found.st_uid not in trusted or (_writable_by_others(found, trusted) and not sticky):
             return above
     if _writable_by_others(folder.stat(), trusted):
         return folder
     if not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
-        return None  # others do not even get in
+        return None  # other users cannot enter it
     for level in range(1, depth + 1):
         for path in folder.glob("/".join("*" * level)):
             try:

@@ -12,7 +12,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 def usable_cores() -> int:
     """Return the number of cores that this process may run on, at least 1; all of them where the system has no such notion."""
     try:
-        return len(os.sched_getaffinity(0)) or 1  # neither macOS nor Windows has it
+        return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
     except (AttributeError, OSError):
         return os.cpu_count() or 1
 
@@ -24,5 +24,5 @@ def processor_name() -> str:
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     except OSError:
-        pass  # Linux alone has this file
+        pass  # only on Linux
     return platform.processor() or platform.machine() or "unknown"

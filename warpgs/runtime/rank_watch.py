@@ -37,7 +37,7 @@ def is_gone(process: int) -> bool:
         return psutil.Process(process).status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     except psutil.NoSuchProcess:
         return True
-    except (psutil.Error, OSError):  # it is there, and not ours to look at
+    except (psutil.Error, OSError):  # the process exists, but belongs to another user
         return False
 
 
@@ -90,7 +90,7 @@ class RankWatch:
             number += 1
             try:
                 self._beat(number)
-                if self._own.check(["spoke"]):  # somebody else has said why all end
+                if self._own.check(["spoke"]):  # another rank has reported the error
                     os._exit(ResourceError.exit_code)
                 lost = next((r for r in range(self.count) if r != self.rank and self.is_lost(r)), None)
             except RuntimeError:  # the store is gone, and with it the process that held it
@@ -105,7 +105,7 @@ class RankWatch:
     def is_lost(self, rank: int) -> bool:
         """Return whether a process has ended without a word, or has been silent for too long."""
         if not self._own.check([f"beat/{rank}"]):
-            return False  # it is still to come
+            return False  # it has not started yet
         found, now = self._own.get(f"beat/{rank}").decode(), time.monotonic()
         last, since = self._seen.get(rank, ("", now))
         if found != last:
@@ -122,15 +122,15 @@ class RankWatch:
         self.leaving.set()
         try:
             first = self.store.add("spoke", 1) == 1
-        except RuntimeError:  # nobody else can be asked
+        except RuntimeError:  # no other process can be asked
             first = True
         if first:
             say(line, error=True)
         if self.rank == 0:
-            time.sleep(3 * BEAT_SECONDS)  # with this process the store may go, from which the others hear of it
+            time.sleep(3 * BEAT_SECONDS)  # the store, through which the other ranks learn of it, may end with this process
 
     def settle(self, seconds: float) -> None:
-        """Wait at most so long [s] for the thread to end this process, which it does when it knows the lost rank."""
+        """Wait at most so long [s] for the thread to end this process, which it does once the lost rank is known."""
         time.sleep(seconds + 2 * BEAT_SECONDS)
 
     def leave(self) -> None:
@@ -142,7 +142,7 @@ class RankWatch:
                     time.sleep(0.1)
             self.leaving.set()
             self.store.set(f"heard/{self.rank}", "")
-            until = time.monotonic() + 3 * BEAT_SECONDS  # with the first process the store may go
+            until = time.monotonic() + 3 * BEAT_SECONDS  # the store may end with the first process
             while self.rank == 0 and time.monotonic() < until and not self._all_heard():
                 time.sleep(0.05)
         except RuntimeError:  # the store has ended with the process that held it

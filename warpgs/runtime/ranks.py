@@ -1,8 +1,8 @@
 """Processes that fit one scene together: their identity, their exchange, and their end when one is lost.
 
 They are started by torchrun, or with the variables that it sets: RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT.
-Numbers go by NCCL between GPUs and by gloo between CPUs. Neither tells in time that a process is gone (a kernel of NCCL waits
-for ever), so each watches the others by way of a store that all have a connection to.
+Numbers go by NCCL between GPUs and by gloo between CPUs. Neither reports a lost process in time (a kernel of NCCL waits for
+ever), so each process watches the others through a store that all are connected to.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 JOIN_SECONDS = 300.0
 """Time in which all processes must have come [s]."""
 EXCHANGE_TIME = timedelta(days=1)
-"""Time that an exchange may take: the first rank may write a checkpoint meanwhile, and who is lost is noticed otherwise."""
+"""Time that an exchange may take: the first rank may write a checkpoint meanwhile, and a lost rank is detected separately."""
 
 
 class Ranks:
@@ -99,7 +99,7 @@ class Group(Ranks):
 
     @contextlib.contextmanager
     def _watched(self) -> Iterator[None]:
-        """Turn the failure of an exchange into the end of this process by the watch, which knows who is gone."""
+        """On a failed exchange, let the watch end this process with an error that names the lost rank."""
         try:
             yield
         except RuntimeError as e:
@@ -135,7 +135,7 @@ def place() -> tuple[int, int]:
     """Return rank and number of the processes, 0 and 1 for a single one.
 
     Raises:
-        UsageError: The variables are no such numbers.
+        UsageError: The variables are not valid numbers.
     """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         return 0, 1
@@ -194,7 +194,7 @@ def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool
     import torch.distributed as dist
 
     own = {}
-    if hosts and home and sys.platform != "win32":  # torch takes it over, and would listen on every interface
+    if hosts and home and sys.platform != "win32":  # torch reuses it; its own would listen on every interface
         own["master_listen_fd"] = loopback_socket(port, "set another MASTER_PORT for all ranks", home).detach()
     wait = timedelta(seconds=JOIN_SECONDS)
     store = dist.TCPStore(home or address, port, count, is_master=hosts, timeout=wait, wait_for_workers=False, **own)
@@ -237,7 +237,7 @@ def last_words(line: str, code: int) -> int:
         return code
     _joined.watch.fail(line)
     sys.stdout.flush()
-    os._exit(code)  # what is left of a broken group may wait for ever
+    os._exit(code)  # a broken group may wait for ever
 
 
 def place_or_first() -> tuple[int, int]:

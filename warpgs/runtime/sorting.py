@@ -10,7 +10,7 @@ from warpgs.runtime import interop
 
 @functools.lru_cache(maxsize=64)
 def _array_at(address: int, size: int, dtype: object, device: torch.device) -> wp.array:
-    """Return memory at an address as a Warp array, which does not own it: whoever reads it holds the tensor."""
+    """Return memory at an address as a Warp array, which does not own it; the caller must keep the tensor."""
     return wp.array(ptr=address, shape=size, dtype=dtype, device=interop.warp_device(device))
 
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM, and SIGHUP of a closed terminal: all end the program in one way. A process that ignores one goes on to."""
+"""Ctrl-C, SIGTERM and SIGHUP end the program in one way; signals that it was started to ignore stay ignored."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 
 STOPPING = tuple(s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)))  # Windows has no SIGHUP
 AGAIN = 0.05
-"""Time after which a signal that Python threw away is sent again [s]."""
+"""Time after which a signal that Python discarded is sent again [s]."""
 
 
 def _heeded() -> list[signal.Signals]:
     """Return the signals that end this process: none that it was started to ignore (nohup, a shell's job in the background).
 
-    Only the main thread may handle signals; in another one they act as ever.
+    Only the main thread may handle signals; in another one they keep their default action.
     """
     if threading.current_thread() is not threading.main_thread():
         return []
@@ -60,7 +60,7 @@ def interrupting_signals() -> Iterator[None]:
     def unraisable(thrown: sys.UnraisableHookArgs) -> None:
         if thrown.exc_type is not KeyboardInterrupt:
             before(thrown)
-        elif numbers:  # from a thread: here it would come in this very function
+        elif numbers:  # from a thread: here it would interrupt this function itself
             timers.append(threading.Timer(AGAIN, _send, numbers[:1]))
             timers[-1].daemon = True
             timers[-1].start()

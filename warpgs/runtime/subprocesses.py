@@ -90,7 +90,7 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
     """Run a module of this package in another process, and yield the lines of its stdout as they come.
 
-    It looks for modules no more in its folder than `run_python` does, and it ends where nobody listens any more; it calls
+    Like `run_python`, it does not import modules from its folder. It ends when its output is no longer read, and calls
     `end_with_parent` to end when this process is killed.
 
     Args:
@@ -152,8 +152,8 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
 class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
-    It looks for modules in its folder no more than `run_python` does. Ctrl-C in the terminal is for its parent alone: the end
-    of its stdin tells it to stop, which it sees even where the parent was killed.
+    It looks for modules in its folder no more than `run_python` does. Only its parent handles Ctrl-C. The process stops at the
+    end of its stdin, which also follows if the parent is killed.
     """
 
     def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):

@@ -1,4 +1,4 @@
-"""Lines for people on the terminal: whatever a file, a folder or an image is called, they are text and nothing else."""
+"""Lines for the user on the terminal, without control characters from names of files, folders or images."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from warpgs.runtime.output_streams import say_lost
 T = TypeVar("T")
 
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Categories of characters that move the cursor, turn the direction of text, end a line, or are half of one."""
+"""Categories of characters that move the cursor, change the direction of text, end a line, or are surrogates."""
 JOINERS = "\u200c\u200d"
-"""Characters of these categories that scripts and emoji need, and that change nothing but the letters beside them."""
+"""Exceptions that scripts and emoji need; they affect only adjacent letters."""
 
 
 class Detail(str):
@@ -25,7 +25,7 @@ class Detail(str):
 
 
 def printable(text: object) -> str:
-    """Return text with every character that a terminal would obey, such as ESC, and bytes that are no text, as codes."""
+    """Return text with every character that a terminal would obey, such as ESC, and bytes that are not text, as codes."""
     return "".join(
         c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c
         for c in readable(str(text))
@@ -66,7 +66,7 @@ def answer(line: object) -> None:
     """Print one line to the process that started this one.
 
     Raises:
-        OSError: It has ended, so that nobody needs the answer.
+        OSError: It has ended, so the answer is not needed.
     """
     _print(line, False)
 

@@ -1,8 +1,8 @@
 """The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
 
-It can be learnt from six images and not be copied from them: everything in it is smooth and matte, and the training
-views surround the held-out ones, but a step between neighbours moves the pattern by more than half its period, so that no
-training image, nor their mean, resembles a held-out view pixel by pixel.
+Six images suffice to reconstruct it: everything is smooth and matte, and the training views surround the held-out ones. But
+they cannot be copied: between neighbouring views the pattern moves by more than half its period, so neither a training image
+nor their mean resembles a held-out view pixel by pixel.
 """
 
 from __future__ import annotations
@@ -295,7 +295,7 @@ def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict
     with hold_folder(folder) as notes:  # before the work: a folder that cannot be made is reported at once
         for note in notes:
             say(f"warpgs: {note}", error=True)
-        _check(folder, *size)  # another process may have filled it before it was ours
+        _check(folder, *size)  # another process may have filled it before this one held it
         for path, content in contents().items():
             make_folder((folder / path).parent)
             write_bytes(folder / path, content)

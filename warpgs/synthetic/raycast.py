@@ -1,8 +1,8 @@
 """A small ray caster in numpy: closed shapes with smooth solid textures under one soft light, no GL, no mesh.
 
-It exists so that the demo scene needs no download and no graphics driver. Every shape knows the first hit of a ray in its
-own frame, the normal there and its radius, so that an image, the exact depth of a pixel and the visibility of a point all
-come from the same intersection code. Shading is diffuse: a surface point has one colour from all directions.
+It exists so that the demo scene needs no download and no graphics driver. Every shape computes the first hit of a ray in its
+own frame, the normal there and its radius. So an image, the exact depth of a pixel and the visibility of a point all come from
+the same intersection code. Shading is diffuse: a surface point has one colour from all directions.
 
 Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths in scene units [u].
 """
@@ -321,7 +321,7 @@ def shade(shapes: Sequence[Shape], light: Light, x: np.ndarray, index: np.ndarra
     for i, shape in enumerate(shapes):
         if not np.isfinite(shape.radius) or not shape.shading:
             continue
-        # Each object shades the others as the sphere of its bulk would: smooth everywhere, and needs no second ray.
+        # Each object casts the shadow of a sphere of its size: smooth everywhere, without a second ray.
         bulk = shape.shading * shape.radius
         rows = np.flatnonzero(index != i)
         away = np.asarray(shape.center, x.dtype) - x[rows]

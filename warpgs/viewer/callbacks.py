@@ -23,7 +23,7 @@ def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
     def call(*args: Any) -> None:
         try:
             callback(*args)
-        except Exception as e:  # of whatever a browser asked for; the viewer goes on
+        except Exception as e:  # any error of a browser's request; the viewer continues
             say(f"the viewer could not serve a request of a browser ({said(e)})", error=True)
 
     return call

@@ -1,4 +1,4 @@
-"""Connections of browsers to the viewer: who may connect, how much they may send, and what becomes of wrong messages."""
+"""Connections of browsers to the viewer: which may connect, how much they may send, and how wrong messages are handled."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def connection_class(rules: Rules) -> type:
             """Return the next message that viser may read; a malformed one closes the connection."""
             while True:
                 frame = await super().recv(*args, **named)
-                if self.refused:  # what had come before the connection ended, too
+                if self.refused:  # messages from before the connection ended, too
                     continue
                 try:
                     if not self.allowance.take():
@@ -134,7 +134,7 @@ def connection_class(rules: Rules) -> type:
                 except DataError as e:
                     self.refused = True
                     say(f"the viewer closed the connection of a browser: {e}", error=True)
-                    self.transport.abort()  # who sends such a message may not answer to a polite end
+                    self.transport.abort()  # a client that sends such a message may ignore a normal close
                     continue
                 if checked is not None:
                     return checked
@@ -143,7 +143,7 @@ def connection_class(rules: Rules) -> type:
 
 
 def _silent() -> logging.Logger:
-    """Return a logger that writes nothing: websockets would print tracebacks of requests that are none."""
+    """Return a logger that writes nothing: websockets would print tracebacks of invalid requests."""
     logger = logging.Logger("warpgs.viewer", logging.CRITICAL + 1)
     logger.addHandler(logging.NullHandler())
     return logger

@@ -27,7 +27,7 @@ class Content:
     """A model and its description."""
 
     title: str
-    """Name for people: that of the folder or the file."""
+    """Name to show: that of the folder or the file."""
     model: FittedModel
     """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
     stem: Path
@@ -57,7 +57,7 @@ def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] 
     """
     run = open_run(folder, device)
     level = load_checkpoint(folder)[0].get("columns.level")
-    # a fit that goes on may have written another checkpoint in between
+    # a fit that continues may have written another checkpoint in between
     fine = level == FINE if level is not None and level.shape == (len(run.gaussians()),) else None
     sheets = sorted((folder / "sampling").glob("*.png"))
     return Content(

@@ -62,7 +62,7 @@ def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gau
     server.initial_camera.look_at = camera.center + distance_ahead(camera, gaussians) * forward
     server.initial_camera.up = -np.asarray(camera.viewmat[1, :3])
     server.initial_camera.fov = fov_y(camera)
-    server.initial_camera.far = 1e5  # else what lies beyond 1000 u is cut off
+    server.initial_camera.far = 1e5  # else content beyond 1000 u is clipped
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
@@ -175,7 +175,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     gaussians = convert_gaussians(gaussians, found, "file", "scene")
     with hold_file(target) as held:
         cameras = [convert_camera(c, found, "file", "scene") for c in cameras]
-        title = target.stem.encode("utf-8", "replace").decode()  # of a name that is not UTF-8 what is
+        title = target.stem.encode("utf-8", "replace").decode()  # ? for bytes that are not UTF-8
         notes = write_html(target, gaussians, middle_first(cameras), run.background, title)
     if run.antialiased:
         notes.append("the page shows the model without antialiasing: too bright from afar and in small windows")

@@ -32,10 +32,10 @@ POLL = 1.0
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
-    """Show a run folder or a file of Gaussians until Ctrl-C; checkpoints of a fit that goes on are shown as they come.
+    """Show a run folder or a file of Gaussians until Ctrl-C; checkpoints of a fit that continues are shown as they come.
 
     Args:
-        path: Run folder, of a fit that goes on, too; or a file of any registered format.
+        path: Run folder, of a fit that continues, too; or a file of any registered format.
         port: Port to listen at; 0 for any free one.
         device: Device that renders images: auto, cpu or cuda.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
@@ -66,7 +66,7 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
 
 
 def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | None) -> None:
-    """Show what there is, and every checkpoint that replaces it."""
+    """Show the present state, and every later checkpoint."""
     window, seen, stages = None, None, waiting()
     if path.is_dir() and modified(path) is None:
         stages("waiting")
@@ -143,7 +143,7 @@ class LiveView:
     def _draw(self) -> None:
         try:
             self._draw_states()
-        except Exception as e:  # of viser, too: the fit goes on
+        except Exception as e:  # errors of viser, too, so that the fit continues
             say(f"the viewer stopped ({type(e).__name__}: {e}); the fit goes on", error=True)
 
     def _draw_states(self) -> None:

@@ -35,7 +35,7 @@ TRAIN_COLOR, TEST_COLOR = (20, 150, 150), (224, 138, 44)
 
 
 class Window:
-    """Shows a model to all browsers that are connected; another one, as a fit goes on, replaces it."""
+    """Shows a model to all browsers that are connected; a later model of a fit replaces it."""
 
     def __init__(self, server: viser.ViserServer, content: Content, maps: bool = True):
         """Draw a model.
@@ -176,7 +176,7 @@ class Window:
             for client in list(self.server.get_clients().values()):
                 try:
                     self._render_for(client)
-                except AssertionError:  # a browser that has not told its camera yet; it will wake us
+                except AssertionError:  # the browser has not sent its camera yet; its message will wake this thread
                     continue
                 except Exception as e:  # there may be no memory for this image; the next one may be smaller
                     self.panel.explain(f"no image: {said(e)}")

@@ -35,7 +35,7 @@ CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view"
 
 
 def _request_type() -> type:
-    """Return the dataclass of the flags that are no settings of a fit: its input, output and machine."""
+    """Return the dataclass of the flags that are not settings of a fit: its input, output and machine."""
 
     @dataclass(frozen=True, kw_only=True)
     class Request:
@@ -100,7 +100,7 @@ def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
 
 
 def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
-    """Return the settings that the flags start from, and words on where they come from."""
+    """Return the settings that the flags start from, and a description of their source."""
     name = word_after(arguments, "--preset")
     base, origin = load_own("preset", str(name), lambda: preset_settings(name))
     strategy = word_after(arguments, "--strategy")
@@ -111,7 +111,7 @@ def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
 
 
 def _choices() -> str:
-    """Return what there is to choose from by name, for people."""
+    """Return the names that can be chosen, as text for the user."""
     plug_ins: dict[str, Registry[Any]] = {
         "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS, "camera models": CAMERA_MODELS,
         "view modules": VIEW_MODULES,

@@ -1,4 +1,4 @@
-"""AVIF, decoded to 8 bits by Pillow's libavif, and how it is told from HEIC: both are ISO base media files.
+"""AVIF, decoded to 8 bits by Pillow's libavif, and its detection: HEIC files are ISO base media files, too.
 
 libavif rejects a file that ends early. Damage inside of the coded pixels is not seen.
 """

@@ -71,7 +71,7 @@ def size(data: bytes) -> tuple[int, int]:
     """Return width and height [px].
 
     Raises:
-        ValueError: The header is broken, or of a kind that is not read.
+        ValueError: The header is broken or not supported.
     """
     for marker, body in segments(data):
         if marker in SOF + OTHER_SOF:

@@ -1,7 +1,7 @@
 """TIFF: the first image's strips or tiles must lie in the file, apart from each other, and hold all their pixels.
 
-Deflate has a checksum, which is checked. Other compressions are decoded by Pillow, which stops where libtiff reports an error;
-deeper pixels than Pillow knows are left to OpenCV, which stops at errors there and only there.
+Deflate has a checksum, which is checked. Pillow decodes other compressions, and stops if libtiff reports an error. OpenCV
+decodes pixels of more bits than Pillow supports; for those it stops at errors, too.
 """
 
 from __future__ import annotations

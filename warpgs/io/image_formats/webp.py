@@ -13,7 +13,7 @@ def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and contents of each chunk.
 
     Raises:
-        ValueError: It is no WebP file, or ends within a chunk.
+        ValueError: It is not a WebP file, or ends within a chunk.
     """
     if len(data) < 20 or data[8:12] != b"WEBP":
         raise ValueError("it is not a WebP file")

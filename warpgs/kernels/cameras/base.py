@@ -60,8 +60,8 @@ def check_camera(camera: Camera) -> type[CameraModel]:
     """Return the model of a camera, or of a batch.
 
     Raises:
-        UsageError: The model is unknown, or the camera has another number of coefficients than it takes, or they require
-            gradients, which there are none of.
+        UsageError: The model is unknown, the number of coefficients does not match it, or they require gradients, which are not
+            supported.
     """
     model = CAMERA_MODELS.find(camera.model)
     found = 0 if camera.distortion is None else camera.distortion.shape[-1]

@@ -145,7 +145,7 @@ def _make_functions(real: type) -> SimpleNamespace:
 
     @wp.func
     def scale_to(limit: real, offset: real) -> real:
-        """Return the factor from a pixel's offset to that of the expansion point; 1 where that is no way to the axis."""
+        """Return the factor from a pixel's offset to that of the expansion point; 1 where no factor leads to the axis."""
         s = limit / offset
         if offset != limit and s >= real(0.0) and s < one:
             return s

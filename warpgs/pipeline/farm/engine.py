@@ -15,7 +15,7 @@ class Event:
     name: str
     """Name of the job."""
     state: str
-    """running; or the last news: done, failed, held (another process works on it) or crashed (its process ended)."""
+    """running; or the last event: done, failed, held (another process works on it) or crashed (its process ended)."""
     message: str = ""
     """Reason of a crash."""
     step: int = 0
@@ -34,7 +34,7 @@ class Engine(Protocol):
         """Start a job; called while fewer than `slots` run."""
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return news; waits up to this time."""
+        """Return new events; waits up to this time."""
 
     def close(self) -> None:
         """End all that runs. A fit saves its state where it can, and is continued by the next farm."""

@@ -47,7 +47,7 @@ def _scores(path: Path) -> dict[str, Any] | None:
 
 
 def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, split: Split | None, device: str) -> str:
-    """Name the properties in which a stored run differs from the one that is wanted; empty where in none."""
+    """Name the properties in which a stored run differs from the requested one; empty if it does not differ."""
     wanted = {
         "configuration": (record.get("config_hash"), config.fingerprint()),
         "code of your own": (record.get("own_code", {}), config.own_code()),
@@ -67,7 +67,7 @@ def _set_aside(folder: Path) -> Path:
         ResourceError: Another process writes there, or the folder cannot be moved.
     """
     with hold_folder(folder):
-        pass  # nobody writes there; Windows moves no folder with an open file, so it is not held any longer
+        pass  # no process writes there; the lock is released first, since Windows moves no folder with an open file
     number = 1
     while os.path.lexists(target := folder.with_name(f"{folder.name}.old{number}")):
         number += 1
@@ -141,7 +141,7 @@ def _outcome(
             note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and fitted again"
             state = "redone"
         elif metrics is not None:
-            if (folder / LOCK).exists():  # of a fit that was killed after its last file, with what else it left
+            if (folder / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
                 with contextlib.suppress(FolderHeldError), hold_folder(folder):
                     pass
             try:

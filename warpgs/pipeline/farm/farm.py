@@ -140,7 +140,7 @@ class _Farm:
         return True
 
     def _take(self, event: Event, waiting: deque[JobStatus]) -> None:
-        """Take note of the news of a job."""
+        """Record an event of a job."""
         status = self.by_name[event.name]
         if event.state == "running":
             status.step = event.step

@@ -65,7 +65,7 @@ def job_of(text: str) -> FarmJob:
     scene, config = SceneRequest(**r["scene"]), r["config"]
     if scene.reader is not None:
         READERS.load(scene.reader)
-    for place in r["own_code"]:  # a class of a preset's file has a name that leads nowhere
+    for place in r["own_code"]:  # a class of a preset's file cannot be imported by its name
         try:
             module_of(place)
         except (ImportError, OSError) as e:

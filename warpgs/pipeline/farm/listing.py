@@ -15,11 +15,11 @@ from warpgs.input_files import read_input, unread_reason
 from warpgs.io.readers import all_readers
 
 NAME = re.compile(r"(?:[^\W_]|[\udc80-\udcff])[^/\\:*?\"<>|\x00-\x1f]{0,99}")
-"""Names of jobs: those of a folder below the results on any system, and bytes that are no text where a folder has them."""
+"""Names of jobs: those of a folder below the results on any system, and bytes that are not text where a folder has them."""
 MOST_BYTES = 200
 """Longest name of a job: file systems take 255 bytes, and names that begin with it, such as NAME.old1, must fit too."""
 OWN_FILES = ("index.html", "results.csv")
-"""Names in a results folder that are no job's."""
+"""Names in a results folder that do not belong to a job."""
 PLUGINS = ("preset", "strategy", "loss-terms", "view-modules", "reader")
 """Flags that can name code: a file of jobs may name only that of warpgs."""
 FARM_FLAGS = (
@@ -44,7 +44,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file.
 
     Raises:
-        DataError: A line of the file is no job.
+        DataError: A line of the file is not a job.
         UsageError: There is nothing to fit, the folder is one scene, or two jobs have one name.
     """
     path = Path(jobs)
@@ -106,7 +106,7 @@ _LINE = schema.fields({"scene": schema.text}, {"name": schema.text})
 
 
 def _job(values: Any, folder: Path) -> ListedJob:
-    """Return the job of a line; SchemaError where it is none."""
+    """Return the job of a line; SchemaError if it is not a job."""
     _LINE(values, "")
     scene = Path(os.path.abspath(folder / values["scene"]))
     flags = [word for key, value in values.items() if key not in ("scene", "name") for word in _flag(key, value)]

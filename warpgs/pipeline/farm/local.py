@@ -142,7 +142,7 @@ class LocalEngine:
         process.worker.send(json.dumps({"job": job_text(job), "threads": process.slot.threads}))
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return the news of all processes."""
+        """Return the new events of all processes."""
         try:
             process, line = self._news.get(timeout=seconds)
         except queue.Empty:
@@ -155,7 +155,7 @@ class LocalEngine:
         name, state = process.job, values["state"]
         del self._busy[name]
         process.job = ""
-        if state == "failed":  # it ends by itself, and its memory with it
+        if state == "failed":  # the process ends and frees its memory
             process.worker.end(SECONDS_TO_SAVE)
             self._free.append(process.slot)
         else:
@@ -163,7 +163,7 @@ class LocalEngine:
         return [Event(name, state)]
 
     def _ended(self, process: _Process) -> list[Event]:
-        """Take note that a process has ended."""
+        """Record that a process has ended."""
         code, errors = process.worker.end(SECONDS_TO_SAVE)
         if not process.job:
             if process in self._idle:

@@ -121,7 +121,7 @@ def source_stamp(scene: Path) -> str:
                 rows.append((path.relative_to(scene).as_posix(), found.st_size, found.st_mtime_ns))
                 if len(rows) > MOST_FILES:
                     return ""
-    except OSError:  # the fit says what is wrong
+    except OSError:  # the fit reports the error
         return ""
     return hashlib.sha256(json.dumps(sorted(rows)).encode()).hexdigest() if rows else ""
 

@@ -1,4 +1,4 @@
-"""One job from beginning to end: what every engine calls, in whatever process it has."""
+"""One job from beginning to end: every engine calls it in the processes that it starts."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None)
     if error is None:
         record = _with_results(job, record, outcome.metrics or {})
     write_record(job.folder, record)
-    gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
+    gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed
     return record.state
 
 
@@ -132,10 +132,10 @@ def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Out
 
 
 def _wanted(request: FitRequest, device: str) -> tuple[str, Split | None, FitConfig]:
-    """Return the fingerprint of a scene as it is now, its split, and the settings with those chosen that are left open."""
+    """Return the fingerprint of a scene as it is now, its split, and the settings, with automatic ones chosen."""
     try:
         found, _ = with_poses(request.scene.with_scale(device), request.out, say)
-    except UsageError as e:  # other photographs than those whose poses are there
+    except UsageError as e:  # the stored poses are of other photographs
         return str(e), None, request.config
     scene, split, _ = read_scene(found)
     return scene.fingerprint, split, settings_by_views(request.config, train_views(scene, split.train), device)[0]

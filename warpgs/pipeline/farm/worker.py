@@ -1,8 +1,8 @@
 """The process of a device slot: takes jobs as lines on stdin, one after another, and answers with lines of JSON.
 
-It serves until its stdin ends or a job fails: what a failure left in memory is nobody's to clean. A line is ``{"kernels":
+It serves until its stdin ends or a job fails, since a failed job may leave memory allocated. A line is ``{"kernels":
 "cpu"}``, to compile kernels before the first job, or ``{"job": TEXT, "threads": N}``. An answer holds ``step``, or ``state``,
-the last one on a job. Where stdin ends during a job, that saves its state and stops.
+the last one on a job. If stdin ends during a job, the job saves its state and stops.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def _answers() -> Callable[..., None]:
 
 
 def _read(lines: queue.SimpleQueue[str | None], working: threading.Event) -> None:
-    """Pass on the lines of stdin; at its end interrupt the job that is worked on."""
+    """Pass on the lines of stdin; at its end interrupt the current job."""
     for line in sys.stdin:
         lines.put(line)
     lines.put(None)

@@ -81,7 +81,7 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
     spans = [max(0.7 * float(np.abs(matmul(offsets, axis)).max()), 0.03 * depth) for axis in (side, up)]
     poses = []
     for t in np.arange(frames) / frames:
-        # neither nearer, where Gaussians look like needles, nor farther, where the image ends in what no photograph saw
+        # not nearer, where Gaussians look like needles; not farther, where the image border shows unobserved areas
         angle, radius = 4 * np.pi * t, np.sin(np.pi * t)
         eye = center + radius * (spans[0] * np.cos(angle) * side + spans[1] * np.sin(angle) * up)
         poses.append(look_at(eye, rig.center, up))

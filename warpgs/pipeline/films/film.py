@@ -88,7 +88,7 @@ def _frames(
     model: FittedModel, plan: FilmPlan, files: Sequence[Path], settings: FilmSettings, coverage: bool | Sequence[View],
     check: FrameCheck, tell: Callable[[str], object] | None,
 ) -> Iterator[np.ndarray]:  # fmt: skip
-    """Render the frames of a plan, look at each, and write its images; gives each image [H, W, 3].
+    """Render the frames of a plan, check each, and write its images; yields each image [H, W, 3].
 
     Args:
         model: The model.
@@ -96,7 +96,7 @@ def _frames(
         files: File of each frame's image; none to write no images.
         settings: Settings of the film.
         coverage: As in `render_path`; the images lie in a subfolder beside ``files``.
-        check: Looks at the frames.
+        check: Check of the frames.
         tell: Called with a line for each frame before it is rendered.
     """
     gaussians, options = model.gaussians(), model.options()

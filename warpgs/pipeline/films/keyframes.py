@@ -54,7 +54,7 @@ def _row(keyframe: Keyframe) -> np.ndarray:
 
 
 def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -> np.ndarray:
-    """Return the values [F, 9] at times [F] of a curve through rows [N, 9] at rising times [N], whose direction never jumps.
+    """Return the values [F, 9] at times [F] of a smooth curve through rows [N, 9] at rising times [N].
 
     Cubic Hermite pieces whose slopes are those of the parabola through each row and its two neighbours (Catmull and Rom 1974,
     for uneven times). A closed curve's last row is its first one.

@@ -42,7 +42,8 @@ class FilmSettings:
     """Settings of a film."""
 
     frames: int | None = None
-    """Number of frames; None for seconds times fps. The views of a scene and cameras of one's own are as many as they are."""
+    """Number of frames; None for seconds times fps. The number of frames of ``views`` and of the user's own cameras is
+    fixed."""
     seconds: float | None = None
     """Duration [s]; None for what suits the path."""
     fps: int = 30

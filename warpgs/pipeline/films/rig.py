@@ -26,7 +26,7 @@ MAX_GAP = math.radians(150)
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
-"""Length of the mean of the cameras' upward directions, each of length 1, from which on they agree on one."""
+"""Length of the mean of the cameras' upward unit directions above which they agree."""
 MIN_SWING = math.radians(6)
 """Smallest range of azimuths of a film, for cameras above each other."""
 
@@ -122,7 +122,7 @@ def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, b
         turned = bool((np.abs(lying) > 0.9).all()) if few else float(np.abs(lying).mean()) > 0.8
         if turned or (not few and np.abs(upright).mean() > 0.5):
             sign = float(upright.mean())
-            if abs(sign) < 0.3:  # of some photographs the other side is up: people photograph from above
+            if abs(sign) < 0.3:  # cameras disagree; people photograph from above
                 height = float(matmul(centers - looked_at, normal).mean())
                 sign = height if height else float(lying.mean())
             return (normal if sign >= 0 else -normal), turned
@@ -174,8 +174,8 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
 def rig_of(cameras: list[Camera], depth: float) -> Rig:
     """Return the arrangement of cameras around their subject.
 
-    Cameras whose optical axes meet stand around the point nearest to all axes, unless they see it from one side; then, as where
-    axes do not meet but point one way, the point is ``depth`` in front of their mean centre.
+    Cameras whose optical axes meet stand around the point nearest to all axes, unless they see it from one side. Then, and
+    where axes are nearly parallel, the point is ``depth`` in front of their mean centre.
 
     Args:
         cameras: Training cameras, at least one.

@@ -12,7 +12,7 @@ from warpgs.pipeline.films.keyframes import Keyframe
 from warpgs.scene import Camera
 
 MAX_DETOUR = 1.5
-"""Largest length of a tour by name, as a multiple of one from neighbour to neighbour, that is still taken."""
+"""Largest accepted length of a tour in order of names, as a multiple of the length from neighbour to neighbour."""
 MAX_IMPROVED = 200
 """Number of views up to which every pair of legs is looked at; a tour of more is smooth enough without."""
 

@@ -15,8 +15,9 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth. From training photographs alone: there two of
-them differ at one point by twice the squared error (3 dB) that they have where depths agree best (decision 019)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
+difference, the squared colour difference of two photographs is twice (3 dB) that at the best agreement of depths (decision
+019)."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface, and so has a depth."""
 MAX_COUNT = 255
@@ -42,12 +43,12 @@ class Match:
     """The points of one view's pixels as another view sees them; tensors of the shape of the pixels, [H, W]."""
 
     u: torch.Tensor
-    """Column in the other view [px], pixel centres at +0.5; of no meaning where ``difference`` is infinite."""
+    """Column in the other view [px], pixel centres at +0.5; undefined where ``difference`` is infinite."""
     v: torch.Tensor
     """Row in the other view [px]."""
     difference: torch.Tensor
     """Difference between the point's depth in the other view and the nearest of the depths that the other view sees at the four
-    pixels around it, as a fraction of the depth: what a pixel covers of a slanted surface has several. Infinite outside of the
+    pixels around it, as a fraction of the depth: depth varies within a pixel on a slanted surface. Infinite outside of the
     other image, where that view sees no surface, and where the pixel itself shows none."""
 
 
@@ -113,7 +114,7 @@ def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
         other: The other view.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is not a pinhole.
     """
     check_pinhole(camera)
     u, v, z = _seen_from(depth, camera, other.camera)
@@ -175,7 +176,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
         The coverage, on the device of ``depth``.
 
     Raises:
-        UsageError: A camera is no pinhole.
+        UsageError: A camera is not a pinhole.
     """
     counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
     least = torch.full_like(depth, torch.inf)

@@ -22,7 +22,7 @@ from warpgs.scene import Gaussians, View
 CLASSES = {
     "0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, empty",
 }  # fmt: skip
-"""Classes of pixels, with what each is for people. Where no view of a scene has an alpha, nothing is background."""
+"""Classes of pixels, with a description of each for the user. Where no view of a scene has an alpha, nothing is background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
 """Upper ends of the classes of depth difference by which an error is expected; the last holds all that is beyond."""
 PROBED = 6
@@ -34,8 +34,8 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
     """Measure how far two training photographs of one point differ, by how far their depths do.
 
     Each photograph is carried to another view by the model's depth and compared with the photograph there, pixel by pixel.
-    That is the error to expect of a pixel whose colour comes from a view with such a difference: measured on training data,
-    after a fit to the same data. It includes differences between the photographs, such as reflections and exposure.
+    This is the expected error of a pixel with colour from a view that differs as much, measured on training data after a fit to
+    the same data. It includes differences between the photographs, such as reflections and exposure.
 
     Args:
         train: Training views.
@@ -181,7 +181,7 @@ def score_by_coverage(
 
 
 def _summary(rows: dict[str, dict[str, Any]]) -> str:
-    """Return how much of the pixels and of the error is where no training view looked, as a sentence for people."""
+    """Return the fraction of the pixels and of the error that no training view saw, as a sentence for the user."""
     unseen = rows.get("0")
     if unseen is None:
         return "every held-out pixel was seen by a training view"

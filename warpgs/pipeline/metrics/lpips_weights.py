@@ -107,7 +107,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
             _check_unpacked(file)
             # weights_only: tensors and plain containers, nothing that could run
             state = torch.load(_mapped(file), map_location="cpu", weights_only=True, mmap=_mapped(file) is not file)
-        except Exception as e:  # torch, pickle and zipfile raise a dozen types on foreign bytes
+        except Exception as e:  # torch, pickle and zipfile raise a dozen types on malformed files
             reason = str(e).splitlines()[0][:120] if str(e) else ""
             raise DataError(
                 f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again"
@@ -122,7 +122,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
 def _mapped(file: BinaryIO) -> str | BinaryIO:
     """Return the name of an open archive by which torch maps it, so that tensors take no memory until they are read.
 
-    The file itself where there are no such names, or torch would have to unpickle the tensors with the rest.
+    The file itself if the system has no such names, or torch would have to unpickle the tensors.
     """
     name = files.DESCRIPTORS / str(file.fileno())
     named = name.exists() and zipfile.is_zipfile(file)

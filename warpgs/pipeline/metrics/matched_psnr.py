@@ -11,7 +11,7 @@ from warpgs.pipeline.metrics.region import scored_region
 from warpgs.scene import View
 
 RULE = "after the affine map of colours that fits the left half of each best, over its right half"
-"""Rule of the score, for people."""
+"""Rule of the score, as text for the user."""
 RIDGE = 1e-6
 """Added to the variances of the colours, so that an image of one colour has a map, too: a thousandth of full range."""
 

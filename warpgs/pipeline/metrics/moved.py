@@ -1,4 +1,4 @@
-"""Things that moved: places where one training view differs from a model that other views there agree with."""
+"""Detection of moved objects: places where one training view differs from the model while other views agree with it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MIN_RESIDUAL = 0.05
 MIN_FACTOR = 3.0
 """Smallest factor between the residual of a pixel and that of other views at the same point."""
 FLOOR = 0.005
-"""Residual of other views in [0, 1] below which they agree with the model wholly."""
+"""Residual of other views in [0, 1] below which they fully agree with the model."""
 MIN_VIEWS = 2
 """Fewest other views that must show a point."""
 MIN_TRAINING = 6
@@ -32,11 +32,12 @@ MAX_DEPTH_ERROR = 0.1
 MIN_AREA = 0.004
 """Fraction of the image that one region must fill to be reported; static scenes have up to 0.002 (decision 019)."""
 MAX_MISFIT = 5.0
-"""Median residual of a view, in medians of all views, from which it fits badly as a whole: then no single region stands out."""
+"""Median residual of a view, as a multiple of the median over views, above which the whole view fits badly, so that no single
+region is reported."""
 HIGH_MISFIT = 0.002
-"""Median over views of their median residuals from which a fit is not far enough to tell; finished ones have up to 0.001."""
+"""Median over views of their median residuals above which a fit is too early for this check; finished fits have up to 0.001."""
 LOW_MISFIT = 0.0005
-"""Median residual in [0, 1] below which views do not differ in that."""
+"""Median residual in [0, 1] below which a view never counts as a bad fit."""
 SMOOTHING = 32
 """Width of the image over the side of the square in which residuals are averaged."""
 

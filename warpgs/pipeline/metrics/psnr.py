@@ -34,5 +34,5 @@ def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None
     if region is not None:
         difference = difference[region]
     mse = float((difference**2).mean())
-    # numpy's logarithm, which rounds apart from math.log10 now and then: figures that were published stay the same
+    # numpy's logarithm, which sometimes rounds differently from math.log10: published figures stay the same
     return float("inf") if mse == 0 else -10 * float(np.log10(mse))

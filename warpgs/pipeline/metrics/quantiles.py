@@ -1,4 +1,4 @@
-"""Quantiles of as many numbers as an image has pixels."""
+"""Quantiles of large arrays, such as images."""
 
 from __future__ import annotations
 

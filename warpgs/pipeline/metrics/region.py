@@ -1,4 +1,4 @@
-"""Pixels of an image that count, for the fit and for the score: its mask's, or the object where it stands before black."""
+"""Pixels that count for the fit and for the score: those of a mask, or of an object before a black background."""
 
 from __future__ import annotations
 

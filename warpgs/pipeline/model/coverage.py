@@ -44,7 +44,7 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
     return Coverage(maxima, views)
 
 
-@torch.enable_grad()  # whoever asks may have switched gradients off, as the trainer does when the set changes
+@torch.enable_grad()  # the caller may have switched gradients off, as the trainer does when the set changes
 def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
     """Estimate how much the images change when a Gaussian moves by its own width or its axes grow.
 

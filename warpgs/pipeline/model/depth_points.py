@@ -20,10 +20,10 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 NOTHING = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 """No points."""
 FREE_SPACE = 0.95
-"""A filled point nearer to another view than this fraction of the depth found there would hide what that view sees."""
+"""A filled point nearer to another view than this fraction of that view's depth would occlude its surface."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
-"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: what is far takes few
-planes, what is near many."""
+"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: few planes for
+distant surfaces, many for near ones."""
 MIN_KNOWN = 10
 """Known points that a view must hold to bound its depths."""
 
@@ -148,7 +148,7 @@ def coarse_points(
         depths: Geometrically consistent depth of each, confirmed by other views.
         merge_px: Width of the cells in which consistent points become one [px]; 0 keeps every pixel.
         fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
-            those of `complete`; none is in space that another view looks through, or beside a consistent point. Views without
+            those of `complete`; none is in space that another view sees through, or beside a consistent point. Views without
             estimated depth are left out, so that the work for each view is bounded.
         source: Name of the source in the notes, sweep or flow.
         known: Points of a reconstruction. Those that two of the views saw are taken where no depth is consistent, and their

@@ -1,7 +1,7 @@
 """Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
 
-Between few cameras much comes into view that no photograph shows. The points continue what lies beside it: colour and depth of
-an image's border outwards, and a far surface a little behind the near one that it ends at
+Between few cameras, renders show much that no photograph shows. The points extrapolate into these areas: colour and depth of an
+image's border outwards, and a far surface a little behind the near one that occludes it
 (docs/decisions/026-extrapolated-points.md).
 """
 
@@ -27,8 +27,8 @@ DEPTH_PX, COLOR_PX = 31, 6
 REACH, BEHIND_PX, BEHIND_COLOR_PX = 24, 8, 3
 """Reach of a far surface behind a near one; width of its cells, a point each; and reach of the mean of its colour [px]."""
 STEP, EDGE = 1.02, 1.15
-"""Factors of depth: between two pixels, above which a surface ends rather than slants; and of the far side over the near one,
-from which there is a point."""
+"""Ratios of depth: that of neighbouring pixels above which a surface ends; and that of the far to the near side above which
+points are added."""
 SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and direction of the four neighbours of a pixel."""
 
@@ -36,7 +36,7 @@ SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> PointCloud:
     """Return extrapolated points of all views: first those beyond the images, then those behind edges of depth.
 
-    There are none where a part of a view does not count: its border is no border of what was photographed.
+    Views with masks get none, since the border of a mask is not the border of the image.
 
     Args:
         views: Training views.

@@ -23,7 +23,8 @@ INNER = 0.02
 """Fraction of the means left out at either end of each axis where the size of the scene is measured."""
 NEEDLE_LENGTH = 0.2
 """Fraction of the scene's size that a Gaussian beyond the ratio `NEEDLE` must be long to be removed: shorter needles are hairs
-and edges of a good model. Of a tenth they cost up to 0.08 dB on held-out views (docs/decisions/014-formats.md)."""
+and edges of a good model. With a tenth instead, removal costs up to 0.08 dB on held-out views
+(docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
 """Largest file of a box that is read [bytes]."""
 _NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
@@ -45,7 +46,7 @@ class Box:
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Return finite numbers of a shape; UsageError where ``value`` is none."""
+    """Return finite numbers of a shape; UsageError if ``value`` is not that."""
     try:
         array = np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):

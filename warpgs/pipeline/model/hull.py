@@ -23,7 +23,7 @@ PROJECTIONS = 2**25
 MAX_LEVELS = 20
 """Most levels: the finest cells are a millionth of the first one."""
 TOLERANT = 12
-"""Views for each one that may err: with so many, a cell is empty if two say so, with twice as many, three."""
+"""Number of views per tolerated error: with this many views, two empty ones make a cell empty; with twice as many, three."""
 SEEN = 0.9
 """Fraction of the views that must have a cell in their image: space that few look into cannot be carved."""
 OPAQUE_COLOR = 0.9
@@ -31,7 +31,8 @@ OPAQUE_COLOR = 0.9
 LEAST_VIEWS = 2
 """Number of views that must see a cell, because unseen cells are inside the object or outside the photographs."""
 LIKE = 0.15
-"""Standard deviation of the colours that views see a cell in, up to which they are like, of the channel that differs most."""
+"""Largest standard deviation of a cell's colour over views at which the colours are similar, in the channel that differs
+most."""
 BEHIND_CELLS = 3.0
 """Distance behind the first cell of a pixel from which on a cell is hidden, as a multiple of the width of a cell."""
 
@@ -48,7 +49,7 @@ class Silhouette:
         self.sums[1:, 1:] = opaque.cumsum(0, dtype=np.int64).cumsum(1)
         border = np.concatenate([opaque[0], opaque[-1], opaque[:, 0], opaque[:, -1]])
         self.cut = bool(border.any())
-        """True where the object reaches the border of the image, so that it may go on outside."""
+        """True if the object reaches the border of the image, so that it may extend beyond it."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
         """Return three masks [N] of balls around points [N, 3]: only at empty pixels; only at opaque ones; perhaps seen.
@@ -130,8 +131,8 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean colours [N, 3] of cells of that width [u] where they are seen, and the cells that are kept, bool [N].
 
-    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in like colours: the others
-    are parts of the hull that the object need not fill.
+    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in similar colours; the
+    others may be empty parts of the hull.
     """
     total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
     for shape in shapes:

@@ -298,7 +298,7 @@ def initial_gaussians(
     points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
     colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
     count = len(points)
-    # in float64: float32's roots and logarithms have other last digits on other processors (MKL)
+    # in float64, since the rounding of float32's roots and logarithms depends on the processor (MKL)
     distances = mean_square_distances(points).double().sqrt()
     scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
     sh = points.new_zeros(count, coefficient_count(sh_degree), 3)

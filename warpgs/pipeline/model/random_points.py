@@ -105,7 +105,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
         rows, columns = rows[chosen], columns[chosen]
         pixels = np.stack([columns, rows], 1) + 0.5
         elsewhere = not source.has_matches and len(views) > 1
-        # where none is better than another, the first are taken, and the others need no depth
+        # where all are equally good, the first are taken, and the others need no depth
         useful = len(pixels) if elsewhere or any(name in OBJECTS for _, name in regions) else wanted
         candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
         worse = empty_votes(views, regions, candidates)

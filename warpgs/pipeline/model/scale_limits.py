@@ -60,7 +60,7 @@ class Limits:
         new = new.clamp(max=math.log(self.largest))
         if self.reach > 0:
             new = torch.minimum(new, camera_reach(params["means"].detach(), cameras.centers, self.reach)[:, None])
-        new = torch.where(old.isinf(), old, new)  # what is not finite is not hidden
+        new = torch.where(old.isinf(), old, new)  # non-finite values stay visible
         if self.ratio < math.inf:
             longest, middle = (x[:, None] for x in long_axes(new))
             new = torch.where(new == middle, torch.maximum(new, longest - math.log(self.ratio)), new)
@@ -81,7 +81,8 @@ class LimitConfig:
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
     max_reach: float = 1 / 3
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
-    a third, three of them reach no camera; larger ones beside or behind training cameras are a fog before other views."""
+    a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras are fog in front of
+    other views."""
     min_pixels: float = 0.2**0.5
     """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
     most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
@@ -131,8 +132,8 @@ class TrainingCameras(NamedTuple):
 def _camera_row(camera: Camera) -> np.ndarray:
     """Return a camera as `pixel_size` takes it, shape [9]; its cone holds eight points of the border of the image.
 
-    Where a lens does not reach one of them, the cone is all that the model can see. Of a model without centre nothing is known:
-    its pixels are of size 0, and limit nothing.
+    Where a lens does not reach one of them, the cone is all that the model can see. For a model without centre, pixels have
+    size 0 and limit nothing.
     """
     f, center = np.array([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
     ends = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
@@ -202,7 +203,7 @@ def shape_figures(
     if at.reach > 0:
         beyond |= over > math.log(at.reach) + ROUNDING
     count, sigma = max(1, len(gaussians)), float(longest.max().exp()) if len(gaussians) else 0.0
-    # exactly rounded sums, which no number of threads changes
+    # exactly rounded sums, the same for any number of threads
     weight = math.fsum(opacities[needle].tolist()) / max(math.fsum(opacities.tolist()), 1e-30)
     return {
         "radius": radius, "extent": extent, "largest": sigma, "largest_over_radius": sigma / radius,

@@ -165,7 +165,7 @@ class Table:
         if update.overwritten is not None:
             self._overwrite(update.overwritten, update.values)
         keep, parents = update.keep, update.parents
-        for name in self.params:  # each old tensor is given up before the next is made
+        for name in self.params:  # each old tensor is freed before the next is allocated
             added = update.added[name].to(self.params[name].dtype)
             self.params[name] = torch.cat([self.params[name].detach()[keep], added]).requires_grad_()
             for moments in (self.exp_avg, self.exp_avg_sq):

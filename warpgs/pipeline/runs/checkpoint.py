@@ -64,7 +64,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
     """
     path = folder / TENSORS
     for name, t in tensors.items():
-        # the extremes tell without a copy, since torch lets a NaN win
+        # minimum and maximum suffice, without a copy: torch returns NaN if any value is NaN
         if t.is_floating_point() and t.numel() and not all(math.isfinite(float(v)) for v in t.aminmax()):
             raise NotFiniteError(
                 f"{path} was not written: {name} holds non-finite values; results after the last checkpoint are invalid. "

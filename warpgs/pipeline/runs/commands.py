@@ -1,4 +1,4 @@
-"""Commands on a run that is there: score it again, render it, export it."""
+"""Commands on an existing run: score it again, render it, export it."""
 
 from __future__ import annotations
 
@@ -79,8 +79,8 @@ def evaluate(
         by_coverage: Whether to split the scores by how many training views saw what a pixel shows.
 
     Raises:
-        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the weights are
-            no weights.
+        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the file of
+            weights is invalid.
         ResourceError: Another process writes into the folder, or it cannot be written.
     """
     device, _ = choose_device(device_name)
@@ -137,7 +137,7 @@ def render(
     Raises:
         DataError: The folder is not a run, or the file, its cameras or the keyframes cannot be read.
         ResourceError: A file cannot be written.
-        UsageError: The path is unknown, the background is no colour, or a number is out of its range.
+        UsageError: The path is unknown, the background is not a colour, or a number is out of its range.
     """
     color = color_of(background)
     if color is None and background != "auto":

@@ -23,7 +23,7 @@ EXPECTED = (
     "The expected PSNR compares training photographs with each other where their depths differ as much: an estimate from "
     "training data, not a bound."
 )
-"""Meaning of the expected PSNR, for people."""
+"""Meaning of the expected PSNR, as text for the user."""
 
 
 def coverage_of_run(

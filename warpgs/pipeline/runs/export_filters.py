@@ -1,4 +1,4 @@
-"""Filters of an export: what of a model stays, and how it is turned, with lines for the user on each."""
+"""Filters of an export: which Gaussians are kept, and how the model is rotated, with a line for the user on each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models for others: a run or a file, filtered, in any format, and its cameras."""
+"""Export of a model, from a run or a file, filtered, in any format, and of its cameras."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _written(
 
 
 def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
-    """Return a line on what the format rounded, from the file itself; none for what float32 rounds."""
+    """Return a line on the rounding errors of the format, measured on the file; none for a format in float32."""
     back, _ = read_with_antialiasing(target, None, "file", kind)
     moved = float((back.means.double() - gaussians.means.double()).abs().max())
     scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)

@@ -140,7 +140,7 @@ def fit(
     check_batched(scene, config, ranks, time_budget, resume)
     verbose, own = ranks.first and verbose, out if ranks.first else None
     with _opened(own, resume, verbose) as (held, progress, compiled):
-        resume = resume and out is not None and (out / CONFIG).is_file()  # else it holds found poses alone
+        resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
         if out is not None and resume:
             read_record(out)  # a run of another version is refused before anything takes time
         where = choose_device(device)
@@ -243,7 +243,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
         of = job.train, job.scene.points, c, job.device, job.scene.background
         trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
     if job.device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(job.device)  # the steps' need is told, not the start's or an earlier fit's
+        torch.cuda.reset_peak_memory_stats(job.device)  # report the steps' memory, not that of the start or of an earlier fit
     return trainer, state, record
 
 
@@ -278,7 +278,7 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
             antialiased=job.config.antialiased,
         )
     with ThreadPoolExecutor(1) as beside:
-        # its process takes seconds, in which views are scored here
+        # its process takes seconds; views are scored here meanwhile
         overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None
         metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
         if job.out is not None and overview is not None:

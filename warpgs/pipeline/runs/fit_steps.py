@@ -29,7 +29,7 @@ class RunRecorder:
     """Log and checkpoints of a fit in its run folder; without a folder it keeps nothing."""
 
     def __init__(self, job: FitJob, step: int, images_written: Callable[[], None]):
-        """Open the log after ``step``; ``images_written`` waits for the images that a checkpoint counts."""
+        """Open the log after ``step``; ``images_written`` waits for the images before a checkpoint is written."""
         self.job, self.images_written = job, images_written
         self.log = None if job.out is None else EventLog(job.out / "metrics.jsonl", step)
 
@@ -73,7 +73,7 @@ class StepTeller:
         """Start before the first step; ``progress`` is None for a fit that shows none."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
-        """The last step that took longer than those to come will; kernels that were compiled by then."""
+        """The last step that compiled kernels and so took longer; the number of kernels compiled by then."""
 
     def __call__(self, r: StepReport) -> None:
         """Take one report."""
@@ -112,7 +112,7 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
             if e.view is None:
                 raise
             if job.out is None:
-                job.ranks.leave()  # all have this loss, and the first says so
+                job.ranks.leave()  # all ranks have this loss; the first reports it
                 raise
             failed = _saved_failure(job.out, job, trainer, e)
             recorder.save(trainer)

@@ -54,7 +54,7 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
-    """Hold a run folder for a fit: a new or an empty one, or one with a run to continue; gives notes for the user.
+    """Hold a run folder for a fit: a new or an empty one, or one with a run to continue; yields notes for the user.
 
     One that holds found poses alone, as a fit leaves it that ended before its first step, is taken in both cases.
 
@@ -65,7 +65,7 @@ def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
     """
     _check_folder(out, resume)
     with hold_folder(out, *IMAGE_FOLDERS) as notes:
-        _check_folder(out, resume)  # another process may have filled it before it was ours
+        _check_folder(out, resume)  # another process may have filled it before this one held it
         yield notes
 
 
@@ -126,8 +126,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read config.json of a run folder, its format first.
 
     Raises:
-        DataError: The folder is no run, its record is incomplete, or another version of warpgs wrote it in a format that this
-            one does not read; the message names that version and the way out.
+        DataError: The folder is not a run, its record is incomplete, or another version of warpgs wrote it in a format that
+            this one does not read; the message names that version and the remedy.
     """
     path = folder / CONFIG
     try:

@@ -1,4 +1,4 @@
-"""The mesh of a run: what its training views see, as a file."""
+"""The mesh of a run, from the depth of its training views, as a file."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def mesh(
 
 
 def _lines(found: FusedMesh, views: int) -> list[str]:
-    """Return what a mesh is made of, for people."""
+    """Return the size of a mesh as a line for the user."""
     mesh, lines = found.mesh, []
     lines.append(
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; "

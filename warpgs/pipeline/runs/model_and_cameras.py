@@ -55,7 +55,7 @@ def open_file(
             raise DataError(
                 f"{cameras}, {name}: an image of {c.width} x {c.height} px has more than {MAX_PIXELS:,} pixels; write less"
             )
-    # the unit stays that of the file, in which the near plane of a rule is given
+    # the unit stays that of the file, since the near plane of a rule is in that unit
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
     gaussians, declared = read_with_antialiasing(path, normalization, "scene")
     gaussians = gaussians.to(where)

@@ -56,7 +56,7 @@ class PlotSettings:
         """Check what can be checked before any work.
 
         Raises:
-            UsageError: A value is none of those there are.
+            UsageError: A value is not one of the choices.
         """
         for flag, value, known in (
             ("--points", self.points, POINTS), ("--color", self.color, COLORS), ("--background", self.background, BACKGROUNDS),

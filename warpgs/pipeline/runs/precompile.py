@@ -132,7 +132,7 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Pr
     for device in devices:
         for kernel, block in fit_kernels(device.type == "cuda"):
             jobs[device, kernel.module, block] = device, kernel, block
-    # Warp's own force_load loads modules from threads too; it would not say how long each took
+    # Warp's own force_load also uses threads, but does not report the time of each module
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         for done in as_completed([pool.submit(_load, *job) for job in jobs.values()]):
             yield done.result()

@@ -1,4 +1,4 @@
-"""Pruning of a finished model: Gaussians and harmonics that its training views do not miss go (docs/decisions/020)."""
+"""Pruning of a finished model: Gaussians and harmonics that its training views do not need are removed (docs/decisions/020)."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, 
     tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
     tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
     with hold_folder(out.parent) as notes:
-        _new_folder(out, out)  # another process may have made it before the folder above was ours
+        _new_folder(out, out)  # another process may have made it before this one held the folder above
         with filling(out) as temporary:
             write_json(temporary / CONFIG, record)
             save_checkpoint(temporary, tensors, {"step": step})

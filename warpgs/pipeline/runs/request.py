@@ -18,8 +18,8 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Scene
 
 CPU_MAX_SIDE = 800
-"""Longest side of an image [px] that a fit on a CPU keeps where the user names neither a factor nor a side: four times as
-many steps fit into its time, and held-out PSNR at full size rises (decision 018)."""
+"""Default of the longest side of an image [px] for a fit on a CPU: four times as many steps fit into its time, and held-out
+PSNR at full size rises (decision 018)."""
 NO_SCORES = "no scores: all photographs train; --split every:8 holds some out"
 """Sentence on a fit without held-out views, with the way to scores."""
 
@@ -103,7 +103,7 @@ class FitRequest:
 
 
 def check_overrides(overrides: Mapping[str, object]) -> None:
-    """Check that keywords of a fit are no options of reading a scene.
+    """Check that keywords of a fit are not options of `load_scene`.
 
     Raises:
         UsageError: One is.
@@ -117,7 +117,7 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
 
     Raises:
         ResourceError: CUDA was requested and is missing.
-        UsageError: The name is none of these.
+        UsageError: The name is unknown.
     """
     if isinstance(name, torch.device):
         device = name

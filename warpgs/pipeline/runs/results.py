@@ -1,4 +1,4 @@
-"""Results of a fit for people: images of held-out views, scores, the report page."""
+"""Results of a fit for the user: images of held-out views, scores, the report page."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ LABELS = {
     "lpips_vgg_legacy": "LPIPS-VGG [0, 1]", "lpips_vgg_standard": "LPIPS-VGG [-1, 1]",
     "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
 }  # fmt: skip
-"""Names of scores for people."""
+"""Names of scores as shown to the user."""
 BASELINES = {"mean_photo": "the mean photograph", "nearest_photo": "the nearest photograph"}
-"""Images that are scored without a fit, for people."""
+"""Images that are scored without a fit, as text for the user."""
 SHOWN_VIEWS = 6
 """Held-out views with images in the report; all have files in the run folder."""
 RENDER_WORKERS = 4
@@ -163,7 +163,7 @@ def evaluate_run(
         return score(view, image, alpha=alpha)
 
     tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
-    with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS takes much memory a view
+    with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS needs much memory for each view
         for work, view in counted(tasks, tell, "scoring", "views"):
             jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
             if len(jobs) > RENDER_WORKERS:
@@ -203,7 +203,7 @@ def _images(
 
 
 def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
-    """Return a function that draws the 3D overview, in a process of its own: it may be called from another thread."""
+    """Return a function that draws the 3D overview, in a separate process: it may be called from another thread."""
     means = gaussians.means.detach().cpu().numpy()
     colors = np.clip(base_colors(gaussians.sh[:, :1].detach().cpu().numpy()), 0, 1)
     sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]

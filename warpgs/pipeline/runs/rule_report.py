@@ -108,7 +108,7 @@ def rule_report_of(
 
 
 def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], exact: RasterizeOptions) -> torch.Tensor:
-    """Return the image of a window under `exact` in float64: by the kernels where they alone know the model."""
+    """Return the image of a window under `exact` in float64; by the kernels for camera models that the reference lacks."""
     if camera.model in MODELS:
         with _one_thread():
             return reference_image(part, camera, window, exact.background, part.sh_degree, exact.antialiased)
@@ -117,7 +117,7 @@ def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], 
 
 
 def _summary(r: dict[str, Any]) -> str:
-    """Return the figures as one sentence for people."""
+    """Return the figures as one sentence for the user."""
     sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
     where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
     error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"

@@ -1,4 +1,4 @@
-"""Reasons for the places of sampled Gaussians: images of sampling events, and the report's part on all of a fit's events."""
+"""Report on sampled Gaussians: images of sampling events, and the report's section on all events of a fit."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def view_sheet(
     image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
     at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
     weights = config.weights(view.semantic is not None)
-    # each score stands below what it comes from
+    # each score is shown below its inputs
     tiles = [
         Tile("render before", rendered),
         Tile("image", image),
@@ -108,11 +108,11 @@ def _on_host(sampled: SampledView) -> SampledView:
 
 @contextlib.contextmanager
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
-    """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it goes on.
+    """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
 
-    A separate thread writes them. The end of the block waits for it, and so does the function that it gives, which is to be
-    called before a checkpoint: a fit that goes on from there does not write the images of events before it. If an image cannot
-    be written, the fit continues, with one message in ``fit.messages``.
+    A separate thread writes them. The end of the block waits for them. So does the yielded function; call it before a
+    checkpoint, since a fit that continues from there does not write earlier images. If an image cannot be written, the fit
+    continues, with one message in ``fit.messages``.
 
     Args:
         fit: The fit, before its first step.
@@ -149,7 +149,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
                 if sheet.done():
                     sheet.result()  # or what went wrong
             if step in steps:
-                # the thread must not ask the device for anything: steps may be being recorded then
+                # the thread must not use the device, since steps may be captured at that time
                 kept = [_on_host(d) for d in _shown(event)]
                 views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
                 writing.append(thread.submit(write, step, views, kept))

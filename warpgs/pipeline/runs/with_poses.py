@@ -75,7 +75,7 @@ def lost_lines(out: Path | None) -> list[str]:
 
 
 def _notes(record: dict[str, Any]) -> list[str]:
-    """Return what the report says of found poses: how they were found, and who has none."""
+    """Return the report's text on found poses: how they were found, and which photographs have none."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
     where = [f"see {POSED_SCENE}/{TEXT} of the run for photographs to add"] if record["advice"] else []
     return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]

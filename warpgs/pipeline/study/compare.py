@@ -162,7 +162,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
         if record is None and outcome.metrics is not None:
             say(f"  {summary_line(outcome.metrics)}")
         runs[key] = outcome
-        gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory piles up
+        gc.collect()  # a fit and its recorded steps refer to each other: without this their device memory is not freed
     return runs
 
 
@@ -175,7 +175,7 @@ def run_study(request: StudyRequest) -> list[str]:
         Lines for the user: the table and the notes.
 
     Raises:
-        DataError: A scene cannot be read or holds out no view; the LPIPS weights are none; or every run of a variant failed.
+        DataError: A scene cannot be read or holds out no view; the LPIPS weights are invalid; or every run of a variant failed.
         ResourceError: The folder cannot be written, another process writes into it, or the device is missing.
     """
     device, where = choose_device(request.device)

@@ -174,7 +174,7 @@ _LATEX = str.maketrans(
 
 
 def _escape(text: str) -> str:
-    """Escape the signs that mean something to LaTeX: names of scenes may be anybody's."""
+    """Escape LaTeX's special characters, since names of scenes are arbitrary."""
     return text.translate(_LATEX)
 
 

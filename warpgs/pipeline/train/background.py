@@ -70,7 +70,7 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
         train: Its training views.
 
     Raises:
-        UsageError: The wish is no colour.
+        UsageError: The request is not a colour.
     """
     color = color_of(wish)
     if color is not None:
@@ -113,5 +113,5 @@ def random_shift(seed: int, step: int, background: Sequence[float]) -> tuple[flo
 
 
 def _words(color: Color) -> str:
-    """Return a colour for people, as #rrggbb."""
+    """Return a colour as text, #rrggbb."""
     return "#" + "".join(f"{round(255 * c):02x}" for c in color)

@@ -1,6 +1,6 @@
 """Steps of several views: each view has a slot for its gradients; these are averaged in a fixed order, for one update.
 
-Slots are spread over the processes of a fit; all else of a step is done by every process, with the same bits.
+Slots are spread over the processes of a fit. Every process does the remaining work of a step, with the same bits.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
-"""Places in the last tensor that is summed, behind loss and squared error: how many processes were told to stop; and from where
-on each slot says why it stops the step."""
+"""Positions in the last summed tensor, after loss and squared error: the number of processes that were asked to stop; and the
+first of the slots' reasons to stop the step."""
 
 
 def update_by_sums(
@@ -70,7 +70,7 @@ class BatchSteps:
         self.slots = StepBuffers(buffers.device, 1, len(tree.slots))
         """Settings and results of this process's slots."""
         self.told_to_stop = False
-        """Whether this process was told to stop, which all hear of in the next step."""
+        """Whether this process was asked to stop; the next step tells all others."""
         self.sums: SlotSums | None = None
         """Sums over slots, of the sizes of the last step."""
         self._graphs = self._updates = None
@@ -112,7 +112,7 @@ class BatchSteps:
             self.slots.stop.zero_()
             return works[slot - own.start]()
 
-        first = [found_in(own.start)]  # whose statistics say what is summed
+        first = [found_in(own.start)]  # the strategy's statistics determine the sums
         finish = self._finish(first[0], plan, captured)
 
         def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
@@ -158,7 +158,7 @@ class BatchSteps:
         if not captured or self._updates is None:
             return work
         if self._update is None or self._update[0] != plan:
-            parts[-1].fill_(NOT_FINITE)  # what is run to be captured changes nothing
+            parts[-1].fill_(NOT_FINITE)  # runs before a capture change nothing
             self._update = (plan, self._updates.capture(work))
         return self._update[1].replay
 

@@ -15,7 +15,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views at most: where views have an alpha channel, and where all are opaque."""
+"""Steps of a fit of up to `FEW` views: with an alpha channel, and with opaque views."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Views from which steps grow beyond `MIN_STEPS`; the power of their number with which they do; and their bound."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
@@ -28,12 +28,12 @@ DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot distinguish a view-dependent colour from an error of the shape."""
 OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 60, 9
-"""Fraction of every opacity that a step takes; and the opaque views, and views with alpha, up to which it does so and there is
-one layer. With more views it takes none, and there are two layers. Up to 51 opaque views were measured, and gain; 8 views with
-alpha gain, 9 do not (docs/decisions/023-opacity-decay.md)."""
+"""Fraction by which a step lowers every opacity; and the largest numbers of opaque views, and of views with alpha, with this
+decay and one layer. With more views there is no decay, and there are two layers. Up to 51 opaque views were measured, and gain;
+8 views with alpha gain, 9 do not (docs/decisions/023-opacity-decay.md)."""
 SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
-"""Weight of the roughness of rendered depth up to so many opaque views, in fits of at least so many steps; else there is no
-such term: it was not measured with alpha, costs decibels with 9 views, and does not pay in 480 steps
+"""Weight of the roughness of rendered depth, the largest number of opaque views, and the least number of steps with this term:
+it was not measured with alpha, lowers PSNR with 9 views, and does not help in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Opaque views up to which a fit of at least `SMOOTH_STEPS` steps starts with extrapolated points where no view looks, and the
@@ -42,17 +42,17 @@ MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: they are
 too few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
 CPU_PIXELS = 1.55e6
-"""Pixels that two cores of a processor of 2.5 GHz train a second with about as many Gaussians; with fewer it is up to three
+"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians, up to three
 times as many."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
 ONE_LAYER = 1.1
-"""Time of a step on a CPU with one layer over that with two, of which fewer Gaussians grow."""
+"""Time of a step on a CPU with one layer over that with two layers, which have fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
 """Learning rates of the means and of the constant colour, and the factor of both where the time of a CPU limits the steps of
 more than so many views (docs/decisions/025-time-on-a-cpu.md)."""
 LOST_DB = 0.18
-"""PSNR that a fit on a CPU loses each time its steps are halved, at least [dB]; with many views it is more."""
+"""Least PSNR that a fit on a CPU loses each time its steps are halved [dB]; with many views it loses more."""
 
 
 def steps_by_views(views: int, opaque: bool = True) -> int:

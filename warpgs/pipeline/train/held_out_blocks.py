@@ -124,13 +124,13 @@ class Gain:
     mean: float
     """Mean over blocks of the fall of their error [dB]."""
     noise: float
-    """Standard error of that mean [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so it is
-    rather too small than too large."""
+    """Standard error of that mean [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
+    error may be larger."""
 
     def upper_bound_below(self, least: float, noises: float) -> bool:
-        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is no number.
+        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is NaN.
 
-        With few blocks the noise is large, so that a fit of unknown gain goes on.
+        With few blocks the noise is large, so that a fit of unknown gain continues.
         """
         return not self.mean + noises * self.noise >= least
 

@@ -144,7 +144,7 @@ def check_terms(terms: Sequence[LossTerm]) -> None:
     """Check that a run folder could name the class of each loss term, and that a render has what each needs.
 
     Raises:
-        UsageError: One is no loss term, its class is not registered by its own name, or it needs an unknown output.
+        UsageError: One is not a loss term, its class is not registered by its own name, or it needs an unknown output.
     """
     for term in terms:
         kind = type(term)

@@ -1,6 +1,6 @@
 """Memory that a fit needs, added up from what its parts declare, and the means to keep to a limit.
 
-A step holds parameters with their moments throughout, and on top of them what its heaviest moment needs. Each part declares its
+A step holds parameters with their Adam moments throughout, plus the memory of its largest phase. Each part declares its
 bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The
 CUDA driver, Python and the compiled kernels need more on top. Not counted, since they are small: parameters of single views,
 and the buffers of learning rates and losses (`StepBuffers`).
@@ -45,7 +45,7 @@ class Layout:
     table: Table
     """The Gaussians with their columns."""
     view_bytes: int
-    """Bytes of all views, those included that are kept beside them."""
+    """Bytes of all views, including data kept beside them."""
     graphs: int = 0
     """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
     sums: int = 0
@@ -127,7 +127,7 @@ class MemoryPlan:
     chunked_at_cap: bool = False
     """True where steps at the cap do."""
     graph_refused: bool = False
-    """True where captured steps would not keep to the limit, and steps are taken one by one."""
+    """True if captured steps would exceed the limit, so that steps are taken one by one."""
 
     def to_json(self) -> dict:
         """Return plain values for metrics.json."""

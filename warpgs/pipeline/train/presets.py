@@ -1,6 +1,7 @@
-"""Presets: named settings that a fit starts from. Ours are TOML files, and so may a user's be.
+"""Presets: named settings that a fit starts from.
 
-Importing this costs nothing: the help of one screen reads the names. The settings load when a preset is requested.
+Built-in presets are TOML files; a user may add others. Importing this module is fast, since the short help reads only the
+names. The settings are loaded when a preset is requested.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ MAX_BYTES = 2**16
 MAX_DEPTH = 8
 """Number of tables and lists that may lie in each other."""
 MAX_DOTS = 100
-"""Number of dots in a line: Python's reader of TOML takes the square of the parts of a key as time."""
+"""Number of dots in a line: The time of Python's TOML reader grows with the square of the parts of a key."""
 MAX_BASES = 8
 """Number of presets that may start from each other."""
 DEFAULT_PRESET = "default"
@@ -37,7 +38,7 @@ DEFAULT_PRESET = "default"
 NO_BASE = "none"
 """Base of a preset that starts from the defaults of `FitConfig`."""
 OWN_KEYS = ("base", "about")
-"""Keys of a preset that are no settings."""
+"""Keys of a preset that are not settings."""
 
 
 class Presets(Mapping[str, "FitConfig"]):
@@ -101,7 +102,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
             are the names of flags; ``base`` names the preset that it starts from, default where it is not given.
 
     Raises:
-        DataError: The file cannot be read or is no TOML.
+        DataError: The file cannot be read or is not TOML.
         UsageError: There is no such preset, or one of its settings is unknown or of another type.
     """
     from warpgs.pipeline.train.config import FitConfig
@@ -131,7 +132,7 @@ def chosen_settings(
     """Return the settings of a preset with some replaced, as `warpgs.fit` takes both, and notes on where they come from.
 
     Raises:
-        DataError: The file of a preset cannot be read or is no TOML.
+        DataError: The file of a preset cannot be read or is not TOML.
         UsageError: There is no such preset, or a setting is unknown or of another type.
     """
     from warpgs.pipeline.train.config import FitConfig
@@ -168,7 +169,7 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a TOML file, and the first digits of its SHA-256.
 
     Raises:
-        DataError: It cannot be read, is too large or too deep, or is no TOML.
+        DataError: It cannot be read, is too large or too deep, or is not TOML.
     """
     remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
     try:

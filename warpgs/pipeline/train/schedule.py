@@ -22,7 +22,7 @@ def sh_degree(step: int, every: int, highest: int) -> int:
 MAX_LR = 1e6
 """Largest learning rate: far above what trains, far below what overflows within a fit."""
 MAX_DECAY = 0.1
-"""Largest fraction of an opacity that a step may take: by then nothing stays opaque."""
+"""Largest fraction by which a step may lower an opacity: with it nothing stays opaque."""
 
 
 def check_lrs(of: str, **rates: float | None) -> None:

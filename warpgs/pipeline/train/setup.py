@@ -62,8 +62,7 @@ def prepare(
     Raises:
         DataError: There is nothing to start from.
         UsageError: A view's camera cannot be rendered: its model is missing, or it has other coefficients. A given map is of
-            another size or not finite. Or the start or
-            the strategy compares views, and a camera is no pinhole.
+            another size or not finite. Also if the start or the strategy compares views, and a camera is not a pinhole.
     """
     for view in train:
         check_camera(view.camera)
@@ -107,10 +106,10 @@ def _start_of(
     usable: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
     """Return the first points and the depths that come with them; arguments are those of `prepare` and `initial_points`."""
-    # what is searched for along lines is searched for in pinholes; given points need no search
+    # searches along lines need pinhole images; given points need no search
     views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
     found = initial_points(views, points, config.init, generator, usable, progress)
-    if found.depths is None and any_given(views):  # a start that searches for none
+    if found.depths is None and any_given(views):  # a start without a search for depth
         depths, lines = with_given_depth(views, None, seen_points(views, points))
         found = found._replace(depths=depths, how="\n".join((found.how, *lines)))
     if found.depths is not None:

@@ -1,8 +1,8 @@
 """Sums over the views of a step, its slots, in one order for any number of processes.
 
 Numbers of float32 are added in a fixed binary tree over the slots 0 to B - 1: slots ``first`` to ``end`` are those up to the
-largest power of two below their number, plus the others. A process sums the largest subtrees of its own slots; from those of
-all processes each finishes the same tree, and has the same bits as one process alone.
+largest power of two below their number, plus the others. Each process sums the largest subtrees of its own slots. From the
+subtrees of all processes, each then finishes the same tree, with the same bits as a single process.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ class SlotSums:
             self.rows[row].add_(self.rows[row + 1])
 
     def _exchange(self) -> None:
-        """Finish the tree: each process does a slice of the numbers with the sums of all, and gives it to all."""
+        """Finish the tree: each process adds one slice of the numbers over all processes, and sends it to all."""
         tree, ranks = self.tree, self.tree.ranks
         count, width = ranks.count, tree.width
         sent = self.rows[:width].view(width, count, -1).transpose(0, 1).contiguous()

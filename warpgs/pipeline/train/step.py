@@ -58,7 +58,7 @@ class StepPlan:
     opacity_decay: float = 0.0
     """Fraction of every opacity that the step takes."""
     spares_unused: bool = False
-    """True to take none of a Gaussian that the step does not use."""
+    """True to keep the opacity of Gaussians that the step does not use."""
 
 
 class StepBuffers:
@@ -78,7 +78,7 @@ class StepBuffers:
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
         """Number of the current step in its series. It stays once a step stops, and so do all Gaussians."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
-        """0 while steps go on, else the reason why they stopped."""
+        """0 while steps continue, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device)
         """Loss and mean squared error of each step."""
         self.one = torch.ones((), device=device)
@@ -369,7 +369,7 @@ class StepGraphs:
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
         with torch.cuda.stream(self.stream):
-            # a first run loads kernels and fills caches, which may not happen while capturing; it changes no parameter
+            # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
             buffers.stop.fill_(NOT_FINITE)
             buffers.view_rows.zero_()
             work()

@@ -1,4 +1,4 @@
-"""Figures of a step, for those who follow a fit."""
+"""Figures of a step, for callbacks and displays."""
 
 from dataclasses import dataclass
 

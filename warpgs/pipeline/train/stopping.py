@@ -190,7 +190,7 @@ class Stopping:
         return self.why != ""
 
     def _reason(self, step: int, errors: torch.Tensor) -> str:
-        """Return why growth ends after a step with these errors of the blocks [B]; nothing where it goes on."""
+        """Return why growth ends after a step with these errors of the blocks [B]; empty if growth continues."""
         c = self.config
         assert c.min_gain_db is not None
         since, earlier = next((m for m in reversed(self.measured) if m[0] * LATELY <= step), (0, None))

@@ -70,7 +70,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     Returns: The configuration with its steps, and a note on the choice.
 
     Raises:
-        UsageError: The budget is no positive number, or too short for the shortest fit.
+        UsageError: The budget is not a positive number, or too short for the shortest fit.
     """
     check_budget(seconds)
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
@@ -96,7 +96,7 @@ def check_budget(seconds: float) -> None:
     """Check a time budget [s].
 
     Raises:
-        UsageError: It is no positive, finite number.
+        UsageError: It is not a positive, finite number.
     """
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

@@ -115,7 +115,7 @@ class Trainer:
             c.groups(), c.strategy_config, self.table, self.generator, c.seed, plan_phases(c.phases, c.steps), extent, c.rule,
             self.background, antialiased=c.antialiased,
         )  # fmt: skip
-        """What the strategy sees of the fit; views, phases and the scene's size have their place there."""
+        """The parts of the fit that the strategy works with: views, phases, the scene's size and others."""
         self.strategy, self.stopping = find_strategy(c.strategy)(self.context), Stopping(c.stopping)
         self.table.add_columns(self.strategy.columns())
         views = LearnedViews.first(c.view_modules, train, device)
@@ -262,7 +262,7 @@ class Trainer:
             error.view = chosen[done + error.slot]
             raise error
         if stop:
-            self.taker.clear()  # they are captured anew with more capacity
+            self.taker.clear()  # they are captured again with more capacity
         counts = [len(self.table)] * done
         if done == count:
             self._update()

@@ -52,7 +52,7 @@ def built_in_terms(
     Args:
         config: Weights.
         cutout: Its images have an alpha channel.
-        depth: Depth is given of a view.
+        depth: True if a view has given depth.
         normals: Normals are given of a view.
     """
     terms: list[LossTerm] = [Photometric(config.ssim_weight)]

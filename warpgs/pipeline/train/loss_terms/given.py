@@ -39,7 +39,7 @@ def inverse_depth_difference(
         target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: means over pixels stay what they are.
         mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
-    shown = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
+    shown = ~(alpha <= MIN_ALPHA)  # True for a NaN, so that it reaches the loss
     shown = shown if mask is None else shown & (mask > 0)
     weight = torch.where(shown, target[..., 1], 0)
     inverse = target[..., 2] / torch.where(shown & (target[..., 1] > 0), depth, 1)
@@ -91,7 +91,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
     shown = shown if mask is None else shown & (mask > 0)
-    # the root in float64: float32's has other last digits on other processors (MKL)
+    # the root in float64, since the rounding of float32's depends on the processor (MKL)
     length = target.square().sum(-1).double().sqrt().to(target.dtype)
     weight = torch.where(shown, length, 0)
     off = torch.where(weight > 0, length - (normals * target).sum(-1), 0)
@@ -123,7 +123,7 @@ class GivenNormalsDifference(LossTerm):
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
         """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
         depth = torch.where(inputs.outputs["alpha"] <= MIN_ALPHA, 0, inputs.outputs["depth"])
-        # in the axes of the camera, as the given ones: a refined pose gets no gradient
+        # in the axes of the camera, like the given normals: a refined pose gets no gradient
         camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
         target = inputs.target
         return self.weight * normal_difference(depth_normals(camera, depth), target.maps["given_normals"], target.mask)

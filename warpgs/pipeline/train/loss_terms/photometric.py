@@ -18,7 +18,7 @@ def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.devi
 
     They are cached for good, as CUDA graphs refer to their memory.
     """
-    with torch.inference_mode(False):  # whoever asks first: what is made in that mode cannot be trained with
+    with torch.inference_mode(False):  # a first call may come in inference mode, whose tensors cannot be used in training
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
 
 

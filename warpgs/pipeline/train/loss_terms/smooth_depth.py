@@ -1,8 +1,8 @@
-"""Smoothness of rendered depth, for few views: what they leave ambiguous becomes planes, not fog.
+"""Smoothness of rendered depth, for few views: ambiguous depth becomes planar instead of fog.
 
 On a plane, inverse depth is a linear function of the pixel. So the term is the mean of |z/z' + z/z'' - 2|, with the depths z'
-and z'' of both neighbours of a pixel in its row, and the same in its column. It has no unit. Edges of colour weaken it, pixels
-whose depth another view confirms count less, and a bound frees jumps of depth where colour shows none
+and z'' of both neighbours of a pixel in its row, and the same in its column. It has no unit. Its weight is lower at edges of
+colour and at pixels with consistent depth. A bound allows depth to jump where colour does not
 (docs/decisions/024-smooth-depth.md).
 """
 
@@ -24,7 +24,7 @@ MIN_ALPHA = 0.3
 EDGE = 0.1
 """Difference of colour between both neighbours, mean of the channels, at which the weight falls to 1/e."""
 BOUND = 0.1
-"""Largest value of a pixel: beyond it nothing pulls."""
+"""Largest value of a pixel: beyond it the gradient is 0."""
 CONFIRMED = 0.2
 """Weight of pixels with consistent depth."""
 MAPS = 12
@@ -43,7 +43,7 @@ def depth_roughness(
         weight: Weights of the pixels, shape [H, W].
         mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
-    shown = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
+    shown = ~(alpha <= MIN_ALPHA)  # True for a NaN, so that it reaches the loss
     shown = shown if mask is None else shown & (mask > 0)
     z = torch.where(shown, depth, 1)
     value = z.new_zeros(())

@@ -66,7 +66,7 @@ class DensityConfig:
 
 
 def _exp(x: torch.Tensor) -> torch.Tensor:
-    """Return e^x by way of float64: float32's has other last digits on other processors (MKL)."""
+    """Return e^x computed in float64, since the rounding of float32's depends on the processor (MKL)."""
     return x.double().exp().to(x.dtype)
 
 
@@ -114,7 +114,7 @@ def refine(
     with torch.no_grad():
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
         scales = _exp(tensors["log_scales"].amax(1))
-        logits = tensors["logit_opacities"]  # torch's sigmoid depends on the number of threads in its last digit
+        logits = tensors["logit_opacities"]  # the rounding of torch's sigmoid depends on the number of threads
         grows = pull > config.gradient
         if growing is not None:
             grows &= growing
@@ -127,7 +127,7 @@ def refine(
         faint = ~(logits >= geometry.logit(config.prune_opacity))
         if after_reset and config.prune_size > 0:
             huge = scales > config.prune_size * extent
-            if 2 * int(huge.sum()) <= len(gaussians):  # else it is the extent that is small: the cameras stand close together
+            if 2 * int(huge.sum()) <= len(gaussians):  # else the extent itself is small, since the cameras stand close together
                 faint |= huge
         if protected is not None:
             faint &= ~protected

@@ -83,7 +83,7 @@ def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tens
     new = -torch.expm1(torch.log1p(-o) / N)
     integral = torch.zeros_like(o)
     for i in range(1, int(copies.max()) + 1 if len(copies) else 0):
-        # the i-th of N is seen through i - 1 others: new (1 - new)^(i - 1), integrated power by power
+        # i - 1 others lie in front of the i-th of N: new (1 - new)^(i - 1), integrated power by power
         terms = [math.comb(i - 1, k) * (-1) ** k / math.sqrt(k + 1) * new ** (k + 1) for k in range(i)]
         integral += torch.where(copies >= i, sum(terms), 0)
     return new.to(opacities), (o / integral).to(opacities)
@@ -165,7 +165,7 @@ class MCMC(Strategy):
     def regularisation(self, phase, gaussians):
         """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
         c = self.config
-        # by way of float64: float32's functions have other last digits on other processors
+        # in float64, since the rounding of float32's functions depends on the processor
         opacity, scale = gaussians.logit_opacities.double().sigmoid().mean(), gaussians.log_scales.double().exp().mean()
         return (c.opacity_weight * opacity + c.scale_weight * scale).to(gaussians.log_scales.dtype)
 

@@ -147,7 +147,7 @@ def check_modules(modules: Sequence[ViewModule]) -> None:
     """Check that a run folder could name the class of each view module.
 
     Raises:
-        UsageError: One is no view module, its class is not registered by a name of its own, or two are of one class.
+        UsageError: One is not a view module, its class is not registered under its own name, or two are of one class.
     """
     for i, module in enumerate(modules):
         kind = type(module)

@@ -2,8 +2,8 @@
 
 A camera with automatic exposure and white balance changes the colours between photographs. With exposures a step compares the
 view's image with A rgb + b of its render. The learned parameters are the 12 numbers of [A - 1 | b], which start at zero. A step
-uses them less their mean over all training views, so that the model has their mean exposure: else all of them could turn darker
-while the Gaussians turn brighter, and no training image would tell.
+subtracts their mean over all training views, so that the model has the mean exposure. Otherwise all exposures could become
+darker while the Gaussians become brighter, with the same training images.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def exposure_of(rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
 
     No gradient flows into the mean: only the rows of ``own`` are learned from.
     """
-    # in float64, whose rounding no number of threads shows in float32
+    # in float64, so that the float32 result is the same for any number of threads
     return own - rows.detach().mean(0, dtype=torch.float64).to(own.dtype)
 
 
@@ -45,7 +45,7 @@ class _Exposed(torch.autograd.Function):
     def forward(ctx: Any, rgb: torch.Tensor, exposure: torch.Tensor) -> torch.Tensor:
         ctx.save_for_backward(rgb, exposure)
         m = exposure.view(CHANNELS, CHANNELS + 1)
-        # sums of products one by one, not a matrix product, whose order of summation is the library's
+        # explicit sums, since the order of summation in a matrix product depends on the library
         found = rgb + m[:, CHANNELS]
         for k in range(CHANNELS):
             found += rgb[..., k : k + 1] * m[:, k]

@@ -1,9 +1,9 @@
 """Refinement of training poses: an increment of each camera, learned with the Gaussians.
 
 A training view i > 0 is rendered from T_i viewmat_i, where T_i turns by a rotation w_i about the camera's centre and moves by
-t_i in the camera's axes. The first camera stays, so that the scene as a whole cannot turn or wander away; what is left free,
-its size, no image shows. The rotation is Cayley's map of w / 2, of angle 2 atan(|w| / 2): for small w that of exp(w), without
-a case for w = 0, and with the same bits on every processor.
+t_i in the camera's axes. The first camera stays fixed, so that the scene as a whole cannot rotate or drift. Its scale remains
+free, but does not change any image. The rotation is Cayley's map of w / 2, of angle 2 atan(|w| / 2): for small w that of
+exp(w), without a case for w = 0, and with the same bits on every processor.
 
 A focal length that is not known exactly can be learned too: fx and fy of every view of one camera are multiplied by
 s = (2 + z) / (2 - z), which is exp(z) to second order and positive for |z| < 2. Views with the same intrinsics and size count
@@ -37,7 +37,7 @@ RULE = (
     "held-out views are moved by the one similarity that takes the given training cameras to the refined ones best; their "
     "own images are not looked at"
 )
-"""Rule for the poses of held-out views, for people."""
+"""Rule for the poses of held-out views, as text for the user."""
 
 
 def increments(rotation: torch.Tensor, translation: torch.Tensor) -> torch.Tensor:
@@ -63,7 +63,7 @@ def moved(viewmats: torch.Tensor, rotation: torch.Tensor, translation: torch.Ten
         translation: t of each [u], shape [B, 3].
     """
     motion = increments(rotation, translation)
-    # four products, not a matrix product, whose order of summation is the library's
+    # four products, since the order of summation in a matrix product depends on the library
     products = [motion[..., k : k + 1] * viewmats[..., k : k + 1, :] for k in range(4)]
     return products[0] + products[1] + products[2] + products[3]
 
