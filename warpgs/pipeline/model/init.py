@@ -15,7 +15,6 @@ from warpgs.colors import base_coefficients
 from warpgs.errors import DataError, UsageError
 from warpgs.kernels.knn import mean_square_distances
 from warpgs.kernels.sh import coefficient_count
-from warpgs.pipeline.metrics.region import fitted_region
 from warpgs.pipeline.model.depth_points import NOTHING, coarse_points, depth_bounds, joined
 from warpgs.pipeline.model.extrapolation import EXTRAPOLATED_OPACITY, all_count, extrapolated_points
 from warpgs.pipeline.model.hull import hull_points, in_empty_region, silhouettes
@@ -162,8 +161,7 @@ def _number_extrapolated(views: list[View], count: int) -> str:
     """Return how many points are extrapolated, for the user, and why there are none."""
     if count:
         return f"{count:,} extrapolated where no view looks"
-    parts = any(fitted_region(v)[0] is not None for v in views)
-    return "none extrapolated" + (", since masks, alpha or black leave out parts of the views" if parts else "")
+    return "none extrapolated" + ("" if all_count(views) else ", since masks, alpha or black leave out parts of the views")
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:

@@ -100,8 +100,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         train: Training views.
         device: Kind of device, cpu or cuda: on a CPU the steps are limited to a time, unless ``cpu_limit`` is off.
     """
-    views, notes = len(train), []
-    optimizer = config.optimizer
+    views, optimizer = len(train), config.optimizer
     if optimizer.scales_lr is None:
         lr = SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER
         optimizer = dataclasses.replace(optimizer, scales_lr=float(f"{lr:.3g}"))
@@ -146,27 +145,30 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if loss.smooth_weight is None:
         smooth = opaque and views <= SMOOTH_VIEWS and steps >= SMOOTH_STEPS
         loss = dataclasses.replace(loss, smooth_weight=SMOOTH_WEIGHT if smooth else 0.0)
+    made = dataclasses.replace(
+        config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init, optimizer=optimizer,
+        method=method, loss=loss, stopping=stopping,
+    )  # fmt: skip
+    words = _words_of_choices(config, made, wanted)
+    named = Detail(f"settings for {views} views: {', '.join(words)}") if words else ""
+    return made, [note for note in (named, limit) if note]
+
+
+def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
+    """Return words for each setting of ``made`` that ``config`` leaves open; ``wanted`` are the steps without a limit."""
+    optimizer, half = made.optimizer, made.half_resolution
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
-        f"at most {wanted:,} steps{each}": config.steps, f"SH degree {degree}": config.sh_degree,
+        f"at most {wanted:,} steps{each}": config.steps, f"SH degree {made.sh_degree}": config.sh_degree,
         f"means_lr {optimizer.means_lr:g}": config.optimizer.means_lr,
         f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
         f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
         f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
-        f"smooth_weight {loss.smooth_weight:g}": config.loss.smooth_weight,
-        f"{'extrapolated' if init.extrapolate else 'no'} points where no view looks": config.init.extrapolate,
-        "held-out blocks" if stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,
-        "two layers" if method.hier else "one layer": config.method.hier,
+        f"smooth_weight {made.loss.smooth_weight:g}": config.loss.smooth_weight,
+        f"{'extrapolated' if made.init.extrapolate else 'no'} points where no view looks": config.init.extrapolate,
+        "held-out blocks" if made.stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,
+        "two layers" if made.method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
     }  # fmt: skip
-    open_ = [words for words, given in chosen.items() if given is None]
-    if open_:
-        notes.append(Detail(f"settings for {views} views: {', '.join(open_)}"))
-    if limit:
-        notes.append(limit)
-    chosen_parts = {
-        "steps": steps, "sh_degree": degree, "sh_every": sh_every, "half_resolution": half, "init": init,
-        "optimizer": optimizer, "method": method, "loss": loss, "stopping": stopping,
-    }  # fmt: skip
-    return dataclasses.replace(config, **chosen_parts), notes
+    return [words for words, given in chosen.items() if given is None]
