@@ -138,11 +138,11 @@ def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[
 
 
 def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
-    """Return what the given depth of a view means in scene units, by its references.
+    """Return the given depth of a view in scene units, scaled by its references.
 
     Args:
         view: A view with given depth.
-        found: Searched depth of the view that others confirm; None for none.
+        found: Depth of the view by the sweep that others confirm; None for none.
         known: Points of the reconstruction, with the views that saw them.
     """
     assert view.depth is not None

@@ -70,7 +70,8 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
     Args:
         pieces: The stream, in order.
-        limit: Number of bytes that are wanted. A little more is unpacked, in which damage shows, and no whole bomb.
+        limit: Number of bytes that are wanted. At most a little more is unpacked, which reveals damage but does not unpack a
+            bomb.
 
     Raises:
         ValueError: The stream is damaged or ends early.

@@ -126,7 +126,7 @@ class Trainer:
         self.taker = StepTaker(self.learned, self.buffers, self.context.render_options(), self.batch, self.ranks)
 
     def _begin(self, views: list[TrainingView]) -> None:
-        """Train on these views, or on what early stopping leaves of them."""
+        """Train on these views, without the blocks that early stopping holds out."""
         self.set_views(views)
         self.strategy.setup()
         self.notes += self.stopping.begin(self.context, self.strategy, self.half_resolution)

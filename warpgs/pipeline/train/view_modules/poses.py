@@ -130,7 +130,7 @@ def refined_cameras(
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `RULE`.
 
     Where focal lengths are learned, a held-out view has that of the training views of its camera, or the mean factor of all
-    training views if its intrinsics are those of none.
+    training views if no training view has its intrinsics.
 
     Args:
         given: Cameras as given, in scene units, by name.
