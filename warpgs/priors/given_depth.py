@@ -284,9 +284,9 @@ def _notes(
             f"{sum(a.references for a in compared):,} pixels"
         )
     if len(compared) < len(used):
-        notes[0] += f"; {len(used) - len(compared)} of them compared with nothing"
+        notes[0] += f"; {len(used) - len(compared)} of them without a comparison"
     if removed:
-        notes[0] += f"; {removed:.1%} left out, because other views look through them"
+        notes[0] += f"; {removed:.1%} left out, because other views see through them"
     if refused:
         shown = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
         notes.append(f"given depth: {len(refused)} maps are not used: {shown}{' ...' if len(refused) > SHOWN else ''}")

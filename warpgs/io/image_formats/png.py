@@ -104,4 +104,4 @@ def check(data: bytes) -> None:
     parts = list(chunks(data))
     expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)
     if unpacked_size((body for kind, body in parts if kind == b"IDAT"), expected) != expected:
-        raise ValueError("it holds another number of pixels than its header gives")
+        raise ValueError("its number of pixels differs from its header")

@@ -108,7 +108,7 @@ def view_bytes(views: Iterable[TrainingView]) -> int:
 
 
 def with_alpha(views: Sequence[View]) -> list[View]:
-    """Return the views, opaque ones with an opacity of 1 everywhere [H, W] if another one has an opacity: all have one then."""
+    """Return the views; if any has an opacity, opaque ones get an opacity of 1 everywhere [H, W]."""
     if all(v.alpha is None for v in views):
         return list(views)
     return [replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) if v.alpha is None else v for v in views]
