@@ -61,7 +61,7 @@ def check_stored(gaussians: object) -> None:
     """Check that Gaussians have log scales and logits, as in files, and tensors of matching shapes.
 
     Raises:
-        TypeError: They are of another kind, or one is not a tensor.
+        TypeError: The Gaussians have other parameters, or one is not a tensor.
         ValueError: A shape disagrees.
     """
     if not isinstance(gaussians, Gaussians):
@@ -83,7 +83,7 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     """Return Gaussians in other units; the tensors are shared where nothing changes.
 
     Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
-    Sums are taken in float64: georeferenced offsets of 10^6 m would eat the millimetres of a float32.
+    Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.
 
     Args:
         gaussians: N Gaussians in the units ``source``, on any device.

@@ -24,7 +24,7 @@ class DataError(WarpgsError):
 
 
 class NotFiniteError(WarpgsError):
-    """The loss or a parameter of a fit stopped being a number."""
+    """The loss or a parameter of a fit became non-finite."""
 
     view: int | None = None
     """Number of the training view with that loss; None for other values."""

@@ -101,7 +101,7 @@ def _reachable(folder: Folder) -> Path:
 def filling(folder: Path) -> Iterator[Path]:
     """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
 
-    Where anything fails, an error of the block included, the temporary folder goes and nothing is left of it. It is locked
+    On any error, also of the block, the temporary folder is removed. It is locked
     meanwhile. Left-overs of killed writers beside it are removed.
 
     Args:
@@ -109,7 +109,7 @@ def filling(folder: Path) -> Iterator[Path]:
 
     Raises:
         ResourceError: The disk is full, or the folder above is not writable or behind a link that is not followed.
-        UsageError: It is the folder that this process works in, which would be lost to it.
+        UsageError: The folder is the current directory of this process.
     """
     target = folder.absolute() if is_below(folder) else Path(os.path.realpath(folder))
     if os.path.realpath(target) == os.path.realpath(Path.cwd()):
@@ -227,7 +227,7 @@ def read_file(path: Path, below: Path) -> bytes:
         below: Folder that contains it; no link below that folder is followed.
 
     Raises:
-        DataError: It cannot be read, or is a link or no regular file.
+        DataError: It cannot be read, is a link, or is not a regular file.
     """
     try:
         return read_input(path, below=below)
@@ -239,7 +239,7 @@ def appending(path: Path) -> BinaryIO:
     """Open a file to append to, made if it is missing; a link is not followed.
 
     Raises:
-        OSError: It cannot be opened, or is a link or no regular file.
+        OSError: It cannot be opened, is a link, or is not a regular file.
     """
     with open_folder(path.parent) as folder:
         descriptor = folder.open_regular(path.name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -260,7 +260,7 @@ def remove_file(path: Path) -> None:
 
 
 def move_folder(folder: Path, name: str) -> Path:
-    """Give a folder another name where it is, and return its path.
+    """Rename a folder in its place, and return its path.
 
     Raises:
         OSError: It cannot be moved, or is a link.

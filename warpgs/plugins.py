@@ -31,9 +31,9 @@ T = TypeVar("T", bound=Named)
 class Registry(Generic[T]):
     """Classes of one kind by name.
 
-    Ours are the modules of a package, each imported when a name is looked for, so that a new one is a new file. A user's own
-    is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. Nothing is ever
-    imported because a stored file names it.
+    Built-in classes are in the modules of a package, which are imported to look up a name; so a new class is a new file. A
+    user's own is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. Nothing
+    is ever imported because a stored file names it.
     """
 
     def __init__(self, kind: str, base: type[T], package: str):
@@ -86,7 +86,7 @@ class Registry(Generic[T]):
         return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name
 
     def described(self) -> dict[str, str]:
-        """Return a line about each of ours by name: its ``description``, or the first sentence of its docstring."""
+        """Return a line about each built-in class by name: its ``description``, or the first sentence of its docstring."""
         return {name: _line_about(self._classes[name]) for name in self.names()}
 
     def knows(self, name: str) -> bool:

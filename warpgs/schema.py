@@ -1,7 +1,7 @@
 """Schemas of untrusted JSON: its size and depth are bounded, and every value has the expected type.
 
-A schema is a function of a value and of its place in the file. It returns nothing and raises `SchemaError` where the value is
-another than it may be.
+A schema is a function of a value and of its place in the file. It returns nothing, and raises `SchemaError` for an invalid
+value.
 """
 
 from __future__ import annotations

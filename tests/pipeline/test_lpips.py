@@ -174,8 +174,8 @@ def test_bad_sources_are_named(files, tmp_path):
     refused("cannot be read as a torch state dict", heads=saved({"lin0.model.1.weight": Evil()}))
     refused("holds a list", heads=saved([1, 2]))
     narrow = {f"lin{i}.model.1.weight": torch.zeros(1, 7, 1, 1) for i in range(5)}
-    refused("heads of no network known here", heads=saved(narrow))
-    refused("heads of no network known here", heads=backbone)
+    refused("heads of an unsupported network", heads=saved(narrow))
+    refused("heads of an unsupported network", heads=backbone)
     other = {f"features.{k}": v for k, v in BUILD["alex" if net == "vgg" else "vgg"]().state_dict().items()}
     refused("features.0.weight", backbone=saved(other))
     nan = {f"features.{k}": torch.full_like(v, float("nan")) for k, v in features.state_dict().items()}

@@ -112,7 +112,7 @@ def test_depth_that_other_views_look_through_is_left_out(monkeypatch):
     wrong[40:60, 60:90] *= 0.5
     maps = [depths[0], wrong, depths[2]]
     found, notes = with_given_depth([given(v, d) for v, d in zip(views, maps)], swept(), NO_POINTS)
-    assert (found[1].given[42:58, 62:88] > 0).mean() < 0.1 and "left out, because other views look through them" in notes[0]
+    assert (found[1].given[42:58, 62:88] > 0).mean() < 0.1 and "left out, because other views see through them" in notes[0]
     assert (found[1].given > 0).mean() > 0.9
     confirm, through = votes(views, [d.astype(np.float32) for d in maps], 1)
     assert through[50, 75] == 2 and confirm[50, 75] == 0 and confirm.max() == 2
@@ -162,7 +162,7 @@ def test_the_start_is_at_the_given_depth():
     again = initial_points(mapped, None, config, np.random.default_rng(0))
     assert np.array_equal(start.cloud.points, again.cloud.points)
     alone = initial_points(mapped[:1], None, config, np.random.default_rng(0))
-    assert "1 of them compared with nothing" in alone.how and len(alone.cloud) > 500
+    assert "1 of them without a comparison" in alone.how and len(alone.cloud) > 500
 
 
 def test_maps_from_python_are_checked():

@@ -123,7 +123,7 @@ def test_a_region_beats_saliency():
     region[10:20, 20:40] = True
     (prior,), notes = view_priors([view(shapes()[0])], PriorConfig(), regions=[region])
     assert (prior.foreground == region).all() and (prior.confidence == 1).all()
-    assert any("a mask is surer than saliency" in n and isinstance(n, Detail) for n in notes)
+    assert any("a mask is more reliable than saliency" in n and isinstance(n, Detail) for n in notes)
 
 
 def test_classical_sources_say_so():

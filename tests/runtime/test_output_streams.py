@@ -20,7 +20,7 @@ from warpgs.runtime.terminal import answer, say
 from warpgs.synthetic.demo import split_spec, write_demo
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the shell of these tests is sh")
-GOES_ON = "; the command goes on without it\n"
+GOES_ON = "; the command continues without it\n"
 LOST = {
     "| true": "Broken pipe", "> /dev/full": "No space left on device", ">&-": "Bad file descriptor",
     "2>&-": "", "2> /dev/full": "", "<&- >&- 2>&-": "", "> /dev/full 2>&1": "",

@@ -10,7 +10,7 @@ Loaded = TypeVar("Loaded")
 
 
 def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
-    """Return what ``load`` returns; an error of the code that it imports becomes one sentence.
+    """Return what ``load`` returns; an error in the imported code is reported in one sentence.
 
     Args:
         kind: Kind of the loaded object, for messages.

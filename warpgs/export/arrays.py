@@ -94,7 +94,7 @@ def sigmoid(logits: np.ndarray) -> np.ndarray:
 
 
 def logits(opacities: np.ndarray, quantum: float) -> np.ndarray:
-    """Return log(p / (1 - p)) [N] in float64; 0 and 1 are taken for a quarter of a quantum away, as logits are finite."""
+    """Return finite log(p / (1 - p)) [N] in float64; 0 and 1 are moved inwards by a quarter of a quantum."""
     p = np.clip(opacities.astype(np.float64), 0.25 * quantum, 1 - 0.25 * quantum)
     return np.log(p) - np.log1p(-p)
 

@@ -302,7 +302,7 @@ class SPZ(Format):
     declares = True
     note = (
         "SPZ has y up, as Niantic defines it; SuperSplat, splat-transform 3, gsply and gaussforge take its axes for those of "
-        "PLY: --rotate 1,0,0,180 turns a file from them or for them"
+        "PLY: --rotate 1,0,0,180 converts files from or for them"
     )
     decode = staticmethod(decode)
 

@@ -308,12 +308,12 @@ def load_image(
 ) -> LoadedImage:
     """Decode an image, rotate it upright by EXIF, remove distortion, and resample.
 
-    Colours are resampled in proportion to their opacity, so that what transparent pixels hold does not run into others.
+    Colours are resampled in proportion to their opacity, so that the colours of transparent pixels do not affect others.
 
     Args:
         path: The image file.
         lens: Its intrinsics, at any size; they are scaled to the image. Or a function that makes them from the width and
-            height [px] of the stored raster, for formats that leave the size to the image.
+            height [px] of the stored raster, for formats that do not store the image size.
         downscale: Factor by which both sides shrink (area resampling).
         mask: How far a pixel is kept, in [0, 1], [H, W] at the size of the file or of the same aspect.
         background: Colour in [0, 1] behind transparent pixels.

@@ -96,7 +96,7 @@ class MapFolder:
         """Keys of the maps that images requested."""
 
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
-        """Return the files of map and confidence of an image; None for what there is not.
+        """Return the files of map and confidence of an image; None for a missing one.
 
         A map has the path of the image below any folder above it, so `a/b.jpg` has `a/b.png` or `b.png`; the longest counts.
         """

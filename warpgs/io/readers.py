@@ -23,7 +23,7 @@ DEFAULT_MAX_SIDE = 1600
 
 
 def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
-    """Return the factor and the longest side [px] (0 for no limit) that a user's two wishes come to; None for not given."""
+    """Return the factor and the longest side [px] (0 for no limit) that follow from two settings, each None if not given."""
     if max_side is None:
         max_side = DEFAULT_MAX_SIDE if downscale is None else 0
     return 1 if downscale is None else downscale, max_side

@@ -164,9 +164,9 @@ def _explicit(names: list[str], spec: str) -> Split:
 def split_views(scene: Scene, spec: str) -> Split:
     """Return the split of a scene that a specification names.
 
-    ``llff:K`` and ``mip360:K``: of the sorted views every 8th is held out, K of the rest are chosen evenly. ``dtu:K`` and
-    ``blender:8``: the published ids. ``every:N``: every Nth is held out, the rest trains. ``all``: none is held out.
-    ``train=a,b;test=c``: names, with or without suffix; where one half is missing it is the rest.
+    ``llff:K`` and ``mip360:K``: of the sorted views every 8th is held out, K of the others are chosen evenly. ``dtu:K`` and
+    ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
+    ``train=a,b;test=c``: names, with or without suffix; a missing half consists of all other views.
 
     Raises:
         DataError: The scene lacks views of the split, or training and test views overlap.

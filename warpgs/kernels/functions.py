@@ -86,8 +86,8 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         real: wp.float32 or wp.float64.
         camera_model: Name of the camera model, whose functions are compiled in.
         parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        lanes: True for loops that the compiler vectorises: without branches and calls, so a Gaussian is computed to the end
-            even where it is culled, with scales and opacities that were activated before.
+        lanes: True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to the
+            end, too. Scales and opacities are activated beforehand.
     """
     r = make_rotations(real)
     factor = make_covariance(real).factor

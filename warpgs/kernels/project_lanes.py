@@ -16,7 +16,7 @@ LANES = 16
 def make_lanes(real, camera_model: str, parameters: str, bases: int):
     """Make the record of a task's Gaussians and its functions; arguments are those of `project_cpu_backward.make_backward`.
 
-    A loop over the lanes vectorises, since what is alike of all lanes lies side by side.
+    A loop over the lanes vectorises, since each value of all lanes is contiguous.
     """
     m = make_projection(real, camera_model, parameters)
     basis_of = sh.make_functions(real, bases).basis

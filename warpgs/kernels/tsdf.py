@@ -217,7 +217,7 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor) -> None:
-    """Add what one view says to a grid, in place: a point's distance before the surface, where it is not far behind.
+    """Add the signed distances of one view to a grid, in place, except for points far behind its surface.
 
     Args:
         grid: The grid.

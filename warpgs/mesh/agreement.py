@@ -1,4 +1,4 @@
-"""Agreement of views on depth: points in front of the surfaces of other views, which no other view confirms, are left out.
+"""Agreement of views on depth: a mesh omits depths that no other view confirms, unless no other view sees a surface there.
 
 A fit of few views constrains depth only where two of them look. If only one view sees a surface, such as beside an occluding
 edge, its depth is unconstrained.
@@ -67,8 +67,8 @@ def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
 def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     """Return a view without the depths that no other view confirms.
 
-    A depth is kept where at least one other view has a surface at that point, nearer than `TOLERANCE`, and where none has a
-    surface in that direction: outside of all other images nothing speaks against it. So one view alone keeps all.
+    A depth is kept where at least one other view has a surface at that point, nearer than `TOLERANCE`, or where no other view
+    has a surface in that direction, as outside of all other images. So one view alone keeps all.
 
     Args:
         view: The view.

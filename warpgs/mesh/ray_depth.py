@@ -23,7 +23,7 @@ BLOCK = 2**15
 
 
 def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what turns camera space into the space in which a Gaussian is round, up to its scale, and where it lies.
+    """Return the map from camera space to the space in which a Gaussian is isotropic, up to its scale, and its position.
 
     Args:
         gaussians: N Gaussians.
@@ -70,7 +70,7 @@ def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor
 def surface_depth(
     gaussians: Gaussians, camera: Camera, ids: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the median depth of what makes up each pixel, and the fraction of its weights within `BAND` of that.
+    """Return the median depth of each pixel's Gaussians, and the fraction of their weights within `BAND` of that.
 
     Args:
         gaussians: N Gaussians in the units of the camera.

@@ -64,7 +64,7 @@ def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
 
 
 def advice(found: Mapping, names: Sequence[str]) -> list[str]:
-    """Return what to photograph next, a sentence each, the most urgent first; nothing where nothing is missing."""
+    """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
     said = []
     for i in range(len(names)):
         if i not in found.views:

@@ -87,7 +87,7 @@ def find_poses(
     """Find the poses of photographs or of a video's sharpest frames, and write a scene folder that holds those registered.
 
     The folder appears whole or not at all: ``images`` upright and without metadata, ``sparse/0`` as COLMAP has it, and the
-    record of who has a pose and why (poses.json, poses.txt).
+    record of which photographs have a pose and why (poses.json, poses.txt).
 
     Args:
         source: Folder of images, or a video file.

@@ -16,7 +16,7 @@ KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 def without_jpeg_metadata(data: bytes) -> bytes:
     """Return a JPEG file that decodes to the same pixels, without comments and application segments.
 
-    What follows the end of the image goes, too: phones keep films and depth maps there.
+    Data after the end of the image are removed, too: phones store films and depth maps there.
 
     Args:
         data: A file that was decoded without an error.

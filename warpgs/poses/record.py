@@ -87,7 +87,7 @@ def summary(found: Mapping, count: int) -> str:
 
 
 def report_lines(record: dict[str, Any]) -> list[str]:
-    """Return a record as lines for people: the choices, each photograph, and what to photograph next."""
+    """Return a record as lines of text: the choices, each photograph, and what to photograph next."""
     rows = record["photographs"]
     width = max((len(p["name"]) for p in rows), default=0)
     lines = [*record["notes"], ""]

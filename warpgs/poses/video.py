@@ -87,7 +87,7 @@ def sharpness(frame: np.ndarray) -> float:
 
 
 def sharpest(values: list[float], count: int) -> list[int]:
-    """Return the indices of at most ``count`` frames: of so many equal stretches the sharpest each, the earliest of equals."""
+    """Return the indices of at most ``count`` frames: the sharpest of each of ``count`` equal parts, the earliest of equals."""
     bounds = np.linspace(0, len(values), min(count, len(values)) + 1).round().astype(int)
     return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
 

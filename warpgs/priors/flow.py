@@ -235,7 +235,7 @@ def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> 
         value_range: Colours that an ONNX network takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1).
 
     Returns:
-        From (i, j) to flow [H, W, 2] at the size of view i, or None where the pair has none.
+        From (i, j) to flow [H, W, 2] at the size of view i, or None if the pair has no flow.
 
     Raises:
         UsageError: The kind or the range is not one of these.

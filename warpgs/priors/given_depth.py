@@ -138,11 +138,11 @@ def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[
 
 
 def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
-    """Return what the given depth of a view means in scene units, by its references.
+    """Return the given depth of a view in scene units, scaled by its references.
 
     Args:
         view: A view with given depth.
-        found: Searched depth of the view that others confirm; None for none.
+        found: Depth of the view by the sweep that others confirm; None for none.
         known: Points of the reconstruction, with the views that saw them.
     """
     assert view.depth is not None
@@ -284,9 +284,9 @@ def _notes(
             f"{sum(a.references for a in compared):,} pixels"
         )
     if len(compared) < len(used):
-        notes[0] += f"; {len(used) - len(compared)} of them compared with nothing"
+        notes[0] += f"; {len(used) - len(compared)} of them without a comparison"
     if removed:
-        notes[0] += f"; {removed:.1%} left out, because other views look through them"
+        notes[0] += f"; {removed:.1%} left out, because other views see through them"
     if refused:
         shown = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
         notes.append(f"given depth: {len(refused)} maps are not used: {shown}{' ...' if len(refused) > SHOWN else ''}")

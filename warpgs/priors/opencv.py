@@ -10,8 +10,8 @@ from collections.abc import Iterator
 def single_threaded_opencv() -> Iterator[None]:
     """Keep OpenCV from starting threads, in this process; our own call it side by side.
 
-    Many of its calls here are so short that starting threads takes longer than they save, and last digits of some depend on
-    how many there are: `cv2.distanceTransform` takes IPP's code where there is but one, and the fast global smoother cuts an
+    Many of its calls here are so short that starting threads takes longer than they save, and the rounding of some depends on
+    the number of threads: `cv2.distanceTransform` takes IPP's code where there is but one, and the fast global smoother cuts an
     image into as many stripes as there are threads, and works on the last rows of a stripe in other code.
     """
     import cv2

@@ -56,7 +56,7 @@ def pinhole_view(view: View) -> View:
 
 
 def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
-    """Return depth found in a view of `pinhole_view` in the pixels and by the depth of its camera; not valid where not seen."""
+    """Return depth of a view of `pinhole_view` at the pixels of the original camera; invalid where unseen."""
     if camera.model == "pinhole":
         return found
     plane = (pixel_grid(camera) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]

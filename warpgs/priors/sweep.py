@@ -111,7 +111,7 @@ def sweep_depths(
 ) -> list[ViewDepth]:  # fmt: skip
     """Return the depth of every view by sweeping planes against those that share most of its sight.
 
-    Of more than ``config.max_views`` views only so many are swept, so that the time is bounded. They are compared with their
+    At most ``config.max_views`` views are swept, so that the time is bounded. They are compared with their
     best neighbours among all views, and checked by round trips to one another.
 
     Args:
@@ -123,7 +123,7 @@ def sweep_depths(
 
     Returns:
         One depth per view at its own size; its notes name a reduced size and views without a consistent depth. A view that was
-        not swept is valid nowhere, and a note says so.
+        not swept has no valid depth; a note names it.
     """
     cameras = [v.camera for v in views]
     sight = shared_sight(cameras, bounds)

@@ -77,9 +77,9 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
     """Return the views to compare one with: the nearest cameras (ties by order) of those that share sight, at most ``count``.
 
-    Those too near for depths to be found are passed over: their angles take half of what they share. Where no view is left,
-    sampled points may have missed it, and the nearest cameras are returned. To take the views that share most at the best
-    angles instead finds fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
+    Views too near for depth are skipped: their angles halve the shared fraction. If none is left, the sampled points may have
+    missed the overlap, and the nearest cameras are returned. To take the views that share most at the best angles instead finds
+    fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
 
     Args:
         sight: What pairs of views share.

@@ -192,7 +192,7 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
                 "none: almost no foreground and no object mask",
             )
         result.append((maps, source))
-    reason = "a mask is surer than saliency" if classical else "the network finds hardly any foreground"
+    reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
         words = f"semantics: {reason}, so the mask or black background is used as foreground in {_names(replaced)}"
         notes.append(Detail(words) if classical else words)

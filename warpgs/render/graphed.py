@@ -372,7 +372,7 @@ def _can_capture(device: torch.device) -> bool:
     if _UNCACHED or wp.config.verify_cuda:
         return False
     hooks = torch._C._autograd._top_saved_tensors_default_hooks(True)
-    # those of torch.cuda take several times as long
+    # torch.cuda's own functions take several times as long
     return hooks is None and device.index == torch._C._cuda_getDevice() and not torch._C._cuda_isCurrentStreamCapturing()
 
 

@@ -25,7 +25,7 @@ _STEP = schema.fields({"step": schema.whole(0)})
 class EventLog:
     """A log to which events are appended; a resumed fit first drops the events after its checkpoint.
 
-    It is the one file that is not replaced as a whole: it grows by lines, and only at its end. After a kill only the last line
+    It is the only file that is not replaced as a whole: lines are appended. After a kill only the last line
     can be incomplete; readers skip it and a resumed fit drops it.
     """
 

@@ -20,9 +20,9 @@ NOT_EVERYWHERE = re.compile(
 def image_names(views: Iterable[str]) -> dict[str, str]:
     """Return the file name, without suffix, of the images of each view of a scene.
 
-    It is the view's own name without suffix, with _ for /, where no other view has the same, be it in capitals. Of those that
-    do, that are longer than 100 bytes, or that some system does not take, a part is kept, followed by digits of a hash of the
-    whole name.
+    It is the view's own name without suffix, with _ for /, where no other view has the same, be it in capitals. A name that is
+    ambiguous, longer than 100 bytes or not allowed on some system is shortened and followed by digits of a hash of the whole
+    name.
 
     Args:
         views: Names of all views of the scene, so that a view has one name in every folder.

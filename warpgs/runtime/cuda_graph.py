@@ -86,7 +86,7 @@ class CapturedGraph:
 
 
 class GraphMemory:
-    """Account of the memory that torch keeps for graphs that are gone.
+    """Account of the memory that torch keeps for deleted graphs.
 
     A graph has memory of its own, which torch keeps after the graph is gone and lends to no other.
     """

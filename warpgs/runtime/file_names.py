@@ -33,7 +33,7 @@ def use_utf8_names() -> None:
     encoding = sys.getfilesystemencoding()
     if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
         return
-    say(f"warpgs: this locale takes file names for {encoding}; started again in Python's UTF-8 mode (PYTHONUTF8=1)", error=True)
+    say(f"warpgs: this locale reads file names as {encoding}; started again in Python's UTF-8 mode (PYTHONUTF8=1)", error=True)
     os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts
     if sys.stdout is not None:  # letters that the terminal lacks are still printed as codes
         os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")

@@ -116,7 +116,7 @@ class CarefulStream:
 def say_lost(name: str, error: BaseException) -> None:
     """Print on stderr that the command continues without stdout; of a lost stderr nothing can be said."""
     if name == "stdout":
-        _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command goes on without it")
+        _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command continues without it")
 
 
 def _to_stderr(line: str) -> None:

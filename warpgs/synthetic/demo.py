@@ -36,7 +36,7 @@ def checker_texture(rng: np.random.Generator, low: str, high: str, period: float
         high: The other colour, likewise.
         period: Period of the checker [u].
         kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box``
-            where the period is half the edge, so that the faces lie in the strongest layers of the checker.
+            where the period is half the edge, so that the faces lie where the checker pattern is strongest.
 
     Returns:
         The texture, matte.

@@ -152,7 +152,7 @@ def _silent() -> logging.Logger:
 def _failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Print an error of viser's own in one line."""
     error = context.get("exception")
-    say(f"the viewer passed over a message ({said(error) if error else context.get('message')})", error=True)
+    say(f"the viewer ignored a message ({said(error) if error else context.get('message')})", error=True)
 
 
 @contextlib.contextmanager

@@ -123,8 +123,8 @@ def control_value(value: Any, control: Any) -> Any:
 
     Args:
         value: Value of a message, as `read_frame` returns it.
-        control: A control of viser, with its present ``value`` and perhaps ``options``, ``min`` and ``max``; None for one that
-            is not known, which can only be a button.
+        control: A control of viser, with its present ``value`` and perhaps ``options``, ``min`` and ``max``; None for an
+            unknown one, which can only be a button.
 
     Raises:
         DataError: The control cannot have the value.

@@ -22,7 +22,7 @@ from warpgs.viewer.content import Content
 GAUSSIANS, RENDER, DEPTH, COVERAGE, ERROR = "Gaussians (browser)", "render", "depth", "coverage", "error"
 MAPS = {
     RENDER: "colours of all directions, by the rasterizer of the fit",
-    DEPTH: "near warm, far cold; gray where little is there",
+    DEPTH: "near warm, far cold; gray in nearly empty areas",
     COVERAGE: "striped magenta: no training view saw it; amber: one did",
     ERROR: "difference from the photograph, at a camera that you stepped into; brightest from 0.3",
 }
@@ -71,7 +71,7 @@ class Maps:
     def _coverage(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
         model = self.content.model
         if not model.train:
-            return self._render(camera, gaussians, options)[0], "no training camera is known of a PLY file; open its run"
+            return self._render(camera, gaussians, options)[0], "a PLY file has no training cameras; open its run"
         if self._depths is None:
             cameras = model.cameras()
             masks = [v.mask if (v := self.content.views.get(n)) else None for n in model.train]

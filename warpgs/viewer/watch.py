@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import viser
 
 POLL = 1.0
-"""Time between looks at a run folder, and between states of a fit in this process [s]."""
+"""Time between checks of a run folder, and between states of a fit in this process [s]."""
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
@@ -144,7 +144,7 @@ class LiveView:
         try:
             self._draw_states()
         except Exception as e:  # errors of viser, too, so that the fit continues
-            say(f"the viewer stopped ({type(e).__name__}: {e}); the fit goes on", error=True)
+            say(f"the viewer stopped ({type(e).__name__}: {e}); the fit continues", error=True)
 
     def _draw_states(self) -> None:
         """Show each state that comes, until `close`."""

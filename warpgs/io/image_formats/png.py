@@ -70,7 +70,8 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
     Args:
         pieces: The stream, in order.
-        limit: Number of bytes that are wanted. A little more is unpacked, in which damage shows, and no whole bomb.
+        limit: Number of bytes that are wanted. At most a little more is unpacked, which reveals damage but does not unpack a
+            bomb.
 
     Raises:
         ValueError: The stream is damaged or ends early.
@@ -103,4 +104,4 @@ def check(data: bytes) -> None:
     parts = list(chunks(data))
     expected = _raw_size(width, height, depth * CHANNELS[color], interlaced)
     if unpacked_size((body for kind, body in parts if kind == b"IDAT"), expected) != expected:
-        raise ValueError("it holds another number of pixels than its header gives")
+        raise ValueError("its number of pixels differs from its header")

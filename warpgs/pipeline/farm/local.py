@@ -42,7 +42,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
 
     Raises:
         ResourceError: CUDA was requested and is missing.
-        UsageError: More slots are requested than can be, or than the GPUs have.
+        UsageError: More slots are requested than are possible, or than the GPUs have.
     """
     import torch
 

@@ -114,7 +114,7 @@ def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: Ras
 
 
 def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[Camera], str]:
-    """Return the cameras of a film through training views, and how it goes in words."""
+    """Return the cameras of a film through training views, and a description of the path."""
     frames = settings.count(min(max(SECONDS, VIEW_SECONDS * len(train)), MAX_SECONDS))
     cameras = [upright(rig, c) for c in train]
     reaches = [rig.reach(c) for c in train]
@@ -127,7 +127,7 @@ def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[C
 
 
 def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
-    """Return the cameras of a film through the keyframes of a file, and how it goes."""
+    """Return the cameras of a film through the keyframes of a file, and a description of the path."""
     if settings.fov_y is not None:
         raise UsageError(f"{path}: keyframes have their own fields of view; leave out --fov")
     keyframes = read_keyframes(path, framed(first, settings.size), model.normalization)

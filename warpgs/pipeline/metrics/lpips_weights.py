@@ -156,7 +156,7 @@ def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
         if shapes == {k: v for k, v in net.shapes().items() if k.startswith("lin")}:
             return net
     raise DataError(
-        f"{path}: these are heads of no network known here; warpgs measures LPIPS with VGG16 (vgg.pth) and AlexNet (alex.pth) "
+        f"{path}: heads of an unsupported network; warpgs measures LPIPS with VGG16 (vgg.pth) and AlexNet (alex.pth) "
         "from the folder lpips/weights of PerceptualSimilarity"
     )
 

@@ -51,8 +51,8 @@ def _ranks(values: torch.Tensor) -> torch.Tensor:
 def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor:
     """Return the rows of the Gaussians in the order in which they may be removed, int64 [N].
 
-    A Gaussian's place is the later of its places by largest contribution and by Fisher sensitivity: one goes only where both
-    call it dispensable, so neither the thin nor the faint but wide is lost to one score alone.
+    A Gaussian's place is the later of its places by largest contribution and by Fisher sensitivity: it is removed only if both
+    scores are low, so thin Gaussians and wide faint ones stay if one score is high.
 
     Args:
         maxima: Largest blending weight of each, shape [N].
@@ -62,7 +62,7 @@ def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor
 
 
 def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return the rows that stay when the first ``fraction`` of an order goes; at least one stays.
+    """Return the rows that remain after the first ``fraction`` of an order is removed; at least one remains.
 
     Args:
         order: Rows, int64, shape [N].
@@ -105,7 +105,7 @@ def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
 
 
 def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
-    """Return the same Gaussians without the degrees that none of them uses; a file has one number of coefficients for all."""
+    """Return the same Gaussians without degrees that are unused by all; a file has one number of coefficients for all."""
     degrees = stored_degrees(gaussians.sh)
     highest = int(degrees.max()) if len(degrees) else 0
     return Gaussians(**(gaussians.tensors() | {"sh": gaussians.sh[:, : (highest + 1) ** 2].contiguous()}))

@@ -87,8 +87,8 @@ def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndar
 def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     """Return the centres [N, 3] [u] of the finest cells on the surface of the hull, and their width [u].
 
-    A cell is empty where more views than may err show nothing there, and inside where all that see it show nothing else; what
-    is neither is divided, until cells are `FINEST` px wide in the views, or as many as `PROJECTIONS` allows.
+    A cell is empty if more views than may err show nothing there, and inside if all views that see it show only the object.
+    Other cells are divided, until cells are `FINEST` px wide in the views, or as many as `PROJECTIONS` allows.
 
     Args:
         shapes: At least two silhouettes.

@@ -167,7 +167,7 @@ def _number_extrapolated(views: list[View], count: int) -> str:
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
     """Return the reconstruction's points that two of the views saw, or the only view; none without a reconstruction.
 
-    A point that one of them saw was placed with the help of views that are held out.
+    A point that only one of them saw was triangulated with held-out views.
     """
     return NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
 

@@ -75,10 +75,10 @@ def merges(gaussians: Gaussians, maxima: torch.Tensor, kinds: torch.Tensor, odd:
     """Pair neighbours along the Morton curve, and compute what each pair would become.
 
     Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. Opacity times area becomes
-    what the pair covers face on, the part counted once that both cover; where that takes an opacity above `OPAQUE`, the two
-    longer axes grow instead: else a surface made of opaque Gaussians would get holes. A pair costs its largest blending weight
-    times the sum of three differences: of the colours, of the area covered (logarithm of new over old: pairs far apart or of
-    unlike planes bulge), and of the logarithm of the area by which the axes had to grow.
+    the area that the pair covers face on, with the overlap counted once. If that needs an opacity above `OPAQUE`, the two
+    longer axes grow instead: else a surface of opaque Gaussians would get holes. A pair costs its largest blending weight times
+    the sum of three differences: of the colours, of the area covered (logarithm of new over old: pairs far apart or of unlike
+    planes bulge), and of the logarithm of the area by which the axes had to grow.
 
     Args:
         gaussians: N Gaussians.

@@ -164,7 +164,7 @@ def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
     """Return the radius of the scene around the mean of its cameras [u]: it holds them, and 90 % of the first points.
 
-    It is not `scene_extent`, the size of the camera set alone, beside which what is photographed may be large or small.
+    It is not `scene_extent`, the size of the camera set alone: the photographed scene may be much larger or smaller.
     """
     center = np.mean([c.center for c in cameras], axis=0)
     reach = float(np.quantile(np.linalg.norm(cloud.points - center, axis=1), WITHIN)) if len(cloud) else 0.0

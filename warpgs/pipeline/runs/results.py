@@ -81,7 +81,7 @@ def summary_line(metrics: dict[str, Any]) -> str:
 
 
 def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
-    """Return the end of a fit for people: scores, size, time, where the report is, and what to do next.
+    """Return the final lines of a fit: scores, size, time, the path of the report, and the next steps.
 
     Args:
         metrics: Contents of metrics.json.

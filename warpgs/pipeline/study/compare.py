@@ -47,7 +47,7 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
     """Return presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
 
     Args:
-        names: Presets as `warpgs.fit` takes them; a file or an object is called by the last word of its name.
+        names: Presets as `warpgs.fit` takes them; a file or an object has the last word of its name.
         steps: Steps of each run; None for those of its preset.
 
     Raises:

@@ -39,7 +39,8 @@ def update_by_sums(
     Args:
         learned: Tables and strategy that the step changes.
         plan: Choices that the step is made of.
-        parts: Sums of gradients, of statistics, and of what slots say, in their shapes [...]; the first become means.
+        parts: Sums of gradients, of statistics, and of the slots' reasons to stop, in their shapes [...]; the first become
+            means.
         names: Names of the statistics.
         buffers: Settings of the step, and its result.
         batch: Number of slots B.

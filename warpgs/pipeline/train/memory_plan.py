@@ -205,7 +205,7 @@ def plan(
         most: Number of Gaussians that densification may reach.
         limit: Bytes that the fit may take; None for no limit.
         available: Bytes that the device has free.
-        capacity_factor: Capacity of a CUDA graph for instances, as a multiple of what there are.
+        capacity_factor: Capacity of a CUDA graph for instances, as a multiple of the present number.
 
     Returns:
         The plan, and the layout of the steps to be taken: without graphs where those would not keep to the limit.

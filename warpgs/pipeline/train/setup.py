@@ -54,7 +54,7 @@ def prepare(
         points: The reconstruction's points, or None.
         config: Settings.
         generator: Generator of random points.
-        device: Device to sweep on, unless there is a memory limit: depths take more than a step may.
+        device: Device to sweep on, unless there is a memory limit, since the sweep may need more memory than a step.
         priors: Prior of each view; None to compute them where they are needed.
         ready: Called before the device is used, and in any case before the end.
         progress: Called with a line for the user about the current work.

@@ -91,7 +91,7 @@ def finished(node: Node, known: Mapping[Node, torch.Tensor]) -> torch.Tensor:
 
 @dataclass(frozen=True)
 class Tree:
-    """The tree over the slots of a step, and who adds what of it."""
+    """The tree over the slots of a step, and the part that each process adds."""
 
     batch: int
     """Number of slots B."""

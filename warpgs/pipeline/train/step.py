@@ -324,7 +324,7 @@ class StepGraphs:
         self.stream = torch.cuda.Stream(device)
         """Stream of captures, always the same one, since torch keeps freed memory for the stream that it was used on."""
         self.memory = GraphMemory(device)
-        """Account of the memory that torch keeps for graphs that are gone."""
+        """Account of the memory that torch keeps for deleted graphs."""
         self._graphs: dict[tuple[Hashable, StepPlan], CapturedGraph] = {}
 
     def clear(self) -> None:

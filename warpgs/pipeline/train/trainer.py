@@ -90,7 +90,7 @@ class Trainer:
         """Fraction of the planned steps, from the first, in which views are half their size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
-        self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # all have an opacity then
+        self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
         given = {n: any(getattr(v, n) is not None for v in train) for n in ("depth", "normals")}
         self.terms = terms_of(config, self.cutout, **given)
         self.step = 0  # taken
@@ -126,7 +126,7 @@ class Trainer:
         self.taker = StepTaker(self.learned, self.buffers, self.context.render_options(), self.batch, self.ranks)
 
     def _begin(self, views: list[TrainingView]) -> None:
-        """Train on these views, or on what early stopping leaves of them."""
+        """Train on these views, without the blocks that early stopping holds out."""
         self.set_views(views)
         self.strategy.setup()
         self.notes += self.stopping.begin(self.context, self.strategy, self.half_resolution)

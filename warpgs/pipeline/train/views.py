@@ -89,8 +89,8 @@ class TrainingView:
 def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of the view of a step.
 
-    On CUDA image, mask, opacity and disparity are copied from the stacks. Views with an alpha channel stand over the
-    background of the step, beside what was added to it.
+    On CUDA image, mask, opacity and disparity are copied from the stacks. Views with an alpha channel are composited over the
+    background of the step.
     """
     copies = (3 + sizes.masked + sizes.cutout + sizes.depth) * sizes.cuda
     return dict.fromkeys(STEP, FLOAT * sizes.pixels * (copies + 6 * sizes.cutout))
@@ -108,7 +108,7 @@ def view_bytes(views: Iterable[TrainingView]) -> int:
 
 
 def with_alpha(views: Sequence[View]) -> list[View]:
-    """Return the views, opaque ones with an opacity of 1 everywhere [H, W] if another one has an opacity: all have one then."""
+    """Return the views; if any has an opacity, opaque ones get an opacity of 1 everywhere [H, W]."""
     if all(v.alpha is None for v in views):
         return list(views)
     return [replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) if v.alpha is None else v for v in views]
@@ -124,7 +124,7 @@ def half_size_camera(c: Camera) -> Camera:
 def half_size(view: TrainingView) -> TrainingView:
     """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
 
-    Colours, opacities and maps are means over what a pixel covers, and a pixel counts where all of that does.
+    Colours, opacities and maps are means over the covered pixels, and a pixel counts if all of those count.
     """
     camera = half_size_camera(view.camera)
     width, height = camera.width, camera.height

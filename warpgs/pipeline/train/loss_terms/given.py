@@ -36,7 +36,7 @@ def inverse_depth_difference(
     Args:
         depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
         alpha: Rendered opacity, shape [H, W].
-        target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: means over pixels stay what they are.
+        target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: averaging pixels keeps the weighted means.
         mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     shown = ~(alpha <= MIN_ALPHA)  # True for a NaN, so that it reaches the loss

@@ -30,8 +30,8 @@ def photometric_loss(
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Photographed colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count. Masked pixels are black to the
-            window of SSIM, in which they count where it reaches pixels that do.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count. Masked pixels are black in the windows of
+            SSIM around unmasked pixels.
         ssim_weight: lambda, in [0, 1].
 
     Returns:

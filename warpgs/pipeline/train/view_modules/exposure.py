@@ -132,8 +132,9 @@ class Exposure(ViewModule):
         """Return what exposures were learned.
 
         Returns:
-            ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of what a middle
-            gray becomes, over that gray; ``matched_psnr``, the mean over held-out views [dB], None without any; ``summary``.
+            ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of a middle gray
+            after exposure, divided by that gray; ``matched_psnr``, the mean over held-out views [dB], None without any;
+            ``summary``.
         """
         rows = fitted.params[EXPOSURE].double()
         numbers = exposure_of(rows, rows).detach().cpu().numpy().reshape(-1, CHANNELS, CHANNELS + 1)

@@ -34,8 +34,8 @@ FOCAL, CAMERA_NUMBER = "pose_focal", "pose_camera"
 SHOWN_LENSES = 3
 """Cameras whose focal length the summary names."""
 RULE = (
-    "held-out views are moved by the one similarity that takes the given training cameras to the refined ones best; their "
-    "own images are not looked at"
+    "held-out views are moved by the similarity that best maps the given training cameras to the refined ones; their own "
+    "images are not used"
 )
 """Rule for the poses of held-out views, as text for the user."""
 
@@ -130,7 +130,7 @@ def refined_cameras(
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `RULE`.
 
     Where focal lengths are learned, a held-out view has that of the training views of its camera, or the mean factor of all
-    training views if its intrinsics are those of none.
+    training views if no training view has its intrinsics.
 
     Args:
         given: Cameras as given, in scene units, by name.
