@@ -133,7 +133,7 @@ def _group(kind: type, prefix: str, *, sole: bool) -> Iterator[tuple[str, list[s
 
 
 def _wrapped(text: str) -> list[str]:
-    """Return a line of a description as lines of a screen; one that begins with spaces hangs."""
+    """Break a line of a description into lines of a screen; a line that begins with spaces has a hanging indent."""
     hang = "    " if text.startswith("  ") else ""
     return textwrap.wrap(text, WIDTH, subsequent_indent=hang, break_on_hyphens=False)
 

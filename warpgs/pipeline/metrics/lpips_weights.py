@@ -120,9 +120,9 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
 
 
 def _mapped(file: BinaryIO) -> str | BinaryIO:
-    """Return the name of an open archive by which torch maps it, so that tensors take no memory until they are read.
+    """Return the path of an open archive under which torch can map it: then tensors use no memory before they are read.
 
-    The file itself if the system has no such names, or torch would have to unpickle the tensors.
+    Return the file itself if the system has no such paths, or if torch would have to unpickle the tensors.
     """
     name = files.DESCRIPTORS / str(file.fileno())
     named = name.exists() and zipfile.is_zipfile(file)
