@@ -268,7 +268,7 @@ def test_runs_keep_refined_poses(tmp_path):
     metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
     rows, summary = (metrics["view_modules"]["refine_poses"][key] for key in ("views", "summary"))
     assert rows[0]["degrees"] < 1e-9 and rows[0]["units"] < 1e-9 and all(r["degrees"] > 0 for r in rows[1:])
-    assert "held-out views are moved by the one similarity" in summary
+    assert "moved by the similarity that best maps" in summary
     assert summary in (tmp_path / "run" / "report.html").read_text()
     run, scene = warpgs.open_run(tmp_path / "run", "cpu"), warpgs.load_scene(tmp_path / "scene")
     given = {v.name: v.camera for v in scene.views}
