@@ -78,7 +78,7 @@ class SurfaceViews:
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str,
         stage: Callable[[str], object] = lambda line: None,
     ) -> None:  # fmt: skip
-        """Take what is rendered.
+        """Prepare to render the cameras of a model.
 
         Args:
             gaussians: N Gaussians in the units of the cameras.

@@ -250,7 +250,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
-    degree = degree if options.colors is None else 0  # as few unused pixels as possible
+    degree = degree if options.colors is None else 0  # harmonics are not shown then, so as few as possible are read
     named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
     pixels = None
     if options.pixels is not None:

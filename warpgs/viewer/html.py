@@ -34,7 +34,7 @@ POLICY = (
 )
 """Content security policy of the page: it may use its own contents, and request nothing."""
 NO_REMARKS = "<style>.mantine-Notifications-root{display:none}</style>"
-"""Style that hides viser's remark on browsers without a GPU, which stood before the model."""
+"""Style that hides viser's remark on browsers without a GPU, which would cover the model."""
 NO_SCENE_TREE = '<style>:has(>[aria-label$="scene tree"]){display:none!important}</style>'
 """Style that hides viser's button for the scene tree, which has only one entry."""
 HELP = (

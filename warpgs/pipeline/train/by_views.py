@@ -27,7 +27,7 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot distinguish a view-dependent colour from an error of the shape."""
-OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 60, 9
+OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 54, 8
 """Fraction by which a step lowers every opacity; and the largest numbers of opaque views, and of views with alpha, with this
 decay and one layer. With more views there is no decay, and there are two layers. Up to 51 opaque views were measured, and gain;
 8 views with alpha gain, 9 do not (docs/decisions/023-opacity-decay.md)."""

@@ -30,7 +30,7 @@ MAX_BYTES = 2**16
 MAX_DEPTH = 8
 """Number of tables and lists that may lie in each other."""
 MAX_DOTS = 100
-"""Number of dots in a line: The time of Python's TOML reader grows with the square of the parts of a key."""
+"""Number of dots in a line: the time of Python's TOML reader grows with the square of the parts of a key."""
 MAX_BASES = 8
 """Number of presets that may start from each other."""
 DEFAULT_PRESET = "default"
