@@ -11,7 +11,7 @@ import torch
 from tests.scenes import view_stub
 from tests.tolerances import OPACITY_DECAY
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA, settings_by_views
+from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, ONE_LAYER_VIEWS, settings_by_views
 from warpgs.pipeline.train.opacity_decay import LEAST_LOGIT, decay_opacities
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
@@ -50,7 +50,7 @@ def test_a_step_that_is_not_taken_changes_nothing():
     ("views", "alpha", "few"),
     [
         (EXTRAPOLATED_VIEWS + 1, None, True), (ONE_LAYER_VIEWS, None, True), (ONE_LAYER_VIEWS + 1, None, False),
-        (3, 1.0, True), (ONE_LAYER_VIEWS_ALPHA, 1.0, True), (ONE_LAYER_VIEWS_ALPHA + 1, 1.0, False),
+        (3, 1.0, True), (ONE_LAYER_VIEWS, 1.0, True), (ONE_LAYER_VIEWS + 1, 1.0, False),
     ],
 )  # fmt: skip
 def test_few_views_have_one_layer_and_decay(views, alpha, few):

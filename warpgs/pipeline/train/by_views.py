@@ -27,10 +27,9 @@ HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 DEGREES = (5, 9, 12)
 """Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
 cannot distinguish a view-dependent colour from an error of the shape."""
-OPACITIES_DECAY, ONE_LAYER_VIEWS, ONE_LAYER_VIEWS_ALPHA = 0.001, 54, 8
-"""Fraction by which a step lowers every opacity; and the largest numbers of opaque views, and of views with alpha, with this
-decay and one layer. With more views there is no decay, and there are two layers. Up to 51 opaque views were measured, and gain;
-8 views with alpha gain, 9 do not (docs/decisions/023-opacity-decay.md)."""
+OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
+"""Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
+were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
 SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
 """Weight of the roughness of rendered depth, the largest number of opaque views, and the least number of steps with this term:
 it was not measured with alpha, lowers PSNR with 9 views, and does not help in 480 steps
@@ -108,7 +107,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
     opaque = all(v.alpha is None for v in train)
-    one_layer = views <= (ONE_LAYER_VIEWS if opaque else ONE_LAYER_VIEWS_ALPHA)
+    one_layer = views <= ONE_LAYER_VIEWS
     method = config.method
     if method.hier is None:
         method = dataclasses.replace(method, hier=not one_layer)
