@@ -157,7 +157,7 @@ def _lines(series: list[Series], name) -> tuple[Line, ...]:
 
 
 def charts(title: str, rows: list[dict]) -> dict[str, str]:
-    """Charts of one machine by the end of their names: over N, over pixels, and of the whole image and step."""
+    """Return the charts of one machine by the end of their names: over N, over pixels, and of the whole image and step."""
 
     def op_name(s: Series) -> str:
         return s.op if s.program == OURS else s.program
