@@ -12,7 +12,7 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import ResourceError, UsageError
 from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
 
 def test_public_names_load_on_use():
@@ -149,6 +149,8 @@ def test_arguments_of_another_type_or_shape_are_named():
     gaussians, cam = cloud(3), camera(8, 8, dtype=torch.float32)
     skewed, large = np.array([[9.0, 0.1, 4], [0, 9, 4], [0, 0, 1]]), dataclasses.replace(cam, width=10**6, height=10**6)
     learned = RasterizeOptions(opacity_factors=torch.ones(3, requires_grad=True))
+    fisheye = dataclasses.replace(cam, model="fisheye", distortion=torch.tensor(0.0))
+    others, uncoloured = (torch.ones(1, 4), torch.ones(1, 3), torch.ones(1)), RasterizeOptions(colors=torch.ones(1, 3))
     wrong = [
         (TypeError, "gaussians must be of Gaussians, ActivatedGaussians or CovarianceGaussians, not Camera", (cam, gaussians)),
         (TypeError, "options must be of RasterizeOptions, not str", (gaussians, cam, "fast")),
@@ -175,6 +177,26 @@ def test_arguments_of_another_type_or_shape_are_named():
             (gaussians, dataclasses.replace(cam, viewmat=np.full((4, 4), np.nan))),
         ),
         (UsageError, "unknown camera model None", (gaussians, dataclasses.replace(cam, model=None))),
+        *(
+            (
+                TypeError,
+                f"camera.{name} must be dense, not torch.sparse_coo",
+                (gaussians, dataclasses.replace(cam, **{name: t})),
+            )
+            for name, t in (
+                ("viewmat", torch.eye(4).to_sparse()),
+                ("K", torch.eye(3).to_sparse()),
+                ("distortion", torch.zeros(4).to_sparse()),
+            )
+        ),
+        (ValueError, r"camera.distortion must have shape \[P\] or \[C, P\], not \[\]", (gaussians, fisheye)),
+        (TypeError, "background must be dense", (gaussians, cam, RasterizeOptions(background=torch.ones(3).to_sparse()))),
+        (TypeError, "background must be numbers", (gaussians, cam, RasterizeOptions(background=1j * torch.ones(3)))),
+        (TypeError, "pixels must be dense", (gaussians, cam, RasterizeOptions(pixels=torch.tensor([[1, 2]]).to_sparse()))),
+        (TypeError, "colors must be a torch tensor, not list", (gaussians, cam, RasterizeOptions(colors=[[1.0]]))),
+        (ValueError, r"colors must have shape \[N, D\]", (gaussians, cam, RasterizeOptions(colors=torch.tensor(1.0)))),
+        (TypeError, "means must be a tensor, not list", (ActivatedGaussians([[0.0]], *others), cam, uncoloured)),
+        (TypeError, "means must be a tensor, not list", (CovarianceGaussians([[0.0]], *others[1:]), cam, uncoloured)),
         (
             TypeError,
             "quats must be dense, not torch.sparse",

@@ -48,7 +48,7 @@ def test_haze_keeps_the_exact_rule(device):
     assert warpgs.select_rule(haze, cameras(device), max_error=0.05)[0] == "exact"
 
 
-@pytest.mark.parametrize("error", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("error", [0.0, -1.0, float("nan"), float("inf"), "0.1"])
 def test_wrong_arguments(error):
     """The limit, the measure and the views are checked before a view is rendered."""
     g, views = cloud(1), cameras("cpu")
@@ -58,3 +58,5 @@ def test_wrong_arguments(error):
         select_rule(g, views, max_error=0.1, measure="median")
     with pytest.raises(UsageError, match="at least one camera"):
         select_rule(g, [], max_error=0.1)
+    with pytest.raises(UsageError, match=r"list of cameras, not one: give \[camera\]"):
+        select_rule(g, views[0], max_error=0.1)

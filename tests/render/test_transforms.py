@@ -24,6 +24,18 @@ def scene():
     return gaussians, loss
 
 
+@pytest.mark.parametrize("most", [None, 40], ids=["whole", "chunked"])
+def test_tensors_of_another_shape_in_the_backward_pass_are_refused(most):
+    """Autograd does not see ``.data`` replaced: the kernels would read and write beside the tensors."""
+    for name in leaves(cloud(30)).tensors():
+        gaussians = leaves(cloud(30))
+        render = rasterize(gaussians, camera(dtype=torch.float32), RasterizeOptions(max_instances=most))
+        tensor = getattr(gaussians, name)
+        tensor.data = torch.rand(7, *tensor.shape[1:])
+        with pytest.raises(RuntimeError, match=r"shape \[30.* in the forward pass, and now has \[7"):
+            render.rgb.sum().backward()
+
+
 @pytest.mark.parametrize(
     "options",
     [RasterizeOptions(), RasterizeOptions(max_instances=40), RasterizeOptions(colors=torch.ones(30, 4))],

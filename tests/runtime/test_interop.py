@@ -1,6 +1,8 @@
 """Launches are cut into ranges that cover every item once; arguments are checked by name."""
 
 import os
+import subprocess
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
@@ -61,7 +63,7 @@ class Recorded:
 def test_ranges_cover_every_item_once(monkeypatch, threads, count, cost, ranges):
     """There are as many ranges as there is work for, and at most one hand-over a thread; small launches stay on theirs."""
     pool = Recorded()
-    monkeypatch.setattr(interop, "_pool", lambda _: pool)
+    monkeypatch.setattr(interop, "_pool", lambda *_: pool)
     torch.set_num_threads(threads)
     visits, firsts = torch.zeros(2, count, dtype=torch.int32).unbind()
     outputs = [interop.view(t, wp.int32) for t in (visits, firsts)]
@@ -254,6 +256,29 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
             assert found == [[times] * count for times in (1, 2, 3)]
 
 
+FORKED = """
+import os, signal, threading
+from tests.gaussians import camera, cloud
+from warpgs.render.rasterize import rasterize
+import torch
+torch.set_num_threads(2)
+g, cam = cloud(2000), camera(75, 53, dtype=torch.float32)
+image = rasterize(g, cam).rgb
+child = os.fork()
+if child == 0:
+    signal.alarm(20)
+    os._exit(0 if torch.equal(rasterize(g, cam).rgb, image) else 3)
+print(threading.active_count() > 1, os.waitpid(child, 0)[1])
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_launches_in_threads_of_its_own():
+    """The parent's do not exist there, and nothing may wait for them."""
+    found = subprocess.run([sys.executable, "-c", FORKED], check=False, capture_output=True, text=True)
+    assert found.stdout.split() == ["True", "0"], found.stderr
+
+
 def test_an_interrupt_waits_for_the_threads(monkeypatch):
     """Else they would go on in memory that the caller frees, with arguments that the next launch writes."""
     begun, working = threading.Event(), []
@@ -277,7 +302,7 @@ def test_an_interrupt_waits_for_the_threads(monkeypatch):
         working.append(pool.submit(late))
         return Interrupted(working[-1])
 
-    monkeypatch.setattr(interop, "_pool", lambda _: SimpleNamespace(submit=submit))
+    monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
     torch.set_num_threads(2)
     visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
     with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):

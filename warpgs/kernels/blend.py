@@ -15,7 +15,7 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 
 
@@ -243,7 +243,7 @@ class _Blend(torch.autograd.Function):
         rgb, alpha, depth, *rest = composite(projected, tiles, backgrounds, settings, save=save)
         if save:
             # all as saved tensors, which are freed after the backward pass
-            ctx.save_for_backward(projected, backgrounds, rgb, depth, *rest, *tiles.tensors())
+            keep(ctx, projected, backgrounds, rgb, depth, *rest, *tiles.tensors())
             ctx.tile_size, ctx.settings = tiles.size, settings
         ctx.set_materialize_grads(False)
         return rgb, alpha, depth
@@ -251,7 +251,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx, *v_images):
-        projected, backgrounds, *tensors = ctx.saved_tensors
+        projected, backgrounds, *tensors = kept(ctx)
         saved, tiles = tensors[:6], Tiles(ctx.tile_size, *tensors[6:])
         v_images = [None if v is None else v.contiguous() for v in v_images]
         v_projected = composite_gradients(projected, tiles, backgrounds, ctx.settings, saved, v_images)

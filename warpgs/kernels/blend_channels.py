@@ -26,7 +26,7 @@ from warpgs.kernels.blend_records import COLORS, WIDTHS
 from warpgs.kernels.blend_settings import BlendSettings
 from warpgs.kernels.tiles import Tiles
 from warpgs.runtime import interop
-from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.derivatives import first_order, keep, kept
 
 GEOMETRY = 6
 """Values of a projected Gaussian before its colour; its depth and its box follow that."""
@@ -153,7 +153,7 @@ class _BlendChannels(torch.autograd.Function):
             found = found or rest
         alpha, depth, *saved = found
         if save:
-            ctx.save_for_backward(projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
+            keep(ctx, projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
             ctx.tile_size, ctx.visible, ctx.settings = tiles.size, tiles.visible, settings
         ctx.set_materialize_grads(False)
         return image, alpha, depth
@@ -161,7 +161,7 @@ class _BlendChannels(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx, v_image, v_alpha, v_depth):
-        projected, colors, backgrounds, image, *tensors = ctx.saved_tensors
+        projected, colors, backgrounds, image, *tensors = kept(ctx)
         shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
         v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
         v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))

@@ -16,7 +16,7 @@ from warpgs.kernels.project_inputs import PROJECTED_SIZE, ProjectInputs, Project
 from warpgs.kernels.project_lanes import LANES
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 
 
@@ -81,7 +81,7 @@ class _Project(torch.autograd.Function):
     def forward(ctx, settings, *tensors):
         inputs = ProjectInputs(*(t.contiguous() for t in tensors))
         projected, tile_counts = project_tensors(inputs, settings)
-        ctx.save_for_backward(*inputs[:-1], projected, tile_counts)
+        keep(ctx, *inputs[:-1], projected, tile_counts)
         ctx.settings = settings
         ctx.mark_non_differentiable(tile_counts)
         ctx.set_materialize_grads(False)  # else torch makes zeros for the counts
@@ -90,7 +90,7 @@ class _Project(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx, v_projected, _):
-        *inputs, projected, tile_counts = ctx.saved_tensors
+        *inputs, projected, tile_counts = kept(ctx)
         wants_camera = ctx.needs_input_grad[6] or ctx.needs_input_grad[7]  # viewmats and Ks, behind the settings
         found = project_gradients(inputs, ctx.settings, projected, tile_counts, v_projected, wants_camera=wants_camera)
         return None, *found, None, None

@@ -12,7 +12,7 @@ import warp as wp
 from warpgs.kernels import ssim_cpu, ssim_cuda
 from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
 from warpgs.runtime import interop
-from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 
@@ -141,7 +141,7 @@ class _Ssim(torch.autograd.Function):
         image, target = image.contiguous(), target.contiguous()
         if _native(image):
             result, *partials = ssim_cuda.forward(image, target, summed=False)
-            ctx.save_for_backward(image, target, *partials)
+            keep(ctx, image, target, *partials)
             return result
         launcher = _Launcher(image)
         result = torch.empty_like(image)
@@ -154,13 +154,13 @@ class _Ssim(torch.autograd.Function):
             with interop.stream_of(launcher.device):
                 launcher.launch(launcher.kernels.vertical, [*pair, launcher.height], moments)
                 launcher.launch(launcher.kernels.similarity, moments, [launcher.flat(t) for t in (result, *partials)])
-        ctx.save_for_backward(image, target, *partials)
+        keep(ctx, image, target, *partials)
         return result
 
     @staticmethod
     @first_order
     def backward(ctx, v_result):
-        image, target, *partials = ctx.saved_tensors
+        image, target, *partials = kept(ctx)
         if _native(image):
             return ssim_cuda.backward(image, target, partials, v_result, summed=False), None
         launcher = _Launcher(image)
@@ -184,20 +184,20 @@ class _Differences(torch.autograd.Function):
         image, target = image.contiguous(), target.contiguous()
         if _native(image):
             sums, *partials = ssim_cuda.forward(image, target, summed=True)
-            ctx.save_for_backward(image, target, *partials)
+            keep(ctx, image, target, *partials)
             return sums.sum(0)
         launcher = _Launcher(image, summed=True)
         sums = image.new_empty(launcher.tasks, 2)
         partials = [torch.empty_like(image) for _ in range(3)]
         pair = [launcher.flat(image), launcher.flat(target)]
         launcher.launch_blocks(launcher.kernels.forward, pair, 5, [sums, *partials], image)
-        ctx.save_for_backward(image, target, *partials)
+        keep(ctx, image, target, *partials)
         return sums.sum(0)
 
     @staticmethod
     @first_order
     def backward(ctx, v_sums):
-        image, target, *partials = ctx.saved_tensors
+        image, target, *partials = kept(ctx)
         if _native(image):
             return ssim_cuda.backward(image, target, partials, v_sums, summed=True), None
         launcher = _Launcher(image, summed=True)

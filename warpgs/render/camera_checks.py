@@ -16,7 +16,7 @@ def check_arrays(camera: Camera) -> None:
     """Check types and shapes of a camera's arrays, their values where they are in main memory, and the type of its size.
 
     Raises:
-        TypeError: An array is neither of numpy nor a tensor, or not of real numbers; or the size is not of integers.
+        TypeError: An array is neither of numpy nor a tensor, sparse, or not of real numbers; or the size is not of integers.
         ValueError: A shape is another; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
             scales or shears, or has another last row than 0, 0, 0, 1.
     """
@@ -34,6 +34,8 @@ def check_arrays(camera: Camera) -> None:
     distortion: Any = camera.distortion
     if distortion is not None:
         _check_type("distortion", distortion)
+        if distortion.ndim not in (1, 2):
+            raise ValueError(f"camera.distortion must have shape [P] or [C, P], not {list(distortion.shape)}")
         if not (getattr(distortion, "is_cuda", False) or all(map(math.isfinite, distortion.reshape(-1).tolist()))):
             raise ValueError(f"camera.distortion holds numbers that are not finite: {distortion.tolist()}")
     for name in ("width", "height"):
@@ -43,11 +45,13 @@ def check_arrays(camera: Camera) -> None:
 
 
 def _check_type(name: str, array: Any) -> None:
-    """Raise TypeError where a value is not an array of real numbers."""
+    """Raise TypeError where a value is not a dense array of real numbers."""
     if not isinstance(array, (np.ndarray, torch.Tensor)):
         raise TypeError(
             f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"
         )
+    if isinstance(array, torch.Tensor) and array.layout != torch.strided:
+        raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
     real = not array.is_complex() if isinstance(array, torch.Tensor) else array.dtype.kind in "fiub"
     if not real:
         raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")

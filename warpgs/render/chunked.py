@@ -11,7 +11,7 @@ from warpgs.kernels.project import project_inputs
 from warpgs.kernels.project_inputs import ProjectInputs
 from warpgs.render.compose import Images, bin_and_blend, bin_projected, heaviest_of, median_depth_of, weights_of
 from warpgs.render.settings import RenderSettings, Window
-from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.derivatives import first_order, keep, kept
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class _BlendChunked(torch.autograd.Function):
                 image[:, rows, columns] = part
             ctx.windows.append(settings.window)
         # the inputs too, so that torch detects changes to them before the backward pass
-        ctx.save_for_backward(projected, backgrounds, colors, *inputs)
+        keep(ctx, projected, backgrounds, colors, *inputs)
         ctx.frame = frame
         ctx.set_materialize_grads(False)
         return tuple(images)
@@ -95,8 +95,8 @@ class _BlendChunked(torch.autograd.Function):
     @staticmethod
     @first_order
     def backward(ctx, *upstream):
-        *blended, colors = ctx.saved_tensors[:3]
-        inputs, frame = ProjectInputs(*ctx.saved_tensors[3:]).detached(), ctx.frame
+        *blended, colors = (tensors := kept(ctx))[:3]
+        inputs, frame = ProjectInputs(*tensors[3:]).detached(), ctx.frame
         blended = blended if colors is None else [*blended, colors]
         gradients = [torch.zeros_like(t) for t in blended]
         for window in ctx.windows:

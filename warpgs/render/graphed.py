@@ -30,7 +30,7 @@ from warpgs.render.settings import RenderSettings
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import Allocator, fetch
 from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphedFunction, GraphPool
-from warpgs.runtime.derivatives import first_order
+from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
@@ -192,16 +192,8 @@ class GraphedRasterizer:
         return v_projected, blend.background_gradient(transmittances, v_images[0])
 
     def project_gradients(self, saved: tuple[torch.Tensor, ...], v_projected: torch.Tensor | None, wants_camera: bool):
-        """Return the gradients of the seven tensors that `project` takes, in their shapes [...].
-
-        Raises:
-            RuntimeError: The number of Gaussians has changed since they were rendered.
-        """
+        """Return the gradients of the seven tensors that `project` takes, in their shapes [...]."""
         *gaussians, cameras, projected, counts = saved
-        if gaussians[0].shape[0] != projected.shape[1]:  # through `.data`, which autograd does not track
-            raise RuntimeError(
-                f"{projected.shape[1]:,} Gaussians were rendered, and now there are {len(gaussians[0]):,}: render again first"
-            )
         if v_projected is None or wants_camera:
             return project.project_gradients(
                 self._inputs(gaussians, cameras)[:8],
@@ -220,7 +212,7 @@ class _Projected(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, rasterizer, cameras, projection, passes, *inputs):
-        ctx.save_for_backward(*inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
+        keep(ctx, *inputs[:5], cameras, *projection)  # viewmats and Ks are in cameras
         ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return projection[0]
@@ -230,7 +222,7 @@ class _Projected(torch.autograd.Function):
     def backward(ctx, v_projected):
         ctx.passes.append(True)
         wants_camera = ctx.needs_input_grad[9] or ctx.needs_input_grad[10]  # viewmats and Ks
-        return None, None, None, None, *ctx.rasterizer.project_gradients(ctx.saved_tensors, v_projected, wants_camera)
+        return None, None, None, None, *ctx.rasterizer.project_gradients(kept(ctx), v_projected, wants_camera)
 
 
 class _Blended(torch.autograd.Function):
@@ -239,7 +231,7 @@ class _Blended(torch.autograd.Function):
     @staticmethod
     def forward(ctx, projected, backgrounds, rasterizer, counts, images, block, passes):
         rgb, _, depth = images
-        ctx.save_for_backward(projected, counts, backgrounds, rgb, depth, block)
+        keep(ctx, projected, counts, backgrounds, rgb, depth, block)
         ctx.rasterizer, ctx.passes = rasterizer, passes
         ctx.set_materialize_grads(False)
         return tuple(images)
@@ -248,7 +240,7 @@ class _Blended(torch.autograd.Function):
     @first_order
     def backward(ctx, *v_images):
         ctx.passes.append(True)
-        found = ctx.rasterizer.blend_gradients(ctx.saved_tensors, v_images, ctx.needs_input_grad[1])
+        found = ctx.rasterizer.blend_gradients(kept(ctx), v_images, ctx.needs_input_grad[1])
         return *found, None, None, None, None, None
 
 

@@ -16,12 +16,14 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
     """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
 
     Raises:
-        TypeError: They are not a tensor of integers.
+        TypeError: They are not a dense tensor of integers.
         ValueError: The shape is another.
     """
     if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
         found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
         raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
+    if pixels.layout != torch.strided:
+        raise TypeError(f"pixels must be dense, not {pixels.layout}; pixels.to_dense() converts them")
     if pixels.ndim not in (2, 3) or pixels.shape[-1] != 2 or (pixels.ndim == 3 and len(pixels) != cameras):
         raise ValueError(f"pixels must have shape [P, 2] or [{cameras}, P, 2], not {list(pixels.shape)}")
     found = pixels.to(device, torch.int64)

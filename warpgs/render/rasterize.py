@@ -71,9 +71,6 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
-    channels = 0 if options.colors is None else options.colors.shape[-1]
-    if options.absgrad and (options.features is not None or channels > WIDTHS[-1]):
-        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
     if options.heaviest < 0:
         raise UsageError(f"heaviest must be a number of Gaussians, or 0 for none, not {options.heaviest}")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
@@ -105,15 +102,21 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
             raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
         raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
+    _check_tensor("means", gaussians.means)  # first, since the harmonics of None are made like them
     for name, tensor in gaussians.tensors().items():
-        if not isinstance(tensor, torch.Tensor):
-            raise TypeError(f"{name} must be a tensor, not {type(tensor).__name__}; torch.as_tensor makes one")
+        _check_tensor(name, tensor)
     check_arrays(camera)
     if options.feature_background is not None and options.features is None:
         raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
+
+
+def _check_tensor(name: str, value: Any) -> None:
+    """Raise TypeError where a value is not a tensor."""
+    if not isinstance(value, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor, not {type(value).__name__}; torch.as_tensor makes one")
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
@@ -178,7 +181,7 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     """Return channels [..., D] with their background: one, a batch of them, or None for zeros; ``name`` is its option's.
 
     Raises:
-        TypeError: The background is not numbers.
+        TypeError: The background is not real numbers, or sparse.
         ValueError: The shape of the background is another.
     """
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
@@ -188,6 +191,10 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
         values = torch.as_tensor(background)
     except (RuntimeError, TypeError, ValueError) as e:
         raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
+    if values.is_complex():
+        raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {values.dtype}")
+    if values.layout != torch.strided:
+        raise TypeError(f"{name} must be dense, not {values.layout}; {name}.to_dense() converts it")
     values = values.to(like)
     if values.ndim not in (1, 2) or values.shape[-1] != channels or (values.ndim == 2 and len(values) != len(like)):
         raise ValueError(f"{name} must have shape [{channels}] or [C, {channels}], C={len(like)}, not {list(values.shape)}")
@@ -260,6 +267,8 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     settings = settings_of(camera, degree, rule, **named)
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
+    if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
+        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
         gradients = needs_slots((*inputs, backgrounds))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from numbers import Real
 
 import torch
 
@@ -42,12 +43,15 @@ def select_rule(
         The name of the rule, and its measured error: the largest of the views.
 
     Raises:
-        UsageError: No rule keeps the limit, there is no view, the limit is not a positive number, or the measure is unknown.
+        UsageError: No rule keeps the limit, there is no view or no list of them, the limit is not a positive number, or the
+            measure is unknown.
     """
-    if not 0 < max_error < math.inf:
-        raise UsageError(f"max_error must be a positive number, such as 0.002, not {max_error}")
+    if not (isinstance(max_error, Real) and 0 < max_error < math.inf):
+        raise UsageError(f"max_error must be a positive number, such as 0.002, not {max_error!r}")
     if measure not in MEASURES:
         raise UsageError(f"measure {measure!r} is not one of {', '.join(MEASURES)}")
+    if isinstance(cameras, Camera):
+        raise UsageError("select_rule takes a list of cameras, not one: give [camera]")
     views, error = list(cameras), 0.0
     if not views:
         raise UsageError("select_rule measures errors in views: give at least one camera")

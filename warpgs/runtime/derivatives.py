@@ -23,6 +23,28 @@ class _NotTwice(torch.autograd.Function):
         raise UsageError("the kernels have no second derivatives: leave out create_graph=True, or detach the gradient")
 
 
+def keep(ctx: Any, *tensors: torch.Tensor | None) -> None:
+    """Save tensors of any shape [...] for the backward pass, in which `kept` returns them."""
+    ctx.save_for_backward(*tensors)
+    ctx.shapes = [None if t is None else t.shape for t in tensors]
+
+
+def kept(ctx: Any) -> tuple[Any, ...]:
+    """Return the tensors [...] that `keep` saved.
+
+    Raises:
+        RuntimeError: One has another shape now. The kernels would read and write beside it.
+    """
+    tensors = ctx.saved_tensors
+    for tensor, shape in zip(tensors, ctx.shapes, strict=True):
+        if tensor is not None and tensor.shape != shape:  # through `.data`, which autograd does not track
+            raise RuntimeError(
+                f"a tensor had the shape {list(shape)} in the forward pass, and now has {list(tensor.shape)}: replace .data "
+                "after the backward pass, or render again"
+            )
+    return tuple(tensors)
+
+
 def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap the backward method of an autograd function that has no derivative itself.
 

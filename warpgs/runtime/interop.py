@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import functools
+import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -75,7 +76,7 @@ def set_threads(count: int) -> None:
 
 
 @functools.cache
-def _pool(count: int) -> ThreadPoolExecutor:
+def _pool(count: int, process: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count, thread_name_prefix="warpgs")
 
 
@@ -348,7 +349,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     working: list[Future[None]] = []
     try:
         for _ in range(min(threads, chunks)):
-            working.append(_pool(threads).submit(run))
+            working.append(_pool(threads, os.getpid()).submit(run))
         for work in working:
             work.result()
     except BaseException:  # on an interrupt, too, since the caller frees memory that the threads use
