@@ -81,6 +81,14 @@ def test_nothing_to_draw_is_a_note():
         assert data is None and "no points or no training cameras" in why
 
 
+def test_a_whole_wall_is_in_the_image_and_no_far_background():
+    """The points from which the camera's place follows: all of a grid, none of the two in a hundred far away."""
+    wall = np.stack(np.meshgrid(np.linspace(-3, 3, 20), np.linspace(0, 2, 20), [1.0, 1.5]), -1).reshape(-1, 3)
+    far = np.random.default_rng(0).normal(size=(16, 3)) * 50 + 200
+    shown = module.within(np.concatenate([wall, far]), module.EDGE)
+    assert shown[: len(wall)].all() and not shown[len(wall) :].any()
+
+
 @pytest.mark.parametrize("aspect", [2.0, 0.5])
 @pytest.mark.parametrize("direction", [[0.3, -1, 2], [0, 5, 0], [0, 0, -1e-15], [1, 1, 1]])
 def test_everything_shown_is_in_the_image_and_fills_it(direction, aspect):

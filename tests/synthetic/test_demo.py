@@ -151,6 +151,24 @@ def test_an_empty_folder_is_fine_and_a_full_one_is_refused(tmp_path):
     assert before == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*")}
 
 
+@pytest.mark.parametrize("empty", [False, True])
+def test_a_full_disk_leaves_no_half_a_scene(tmp_path, monkeypatch, empty):
+    """The third file cannot be written: nothing is there afterwards, or the empty folder of before."""
+    folder, written = tmp_path / "scene", []
+    if empty:
+        folder.mkdir()
+
+    def write(path, content):
+        if len(written) == 2:
+            raise ResourceError("no space left")
+        written.append(path.write_bytes(content))
+
+    monkeypatch.setattr(demo, "write_bytes", write)
+    with pytest.raises(ResourceError, match="no space"):
+        demo.write_demo(folder, views=8, width=32, height=32)
+    assert list(tmp_path.rglob("*")) == [folder] * empty
+
+
 @pytest.mark.parametrize("change", [{"views": 7}, {"width": 31}, {"height": 8}])
 def test_sizes_too_small_are_refused(tmp_path, change):
     with pytest.raises(UsageError, match="at least"):

@@ -98,6 +98,24 @@ def test_a_page_from_disk_shows_the_render(tmp_path):
         browser.close()
 
 
+@pytest.mark.browser
+def test_a_page_on_a_phone_shows_the_whole_width_of_the_first_image(tmp_path):
+    """A narrow window has a wider field of view, also after it was turned; a wide one has the camera's."""
+    camera, path = ring(1)[0], tmp_path / "scene.html"
+    write_html(path, crowd(), [camera])
+    tall, wide = (camera.height / camera.K[1, 1], camera.width / camera.K[0, 0])
+    browser = Chromium(tmp_path)
+    try:
+        browser.resize(390, 844)
+        browser.open(path.as_uri())
+        for width, height in ((390, 844), (844, 390), (390, 844)):
+            browser.resize(width, height)
+            degrees = 2 * np.degrees(np.arctan(max(tall, wide * height / width) / 2))
+            browser.wait(f"Math.abs((window.__viserMutable?.camera?.fov ?? 0) - {degrees}) < 1e-3")
+    finally:
+        browser.close()
+
+
 def refused(browser) -> list[str]:
     """Lines of the console on what the content policy, or the browser, refused."""
     return [line for line in browser.console() if "Content Security Policy" in line or "Refused" in line]

@@ -148,7 +148,7 @@ def test_the_first_view_is_that_of_the_page(window):
     middle = middle_first([model.scene_cameras[n] for n in model.train])[0]
     assert middle is not model.scene_cameras[model.train[0]]
     np.testing.assert_array_equal(server.initial_camera.position, middle.center)
-    client = SimpleNamespace(atomic=contextlib.nullcontext, camera=SimpleNamespace())
+    client = SimpleNamespace(atomic=contextlib.nullcontext, camera=SimpleNamespace(aspect=2.0))
     window.step_into(model.train[0], client)
     assert not np.allclose(client.camera.position, middle.center)
     buttons = {getattr(h, "label", None): h for h in server.gui._gui_input_handle_from_uuid.values()}
@@ -157,6 +157,19 @@ def test_the_first_view_is_that_of_the_page(window):
     back(SimpleNamespace(client=client))
     for name in ("position", "look_at", "fov"):
         np.testing.assert_allclose(getattr(client.camera, name), getattr(server.initial_camera, name), atol=1e-6)
+
+
+def test_a_narrow_window_shows_the_whole_width_of_an_image(window):
+    """On a phone, when a browser connects and when it steps into a camera; a wide window keeps the camera's field of view."""
+    camera = window.first
+    for aspect, side in ((0.46, camera.width / camera.K[0, 0] / 0.46), (2.0, camera.height / camera.K[1, 1])):
+        state = SimpleNamespace(aspect=aspect, on_update=lambda _: None, fov=0.1)
+        client = SimpleNamespace(atomic=contextlib.nullcontext, camera=state)
+        window._connected(client)
+        assert state.fov == pytest.approx(2 * np.arctan(side / 2))
+        state.fov = 0.1
+        window.reset(client)
+        assert state.fov == pytest.approx(2 * np.arctan(side / 2))
 
 
 def test_a_browser_gets_the_image_that_it_asks_for(window):

@@ -82,7 +82,8 @@ def _failures(cards: list[JobCard]) -> str:
         f"<tr><td>{html.escape(message)}</td><td>{len(names)}</td><td>{html.escape(', '.join(names[:20]))}</td></tr>"
         for message, names in sorted(by_message.items(), key=lambda item: -len(item[1]))
     )
-    return f"<h2>Failures</h2><table><tr><th>message</th><th>scenes</th><th>names</th></tr>{rows}</table>" if rows else ""
+    head = "<tr><th>message</th><th>scenes</th><th>names</th></tr>"
+    return f'<h2>Failures</h2><div class="table"><table>{head}{rows}</table></div>' if rows else ""
 
 
 def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:

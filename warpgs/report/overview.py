@@ -14,6 +14,8 @@ from warpgs.temporary import system_folder, temporary_folder
 REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libegl1 libgl1 libgl1-mesa-dri libxrender1`"
 TIMEOUT = 90
 WIDTH, HEIGHT, VIEW_ANGLE = 1280, 640, 40.0  # [px], [px], vertical [deg]
+OUTSIDE, EDGE = 1.0, 0.15
+"""Margins (`within`) of the points to show, and of those that must be in the image: whole walls, no far background."""
 TRAIN_COLOR, TEST_COLOR = "#149696", "#e08a2c"
 
 PROBE = (
@@ -109,6 +111,12 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
     return np.stack([eye @ axes, focus @ axes, axes[1]])
 
 
+def within(points: np.ndarray, margin: float) -> np.ndarray:
+    """Return a mask [N] of the points in the box of nine tenths of them, enlarged by ``margin`` of its size at each side."""
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return ((points >= low - margin * (high - low)) & (points <= high + margin * (high - low))).all(1)
+
+
 def render_overview(
     train: list[Camera], test: list[Camera], points: np.ndarray, colors: np.ndarray, up: np.ndarray
 ) -> tuple[bytes | None, str]:
@@ -121,7 +129,7 @@ def render_overview(
         return None, "no overview image: there are no points or no training cameras to show"
     centers = np.array([c.center for c in train])
     low, high = np.percentile(points, [5, 95], axis=0)
-    inside = ((points >= low - (high - low)) & (points <= high + (high - low))).all(1)
+    inside = within(points, OUTSIDE)
     middle, spread = np.median(points, axis=0), float(np.linalg.norm(high - low)) + 1e-9
     forward = np.mean([c.viewmat[2, :3] for c in train], axis=0)
     back = centers.mean(0) - middle
@@ -130,7 +138,7 @@ def render_overview(
     direction = 1.5 * back + 0.7 * reach * side / max(np.linalg.norm(side), 1e-9) + 0.5 * reach * up
     size = 0.12 * max(reach, 1e-6)
     lines = {"train": frusta(train, size), "test": frusta(test, size)}
-    core = points[((points >= low) & (points <= high)).all(1)]
+    core = points[within(points, EDGE)]
     view = framing(np.concatenate([core, *(f.reshape(-1, 3) for f in lines.values())]), direction, up)
     try:
         with temporary_folder() as folder:

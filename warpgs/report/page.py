@@ -20,15 +20,16 @@ main{max-width:1080px;margin:0 auto;padding:48px 24px 80px}
 h1{font-size:34px;letter-spacing:-.02em;margin:0 0 4px;overflow-wrap:anywhere}
 h2{font-size:20px;margin:52px 0 14px;letter-spacing:-.01em}
 .sub,figcaption,.dim{color:var(--soft)}.sub{margin:0}
-.figures{display:flex;flex-wrap:wrap;gap:1px;background:var(--card);
+.figures{display:grid;grid-template-columns:repeat(auto-fit,minmax(max(140px,22%),1fr));gap:1px;background:var(--card);
 border:1px solid var(--line);border-radius:10px;overflow:hidden;margin:28px 0 0}
-.figures div{flex:1 1 150px;box-shadow:0 0 0 1px var(--line);padding:16px 18px}
+.figures div{box-shadow:0 0 0 1px var(--line);padding:16px 18px}
 .figures b{display:block;white-space:nowrap;font-size:25px;font-weight:600;letter-spacing:-.02em;
 font-variant-numeric:tabular-nums}.figures span{color:var(--soft);font-size:13px}
 ul{padding-left:20px;margin:0}li{margin:3px 0}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums}
 th,td{padding:7px 14px 7px 0;text-align:right;border-bottom:1px solid var(--line)}
-th{font-weight:500;color:var(--soft);font-size:13px}th:first-child,td:first-child{text-align:left;overflow-wrap:anywhere}
+th{font-weight:500;color:var(--soft);font-size:13px}th:first-child,td:first-child{text-align:left;overflow-wrap:break-word}
+.table{overflow-x:auto}.legend{margin:14px 0 10px}
 .view{margin:0 0 40px}.row{display:grid;grid-template-columns:2fr 1fr;gap:10px;align-items:start}
 .wide{margin:14px calc(50% - min(50vw - 24px,800px))}.wide figcaption{padding-left:16px}
 .first{margin:24px 0 0}.stack{display:grid;gap:10px}img{display:block;width:100%;height:auto;border-radius:6px}
@@ -130,13 +131,14 @@ def _coverage(c: CoverageReport) -> str:
     images = "".join(_figure(data, f"{name}, by coverage") for name, data in c.images)
     return (
         f"<h2>Where no training view looked</h2><p>{html.escape(c.words)}</p>{_table(c.table)}"
-        f'<p class="sub">{html.escape(c.legend[0].upper() + c.legend[1:])}.</p><div class="curves">{images}</div>'
+        f'<p class="sub legend">{html.escape(c.legend[0].upper() + c.legend[1:])}.</p><div class="curves">{images}</div>'
     )
 
 
 def _table(rows: list[list[str]]) -> str:
-    head, *body = ["".join(f"<{t}>{html.escape(c)}</{t}>" for c in row) for t, row in zip(["th"] + ["td"] * len(rows), rows)]
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{r}</tr>' for r in body)}</table>"
+    cells = [[html.escape(c).replace(" %", "&nbsp;%") for c in row] for row in rows]
+    head, *body = ["".join(f"<{t}>{c}</{t}>" for c in row) for t, row in zip(["th"] + ["td"] * len(rows), cells)]
+    return f'<div class="table"><table><tr>{head}</tr>{"".join(f"<tr>{r}</tr>" for r in body)}</table></div>'
 
 
 def _list(lines: list[str]) -> str:

@@ -10,7 +10,18 @@ import numpy as np
 
 from warpgs.errors import ResourceError
 from warpgs.report.images import png
-from warpgs.report.overview import TEST_COLOR, TRAIN_COLOR, VIEW_ANGLE, framing, frusta, remedy_for, run_pyvista
+from warpgs.report.overview import (
+    EDGE,
+    OUTSIDE,
+    TEST_COLOR,
+    TRAIN_COLOR,
+    VIEW_ANGLE,
+    framing,
+    frusta,
+    remedy_for,
+    run_pyvista,
+    within,
+)
 from warpgs.scene import Camera
 from warpgs.temporary import temporary_folder
 
@@ -74,12 +85,6 @@ class ScenePlot:
     """Words and colour (#rrggbb) of each entry besides the cameras."""
 
 
-def _inside(points: np.ndarray) -> np.ndarray:
-    """Return a mask [N] of the points that lie within three times the range of nine tenths of them, along each axis."""
-    low, high = np.percentile(points, [5, 95], axis=0)
-    return ((points >= low - (high - low)) & (points <= high + (high - low))).all(1)
-
-
 def _frustum_size(cameras: list[Camera], reach: float) -> float:
     """Return the height of camera pyramids [u]: large enough to be seen, and no larger than the cameras are apart."""
     if len(cameras) < 2:
@@ -122,10 +127,9 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
     Raises:
         ResourceError: This machine cannot render; the message names the packages to install.
     """
-    inside = _inside(plot.points)
+    inside = within(plot.points, OUTSIDE)
     points, colors = plot.points[inside], plot.colors[inside]
-    low, high = np.percentile(points, [5, 95], axis=0)
-    core = points[((points >= low) & (points <= high)).all(1)]
+    core = points[within(points, EDGE)]
     cameras = [*plot.train, *plot.test]
     everything = np.concatenate([core if len(core) else points, np.array([c.center for c in cameras]).reshape(-1, 3)])
     reach = float(np.sqrt(((everything - everything.mean(0)) ** 2).sum(1)).max())

@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import ResourceError, UsageError
-from warpgs.files import is_empty, make_folder, write_bytes
+from warpgs.files import filling, is_empty, make_folder, write_bytes
 from warpgs.geometry import matmul
-from warpgs.runtime.folder_lock import hold_folder
-from warpgs.runtime.terminal import counted, say
+from warpgs.runtime.terminal import counted
 from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 
@@ -280,25 +279,22 @@ def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str],
 
 
 def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]) -> None:
-    """Write the files of a demo into a new or empty folder.
+    """Write the files of a demo as a new or empty folder, whole or not at all.
 
     Args:
         folder: Target folder.
         size: Image width and height [px].
-        contents: Makes the contents by relative path, once the folder is there.
+        contents: Makes the contents by relative path, once the disk can be written.
 
     Raises:
         UsageError: The folder is not empty, or the images are too small.
         ResourceError: The folder cannot be written.
     """
     _check(folder, *size)
-    with hold_folder(folder) as notes:  # before the work: a folder that cannot be made is reported at once
-        for note in notes:
-            say(f"warpgs: {note}", error=True)
-        _check(folder, *size)  # another process may have filled it before this one held it
+    with filling(folder) as temporary:  # before the work: a folder that cannot be made is reported at once
         for path, content in contents().items():
-            make_folder((folder / path).parent)
-            write_bytes(folder / path, content)
+            make_folder((temporary / path).parent)
+            write_bytes(temporary / path, content)
 
 
 def write_demo(

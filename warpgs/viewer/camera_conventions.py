@@ -20,9 +20,14 @@ def wxyz_of(camera: Camera) -> np.ndarray:
     return quaternions(torch.from_numpy(np.asarray(camera.viewmat)[None, :3, :3].transpose(0, 2, 1).copy()))[0].numpy()
 
 
-def fov_y(camera: Camera) -> float:
-    """Return the vertical field of view [rad], as of a principal point in the middle."""
-    return 2 * math.atan(0.5 * camera.height / float(camera.K[1, 1]))
+def fov_y(camera: Camera, aspect: float = math.inf) -> float:
+    """Return the vertical field of view [rad] at which a window shows a camera's whole image, centred.
+
+    Args:
+        camera: The camera.
+        aspect: Width of the window over its height; at least that of the image by default.
+    """
+    return 2 * math.atan(max(0.5 * camera.height / float(camera.K[1, 1]), 0.5 * camera.width / float(camera.K[0, 0]) / aspect))
 
 
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:

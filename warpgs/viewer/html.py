@@ -40,7 +40,7 @@ NO_SCENE_TREE = '<style>:has(>[aria-label$="scene tree"]){display:none!important
 HELP = (
     "<style>#warpgs-help{position:fixed;top:.8em;right:.8em;z-index:2;font:13px sans-serif;color:#fff;text-shadow:0 0 3px #000}"
     "#warpgs-help button{font:inherit;margin-left:.5em;cursor:pointer}</style>"
-    '<div id="warpgs-help">Drag to turn, scroll to zoom<button>Reset (R)</button></div>'
+    '<div id="warpgs-help">Drag to turn, scroll or pinch to zoom<button>Reset (R)</button></div>'
     "<script>{const back=()=>{const m=window.__viserMutable;m?.resetCameraPose?m.resetCameraPose(true):location.reload()};"
     "document.querySelector('#warpgs-help button').addEventListener('click',back);"
     "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
@@ -52,6 +52,14 @@ SORT_FROM_DISK = (
 )
 """Script for a page opened from disk, whose blobs browsers refuse as module workers: without the worker that sorts them, the
 Gaussians are blended in the order of the file. Refused here, viser's page starts it from a data: address, which works."""
+WHOLE_IMAGE = (
+    "<script>{let fov=OWN;const degrees=180/Math.PI,show=()=>{const c=window.__viserMutable?.camera;"
+    "if(!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
+    "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
+    "show();addEventListener('resize',show)}</script>"
+)
+"""Script that widens the vertical field of view OWN [rad] in a window narrower than the first camera's image, half of which has
+the width WIDE at distance 1: on a phone the sides would be cut off."""
 
 
 def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
@@ -123,7 +131,9 @@ def page_of(
     if stored.shortened:
         notes.append(f"{stored.shortened:,} Gaussians are longer than the page can hold, and are shown shorter")
     text, end, rest = text.replace("<head>", head, 1).rpartition("</body>")
-    return f"{text}{HELP}{end}{rest}", notes
+    wide = 0.5 * cameras[0].width / float(cameras[0].K[0, 0])
+    script = WHOLE_IMAGE.replace("OWN", f"{fov_y(cameras[0]):.8f}").replace("WIDE", f"{wide:.8f}")
+    return f"{text}{HELP}{script}{end}{rest}", notes
 
 
 def write_html(

@@ -134,7 +134,7 @@ class Panel:
                 event.client.gui.add_image(image, format="jpeg")
                 event.client.gui.add_button("close").on_click(lambda _: modal.close())
 
-        self.server.gui.add_button("sampling", hint="where the fit placed fine Gaussians").on_click(guarded(show))
+        self.server.gui.add_button("show sampling", hint="where the fit placed fine Gaussians").on_click(guarded(show))
 
     def _add_crop(self) -> None:
         """Offer a box that is moved and turned by its handles, and saved."""

@@ -133,7 +133,7 @@ class Window:
         self._move(self.first, client)
 
     def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or all, to a camera, with its field of view."""
+        """Move a browser's camera, or all, to a camera; its whole image is in the window."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = distance_ahead(camera, self.content.model.gaussians())
         for c in [client] if client is not None else list(self.server.get_clients().values()):
@@ -141,7 +141,7 @@ class Window:
                 c.camera.position = camera.center
                 c.camera.look_at = camera.center + ahead * forward
                 c.camera.up_direction = up
-                c.camera.fov = fov_y(camera)
+                c.camera.fov = fov_y(camera, c.camera.aspect)
         self._hide_near()
 
     def camera_of(self, client: viser.ClientHandle, side: int | None = None) -> Camera:
@@ -153,6 +153,7 @@ class Window:
         return camera_at(state.wxyz, state.position, state.fov, *size)
 
     def _connected(self, client: viser.ClientHandle) -> None:
+        client.camera.fov = fov_y(self.first, client.camera.aspect)
         client.camera.on_update(guarded(lambda _: (self._hide_near(), self._wake.set())))
         self._wake.set()
 

@@ -31,7 +31,8 @@ def run(arguments: list[str], about: str) -> int:
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
-        """Folder for the images and film.mp4; or only a film: .mp4, .webm, .webp or .gif. Default: RUN/path-PATH."""
+        """Folder for the images and film.mp4; or only a film: .mp4, .webm, .webp or .gif. Existing files are replaced.
+        Default: RUN/path-PATH."""
         seconds: float | None = None
         """Duration of the film [s]. Default: chosen by the path."""
         fps: int = 30

@@ -19,8 +19,8 @@ from warpgs.scene import Gaussians, View
 
 VARIANTS = {
     "psnr": "of images rounded to 8 bits, over the scored pixels alone; mean over images",
-    "ssim": "as the 3DGS line has it: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
-    "ssim_skimage": "of scikit-image, as NeRF papers have it: the same window, border left out; about 0.005 lower",
+    "ssim": "as in 3DGS papers: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
+    "ssim_skimage": "scikit-image, as in NeRF papers: the same window, without the border; about 0.005 lower",
 }
 """Definition of each score, for result files and reports. Every paper's table depends on these words."""
 ALPHA_VARIANTS = {
