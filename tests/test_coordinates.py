@@ -75,11 +75,11 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(UsageError, match="units 'metres' is not one of scene, file"):
         convert_gaussians(g, N, "scene", "metres")
     for call in (save, write_ply):
-        with pytest.raises(UsageError, match="scene units need the scene's normalization"):
+        with pytest.raises(UsageError, match="units='scene' requires normalization="):
             call(tmp_path / "a", g)
         with pytest.raises(DataError, match="is not a similarity"):
             call(tmp_path / "a", g, Normalization(np.zeros(3), 0.0))
-    with pytest.raises(UsageError, match="scene units need"):
+    with pytest.raises(UsageError, match="units='scene' requires"):
         read_ply(tmp_path / "a", units="scene")
     broken = type(g)(**{**g.tensors(), "means": g.means * float("nan")})
     with pytest.raises(DataError, match="means holds numbers that are not finite"):

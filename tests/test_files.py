@@ -131,7 +131,7 @@ def test_a_folder_with_nothing_but_our_own_leftovers_is_empty(tmp_path):
         (tmp_path / name).touch()
         assert not is_empty(tmp_path), name
         (tmp_path / name).unlink()
-    with pytest.raises(ResourceError, match="cannot be looked into"):
+    with pytest.raises(ResourceError, match="cannot be read"):
         is_empty(tmp_path / "none")
 
 

@@ -47,8 +47,8 @@ def checked_normalization(normalization: Normalization | None, units: str, where
     if normalization is None:
         if units == "scene":
             raise UsageError(
-                f"{where}: scene units need the scene's normalization; give "
-                "normalization=scene.normalization, or units='file' for Gaussians that belong to no scene"
+                f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file' "
+                "for Gaussians without a scene"
             )
         return Normalization()
     scale, offset = normalization.scale, np.asarray(normalization.offset)
@@ -66,7 +66,7 @@ def check_stored(gaussians: object) -> None:
     """
     if not isinstance(gaussians, Gaussians):
         how = "give gaussians.stored()" if hasattr(gaussians, "stored") else "files hold quats, log scales and logits"
-        raise TypeError(f"gaussians must be of Gaussians, not {type(gaussians).__name__}; {how}")
+        raise TypeError(f"gaussians must be an instance of Gaussians, not {type(gaussians).__name__}; {how}")
     for name, tensor in gaussians.tensors().items():
         if not hasattr(tensor, "detach"):
             raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")

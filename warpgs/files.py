@@ -320,9 +320,7 @@ def is_empty(folder: Path) -> bool:
     try:
         return all(p.name == LOCK or OWN_NAMES.fullmatch(p.name) for p in folder.iterdir())
     except OSError as e:
-        raise ResourceError(
-            f"{folder}: cannot be looked into ({e.strerror or e}); choose a folder that you may read and write"
-        ) from e
+        raise ResourceError(f"{folder}: cannot be read ({e.strerror or e}); choose a folder that you may read and write") from e
 
 
 def remove_leftovers(folder: Path) -> None:

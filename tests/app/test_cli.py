@@ -104,7 +104,7 @@ def test_run_folder_holds_what_it_promises(run):
     assert 0 < events["added"] <= 0.03 * 6 * 64 * 48 * events["count"] and sum(layers.values()) == metrics["gaussians"]
     assert "Why Gaussians were placed" in page and len(list((run / "sampling").glob("*.png"))) == 2
     memory = metrics["memory"]
-    assert 0 < memory["planned"] < memory["planned_at_cap"] and memory["limit"] is None and "planned for a step now" in page
+    assert 0 < memory["planned"] < memory["planned_at_cap"] and memory["limit"] is None and "memory: a step takes " in page
 
 
 def test_eval_repeats_the_scores(run, capsys):
@@ -135,10 +135,21 @@ def test_eval_measures_lpips(run, tmp_path, capsys):
 @pytest.mark.parametrize(("path", "pictures"), [("auto", 4), ("turntable", 4), ("spiral", 4), ("interpolate", 4), ("views", 9)])
 def test_render_paths(run, tmp_path, path, pictures, capsys):
     """Every path gives its pictures and a film."""
-    flags = ["--path", path, *(() if path == "views" else ("--frames", "4")), "--out", str(tmp_path), "--device", "cpu"]
+    flags = [
+        "--path",
+        path,
+        *(() if path == "views" else ("--frames", "4")),
+        "--out",
+        str(tmp_path),
+        "--sheet",
+        "--device",
+        "cpu",
+    ]
     assert main(["render", str(run), *flags]) == 0
-    assert len(list(tmp_path.glob("*.png"))) == pictures and (tmp_path / "film.mp4").stat().st_size > 0
-    assert capsys.readouterr().out.count("VP9: plays in browsers and VLC; ") == 1
+    assert len(list(tmp_path.glob("*.png"))) == pictures + 1 and (tmp_path / "film.mp4").stat().st_size > 0
+    said = capsys.readouterr().out
+    assert said.count("the film is VP9, for browsers and VLC; ") == 1
+    assert f"sheet of {min(6, pictures)} frames in {tmp_path / 'sheet.png'}" in said
 
 
 def test_plot(run, tmp_path, capsys):
@@ -148,7 +159,7 @@ def test_plot(run, tmp_path, capsys):
     if code:
         assert code == 4 and "libegl1" in capsys.readouterr().err and not target.exists()
     else:
-        assert cv2.imread(str(target)).shape == (240, 320, 3) and "Gaussians, " in capsys.readouterr().out
+        assert cv2.imread(str(target)).shape == (240, 320, 3) and "Gaussians of opacity 0.1 or" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -222,10 +233,17 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "no view 'x.png'" in failure(capsys, 3, "fit", str(scene), "--out", str(tmp_path / "c"), "--split", "train=x.png")
     assert "not understood" in failure(capsys, 2, "fit", str(scene), "--out", str(tmp_path / "d"), "--split", "third:3")
     assert "holds no run" in failure(capsys, 3, "eval", str(tmp_path))
+    assert "no such folder" in failure(capsys, 3, "eval", str(tmp_path / "nowhere"))
+    assert "no such file or folder" in failure(capsys, 3, "view", str(tmp_path / "nowhere"))
+    nowhere = tmp_path / "nowhere.safetensors"
+    assert "cannot be read (No such file or directory); give" in failure(capsys, 3, "doctor", "--repeat", str(nowhere))
+    said = failure(capsys, 2, "convert", str(run), "a b.ply")
+    assert f"is a run folder; use `warpgs export {run} --to 'a b.ply'`" in said
     (tmp_path / "model.spz").touch()
     assert "model.spz: is a file, not the folder of a run" in failure(capsys, 3, "eval", str(tmp_path / "model.spz"))
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
     assert "differs from the run" in (said := failure(capsys, 2, *again)) and "(downscale was 1" in said
+    assert f"use only --out {run} --resume" in said
     assert "leave out --frames" in failure(capsys, 2, "render", str(run), "--path", "views", "--frames", "2")
     assert "--format requires --object" in failure(capsys, 2, "demo", out, "--format", "transforms")
     assert "--format must be transforms or colmap" in failure(capsys, 2, "demo", out, "--object", "--format", "ply")
@@ -310,14 +328,15 @@ def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
 
     monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", full)
     line = failure(capsys, 4, "export", "run", "--to", "x.ply")
-    assert "--memory-limit" in line and "--resume" in line and "total capacity" not in line
+    assert "out of memory (" in line and "End other programs" in line and "total capacity" not in line
+    assert "--" not in line, "export has no flags of a fit"
 
 
 @pytest.mark.parametrize("ask", [lambda: torch.empty(2**60), lambda: np.zeros((2**30, 2**24)), lambda: bytearray(2**62)])
 def test_what_libraries_say_where_the_cpu_has_no_memory(ask, capsys, monkeypatch):
     """Their own words, which may change with their versions: more than any machine has is asked for."""
     monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", lambda *_: ask())
-    assert "--memory-limit" in failure(capsys, 4, "export", "run", "--to", "x.ply")
+    assert "out of memory (" in failure(capsys, 4, "export", "run", "--to", "x.ply")
 
 
 NUMBERS = ["inf", "nan", "1e400", "9" * 400, "", "٣", "0x10", "-1", "1e-400000"]

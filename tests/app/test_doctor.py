@@ -6,6 +6,7 @@ import os
 import sys
 import threading
 import types
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -152,6 +153,22 @@ def test_the_prior_cache(monkeypatch, tmp_path):
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "file" / "maps"))
     (f,) = doctor._prior_cache()
     assert f.status == NOTE and "WARPGS_CACHE" in f.remedy and not f.required
+
+
+def test_a_cache_that_another_process_changes_has_a_size(monkeypatch, tmp_path):
+    """A folder that is gone between listing and reading counts as nothing."""
+    (tmp_path / "gone").mkdir()
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "a").write_bytes(bytes(7))
+    real = os.scandir
+
+    def scandir(path):
+        if Path(path).name == "gone":
+            raise FileNotFoundError(path)
+        return real(path)
+
+    monkeypatch.setattr(os, "scandir", scandir)
+    assert doctor._size(tmp_path) == 7
 
 
 def test_a_kernel_cache_that_cannot_be_used(monkeypatch, tmp_path):

@@ -46,6 +46,11 @@ def test_the_help_of_a_command_fits_one_screen(capsys, name):
     assert not re.search(r"None|PosixPath|MISSING|\[\[|``", text)
 
 
+def test_the_two_parts_of_priors_are_named(capsys):
+    text = "\n".join(printed(capsys, "priors", "--help"))
+    assert "warpgs priors show SCENE" in text and "warpgs priors export --model" in text and "--help" in text
+
+
 def test_defaults_and_groups_stand_in_the_help(capsys):
     for name, stated in {
         "farm": ["JOBS --out PATH [flags]", "--per-gpu N", "share a GPU [1]"],

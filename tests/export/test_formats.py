@@ -164,7 +164,7 @@ def test_numbers_that_are_none_are_not_written(tmp_path):
             write_gaussians(tmp_path / f"a{suffix}", made, units="file")
     assert not list(tmp_path.iterdir())
     made.means[3, 1] = 1e8
-    with pytest.raises(DataError, match="SPZ holds coordinates up to"):
+    with pytest.raises(DataError, match="SPZ coordinates must be at most"):
         write_gaussians(tmp_path / "a.spz", made, units="file")
 
 
@@ -353,7 +353,7 @@ EXTENSION = ("meshes", 0, "primitives", 0, "extensions", "KHR_gaussian_splatting
         (at("buffers", 0, "uri", value="http://example.org/a.bin"), "another file"),
         (at(*EXTENSION, "kernel", value="box"), "kernel 'box'"),
         (at(*EXTENSION, "colorSpace", value="lin_rec709_display"), "lin_rec709"),
-        (at("nodes", 0, value={"mesh": 0, "scale": [2, 2, 2]}), "moves its mesh"),
+        (at("nodes", 0, value={"mesh": 0, "scale": [2, 2, 2]}), "transforms its mesh"),
         (at("asset", value=[0] * 300_001), "values"),
         (lambda d: d["meshes"].append(d["meshes"][0]), "2 primitives"),
         (lambda d: d["meshes"][0]["primitives"][0]["attributes"].pop("POSITION"), "POSITION is missing"),

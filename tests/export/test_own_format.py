@@ -94,7 +94,7 @@ def test_python_takes_a_class_an_object_or_its_place(own, tmp_path):
         assert torch.equal(back.means, cloud(40).means)
     assert (tmp_path / "2.mine").stat().st_size < (tmp_path / "1.mine").stat().st_size
     lines = convert(tmp_path / "0.mine", tmp_path / "o.spz", formats=[cls])
-    assert any("rounded by the format" in line for line in lines)
+    assert any("the format rounds positions" in line for line in lines)
 
 
 def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
@@ -121,7 +121,7 @@ def test_a_registered_format_is_found_by_its_suffix(own, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (["b.other", "--format", "{own}:Archive"], "is not named as a file of the format"),
+        (["b.other", "--format", "{own}:Archive"], "expected a name that ends in .mine"),
         (["b.mine"], "format .mine is not supported"),
         (["b.mine", "--format", "{own}:Nameless"], "has the suffix ''"),
         (["b.mine", "--format", "{own}:np"], "must be a class that derives from warpgs.Format"),

@@ -184,10 +184,13 @@ MALFORMED = {
     "flat": (ply(["element vertex 1", *(p for p in PROPERTIES if "scale_2" not in p)], ROW), "2DGS"),
     "half a degree": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:5]]), "5 f_rest"),
     "gap": (ply(["element vertex 0", *PROPERTIES, *RESET_FREE_STEPS[:8], "property float f_rest_9"]), "missing: f_rest_8"),
-    "vertex list": (ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]), "lists in element 'vertex'"),
+    "vertex list": (
+        ply(["element vertex 0", *PROPERTIES, "property list uchar int i"]),
+        "'vertex' has list properties",
+    ),
     "list before": (
         ply(["element face 1", "property list uchar int i", "element vertex 0"]),
-        "lists in element 'face'",
+        "element 'face' has list properties",
     ),
     "nan": (ply(["element vertex 1", *PROPERTIES], ROW[:24] + b"\0\0\xc0\x7f" + ROW[28:]), "opacity of Gaussian 0"),
     "zero rotation": (ply(["element vertex 1", *PROPERTIES], ROW[:40] + bytes(16)), "zero length"),

@@ -69,8 +69,8 @@ def test_the_named_format_is_read_where_a_folder_holds_several(tmp_path):
 
 def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
     scenes.write_llff(tmp_path)
-    refused(tmp_path, r"reader colmap does not find its format \(sparse/0.*; the folder holds poses_b", reader="colmap")
-    refused(tmp_path, r"reader memory does not find its format \(cameras.mem", reader=Cameras())
+    refused(tmp_path, r"reader colmap finds no scene of its format \(sparse/0.*; the folder holds poses_b", reader="colmap")
+    refused(tmp_path, r"reader memory finds no scene of its format \(cameras.mem", reader=Cameras())
     (tmp_path / "cameras.mem").touch()
     refused(tmp_path, "cameras.mem lacks its sounds. Copy the whole scene", reader=Cameras(missing="its sounds"))
     refused(tmp_path / "gone", "no such folder", reader=Cameras())

@@ -156,7 +156,7 @@ def test_explicit_names(spec, train, test):
         ("train=z;test=z", r"views z.jpg are in training and in test"),
         ("train=;test=z", r"leaves no training view"),
         ("llff:4", r"needs 4 training views, but 3 remain of 4"),
-        ("dtu:3", r"picks from 49 views, this scene has 4"),
+        ("dtu:3", r"needs 49 views, and the scene has 4"),
         ("blender:8", r"found 0 and 0"),
     ],
 )

@@ -86,7 +86,7 @@ def test_table_is_of_these_runs(finished):
     text = (request.out / "table.md").read_text()
     figures, gaps = cells(text)
     psnr = {v: [metrics_of(request, v, s)["test"]["psnr"] for s in (0, 1)] for v in ("a", "b b")}
-    assert "The t interval has 95 %" in text  # one difference needs no correction
+    assert "with a 95 % t interval;" in text  # one difference needs no correction
     assert [r[0] for r in figures[2:]] == ["a", "b b"]
     for row in figures[2:]:
         values = psnr[row[0]]

@@ -44,7 +44,7 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
     path = tmp_path / "keys.json"
     path.write_text(json.dumps([keyframe(model, 0, 2.0), keyframe(model, 1, 2.5), keyframe(model, 4, 3.0, fov_y=0.3)]))
     plan = plan_film(model, str(path), FilmSettings(fps=20))
-    assert len(plan.cameras) == 21 and plan.notes == ["path of 3 keyframes over 1 s"]
+    assert len(plan.cameras) == 21 and plan.notes == ["path: 3 keyframes over 1 s"]
     cameras = [c for _, c in plan.cameras]
     for got, wanted in ((cameras[0], 0), (cameras[10], 1), (cameras[-1], 4)):
         assert np.allclose(got.viewmat, model.cameras()[f"{wanted}.png"].viewmat, atol=1e-9)
@@ -97,13 +97,13 @@ def test_no_file_of_keyframes(model, tmp_path):
 def test_what_was_chosen_is_said(model):
     """Auto takes what suits the cameras; durations and frames are those asked for."""
     plan = plan_film(model, "auto", FilmSettings(frames=4))
-    assert len(plan.cameras) == 4 and plan.notes[1:] == ["path spiral"]
-    assert plan.notes[0].startswith("5 training cameras look from one side, over 6")
+    assert len(plan.cameras) == 4 and plan.notes[1:] == ["path: spiral"]
+    assert plan.notes[0].startswith("5 cameras on one side of the scene, over 6")
     plan = plan_film(model, "turntable", FilmSettings(seconds=0.5, fps=12, size=(64, 20), fov_y=0.5))
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
-    assert plan.notes[-1].startswith("path interpolate: through 3 of 5 training views in the order of their names")
+    assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 training views in the order of their names")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
     with pytest.raises(UsageError, match="path 'orbit'; choose one of auto, views, turntable, spiral, interpolate, or give"):
         plan_film(model, "orbit", FilmSettings())
@@ -179,7 +179,7 @@ def _moved(x: float) -> np.ndarray:
 def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
     """The suffix decides; a folder has an image for each frame as well, and a sheet is three frames wide."""
     assert warpgs.render_path(model, "turntable", out=tmp_path / "a.gif", frames=8) == [tmp_path / "a.gif"]
-    assert "path turntable there and back" in capsys.readouterr().err
+    assert "path: turntable, there and back" in capsys.readouterr().err
     plan = plan_film(model, "turntable", FilmSettings(frames=8))
     done = render_film(model, plan, tmp_path / "a.webp", FilmSettings(), sheet=True)
     assert done.files == [tmp_path / "a.webp"] and cv2.imread(str(tmp_path / "a-sheet.png")).shape == (
@@ -192,7 +192,7 @@ def test_a_film_alone_and_six_frames_on_a_sheet(model, tmp_path, capsys):
     assert less.notes[-1].startswith("3 older images are also in ")
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 8 and image.size == (40, 32)
-    with pytest.raises(UsageError, match="images of coverage are PNG files"):
+    with pytest.raises(UsageError, match="coverage images are PNG files"):
         render_film(model, plan, tmp_path / "a.webp", FilmSettings(), coverage=True)
     mixed = dataclasses.replace(
         plan, cameras=[("0", plan.cameras[0][1]), ("1", dataclasses.replace(plan.cameras[1][1], width=50))]

@@ -65,7 +65,8 @@ def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder
     monkeypatch.setattr("warpgs.pipeline.runs.request.CPU_MAX_SIDE", 20)
     result = warpgs.fit(folder / "scene", few, out=out, device="cpu")
     assert len(result.train) == 8 and result.test == () and not result.metrics["test"]
-    assert capsys.readouterr().out.splitlines().count(NO_SCORES) == 1
+    printed = capsys.readouterr().out
+    assert printed.count(NO_SCORES) == 1 and "no view is held out, so there are no scores" in printed
     assert NO_SCORES in result.notes and NO_SCORES in (out / "report.html").read_text()
     protocol = result.metrics["protocol"]
     assert (protocol["split"], protocol["resolution"]) == ("all (no --split given)", ["20 x 16"])
@@ -73,7 +74,7 @@ def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder
     record = json.loads((out / "config.json").read_text())["scene"]
     assert (record["downscale"], record["max_side"]) == (1, 20)
     assert main(["eval", str(out), "--device", "cpu"]) == 0 and "no view is held out" in capsys.readouterr().out
-    with pytest.raises(UsageError, match="--downscale, --max-side and --reader"):
+    with pytest.raises(UsageError, match="a flag that changes them, like --downscale"):
         warpgs.fit(folder / "scene", few, out=out, device="cpu", resume=True, verbose=False)
 
 
@@ -84,7 +85,7 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
     loud = warpgs.fit(folder / "scene", few, device="cpu")
     printed = capsys.readouterr().out
     assert printed.splitlines()[0] == f"reading {folder / 'scene'}"
-    assert "views to fit" in printed and "no folder was asked for" in printed
+    assert "views to fit" in printed and "no run folder (out) was given" in printed
     (first,) = (line for line in printed.splitlines() if line.startswith("step 1 of 2"))
     assert first.endswith("per step -  left -")  # it may have compiled
     details = [n for n in loud.notes if isinstance(n, Detail)]

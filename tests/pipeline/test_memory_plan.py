@@ -283,7 +283,7 @@ def test_captured_steps_are_given_up_where_they_need_more():
     assert tight.graph_refused and chosen == single and not tight.chunked and "without a CUDA graph" in tight.summary()
     assert plan(layout, **many, limit=needed - 2**20, capacity_factor=1.3)[0].chunked
     open_end, _ = plan(layout, **{**many, "most": 10**6, "available": 2**29}, limit=None)
-    assert "--memory-limit helps" in open_end.summary() and open_end.lowered_from is None
+    assert "set --memory-limit" in open_end.summary() and open_end.lowered_from is None
 
 
 @pytest.mark.cuda

@@ -94,7 +94,7 @@ def test_commands_know_the_lens_or_take_its_pinhole(run, tmp_path, capsys):
     assert main(["mesh", str(run), "--out", str(tmp_path / "m.ply"), "--resolution", "16", *CPU]) == 0
     capsys.readouterr()
     assert main(["export", str(run), "--to", str(tmp_path / "transforms.json")]) == 0
-    assert "lenses with distortion, written as pinholes of the same K" in capsys.readouterr().out
+    assert "written without their lens distortion, as pinholes" in capsys.readouterr().out
     frame = json.loads((tmp_path / "transforms.json").read_text())["frames"][0]
     assert frame["fl_x"] == pytest.approx(camera.K[0, 0])
 

@@ -129,7 +129,7 @@ def test_bad_input_is_named(run, tmp_path, capsys):
     """No run, an existing folder, a folder nowhere: one line each, exit codes of their kind, and nothing is left behind."""
     (tmp_path / "there").mkdir()
     cases = [
-        ([str(tmp_path / "none")], 3, "config.json"),
+        ([str(tmp_path / "none")], 3, "no such folder"),
         ([str(run), "--out", str(tmp_path / "there")], 2, "exists already"),
         ([str(run), "--out", str(tmp_path / "no" / "where")], 2, "is not a folder"),
         ([str(run), "--out", str(run)], 2, "exists already"),

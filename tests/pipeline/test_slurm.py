@@ -176,7 +176,7 @@ def test_a_job_that_ends_without_an_answer_has_crashed(cluster, job, capsys):
 def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
     engine = SlurmEngine("cpu", 1)
     cluster.fail["sbatch"] = "sbatch: error: invalid partition specified: nope\n"
-    with pytest.raises(ResourceError, match="did not take job s0: sbatch: error: invalid partition"):
+    with pytest.raises(ResourceError, match="rejected job s0: sbatch: error: invalid partition"):
         engine.start(job)
     del cluster.fail["sbatch"]
     engine.start(job)

@@ -44,11 +44,11 @@ def test_few_photographs_keep_the_focal_length_of_exif(sfm, still_life_views, tm
         (tmp_path / "in" / f"{i}.jpg").write_bytes(with_exif(images[i], 1, film))
     record = find_poses(tmp_path / "in", tmp_path / "out", threads=2)
     assert sum(p["registered"] for p in record["photographs"]) == 4
-    said = [n.startswith("the focal length is that of EXIF") for n in record["notes"] if "4 photographs" in n]
+    said = [n.startswith("the focal length is taken from EXIF") for n in record["notes"] if "4 photographs" in n]
     (camera,) = record["cameras"]
     exif = film / np.hypot(36, 24) * np.hypot(cameras[0].width, cameras[0].height)
     assert said[-1] is kept is bool(abs(camera["focal"] - exif) < 1e-6)
-    assert any(n.startswith("the focal length of EXIF does not fit the 4 photographs") for n in record["notes"]) is not kept
+    assert any(n.startswith("the EXIF focal length does not fit the 4 photographs") for n in record["notes"]) is not kept
 
 
 def test_images_are_upright_and_at_full_size(found, still_life_views):
@@ -117,13 +117,13 @@ def test_photographs_of_an_unread_format_are_named(sfm, tmp_path, capsys, comman
     words = [command, str(source), "--out", str(tmp_path / "out")]
     assert main(words) == DataError.exit_code
     said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1 and "a.nef is a camera's RAW file, which is not read: develop" in said
+    assert len(said.splitlines()) == 1 and "a.nef is a RAW file, which is not supported; convert" in said
     assert "(2 such files)" in said
     for i in range(2):
         noise(source / f"{i}.png", i, 2)
     assert main(words) == DataError.exit_code
     said = capsys.readouterr().err.splitlines()[-1]
-    assert "has 2 photographs" in said and "left out: a.nef is a camera's RAW" in said
+    assert "has 2 photographs" in said and "left out: a.nef is a RAW" in said
     assert [p.name for p in tmp_path.iterdir()] == ["in"]
 
 
@@ -170,13 +170,13 @@ def test_without_pycolmap_a_sentence_says_what_to_install(tmp_path, photographs,
 def test_a_worker_that_fails_is_reported_and_leaves_nothing(sfm, tmp_path, photographs, monkeypatch):
     """Its last words are in the message."""
     monkeypatch.setattr(find, "prepare", lambda path, root, small, most: prepare(path, root, small.with_name("lost"), most))
-    with pytest.raises(ResourceError, match=r"pycolmap ended with code \d+.*last words: "):
+    with pytest.raises(ResourceError, match=r"pycolmap ended with code \d+.*last message: "):
         find_poses(photographs, tmp_path / "out")
     assert not list(tmp_path.iterdir())
 
 
 def test_folders_that_need_poses(tmp_path, photographs, found):
-    with pytest.raises(DataError, match="images without cameras: `warpgs poses` finds those"):
+    with pytest.raises(DataError, match="images without cameras; `warpgs poses` finds the cameras"):
         load_scene(photographs)
     assert needs_poses(photographs) and not needs_poses(found[0]) and not needs_poses(tmp_path)
     (tmp_path / "film.MP4").touch()

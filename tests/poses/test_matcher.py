@@ -98,7 +98,7 @@ def test_the_network_is_asked_where_sift_leaves_photographs_out(sfm, tmp_path, p
     monkeypatch.setattr(find, "find_model", fewer)
     record = find_poses(photographs, tmp_path / "a", matcher="x.onnx", threads=2)
     assert all(p["registered"] for p in record["photographs"]) and record["pairs_tried"] == 15
-    assert "keypoints and matches by sift.onnx (SHA-256 0): 6 poses; SIFT finds 3, more exactly" in record["notes"]
+    assert "keypoints and matches by sift.onnx (SHA-256 0): 6 poses; SIFT, which is more accurate, finds 3" in record["notes"]
     assert record["mean_reprojection_error_px"] < 0.5 and record["points"] > 200
     assert find_poses(photographs, tmp_path / "b", matcher="x.onnx", threads=1) == record
     assert len(list((tmp_path / "a" / "images").iterdir())) == 6 and not (tmp_path / "a" / "work").exists()
@@ -106,7 +106,7 @@ def test_the_network_is_asked_where_sift_leaves_photographs_out(sfm, tmp_path, p
     assert all(p["registered"] for p in find_poses(photographs, tmp_path / "c", matcher="x.onnx")["photographs"])
     monkeypatch.setattr(Sift, "features", lambda self, image, *_: Features(np.zeros((0, 2)), np.zeros((0, 128))))
     record = find_poses(photographs, tmp_path / "d", matcher="x.onnx")
-    assert "sift.onnx (SHA-256 0) is not used: it finds 0 poses, SIFT 3" in record["notes"]
+    assert "sift.onnx (SHA-256 0) is not used: it finds 0 poses, and SIFT 3" in record["notes"]
 
 
 class Upright:

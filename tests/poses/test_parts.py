@@ -139,7 +139,7 @@ def test_a_record_says_that_few_photographs_do_not_tell_the_focal_length(focal, 
     photographs = [Photograph(f"{n}.png", Path(str(n)), 320, 240, 1, "", focal, "0") for n in range(count)]
     found = mapping(views=dict.fromkeys(range(count), view), keypoints=(900,) * count, matches={(0, 1): 200})
     notes = record_of(found, photographs, "0", [])["notes"]
-    assert any(f"an estimate from {count} photographs is often 5 % off" in n for n in notes) is said
+    assert any(f"An estimate from {count} photographs is often 5 % off" in n for n in notes) is said
 
 
 def test_a_record_says_what_does_not_repeat_and_who_has_no_pose():

@@ -35,7 +35,7 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
             and posed.matcher is None
             and any(n.startswith("poses found for 6 of 6") for n in notes)
         )
-    assert calls == [tmp_path / "in"] and "holds no cameras: finding poses" in said[0]
+    assert calls == [tmp_path / "in"] and "has no cameras: finding the poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
     with pytest.raises(UsageError, match="holds the poses of other photographs"):
         with_poses(request, run, said.append)
@@ -59,9 +59,9 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
     for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
         assert with_poses(request, tmp_path, print) == (request, [])
-    with pytest.raises(UsageError, match=r"--matcher finds poses, and .* is not a folder of photographs"):
+    with pytest.raises(UsageError, match=r"--matcher requires photographs without cameras, and .* holds none"):
         with_poses(SceneRequest(str(found[0]), matcher="x.onnx"), tmp_path, print)
-    with pytest.raises(UsageError, match="kept in a run folder; give out"):
+    with pytest.raises(UsageError, match="needs a run folder; give out="):
         with_poses(SceneRequest(str(photographs)), None, print)
 
 

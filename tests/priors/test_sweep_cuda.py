@@ -88,13 +88,13 @@ def test_depths_agree(device):
 
 
 def test_a_small_gpu_leaves_it_to_the_cpu(monkeypatch):
-    """Depths are those of the CPU, and one note names the memory that a GPU should have."""
+    """Depths are those of the CPU, and one note names the memory that since a GPU needs."""
     views, _ = still_life()
     monkeypatch.setattr(sweep, "installed_bytes", lambda _: 2**20)
     found = sweep_depths(views, [(2, 12)] * 3, SweepConfig(), torch.device("cuda"))
     for a, b in zip(found, sweep_depths(views, [(2, 12)] * 3, SweepConfig())):
         assert np.array_equal(a.depth, b.depth) and not b.notes
-    assert "a GPU should have" in found[0].notes[0] and "MiB" in found[0].notes[0] and not found[1].notes
+    assert "since a GPU needs" in found[0].notes[0] and "MiB" in found[0].notes[0] and not found[1].notes
 
 
 @pytest.mark.parametrize("size", [(40, 3), (3, 40), (3, 3), (40, 1), (1, 1)])

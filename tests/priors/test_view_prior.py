@@ -115,7 +115,7 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
         assert not p.foreground.any() and not p.boundary.any() and p.semantics_source.startswith("none")
         check(p, (32, 64))
     text = "\n".join(notes)
-    assert "used as foreground in a.png" in text and "no mask of an object in c.png, d.png: they do not count" in text
+    assert "used as foreground in a.png" in text and "not scored in c.png, d.png, which have hardly any foreground" in text
 
 
 def test_a_region_beats_saliency():
@@ -138,14 +138,14 @@ def test_classical_sources_say_so():
     assert a.disparity[near].min() > a.disparity[~near].max() and f"{valid.mean():.1%}" in a.depth_source
     assert not b.disparity.any() and b.depth_source == "none"
     text = "\n".join(notes)
-    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no depth is consistent in b.png" in text
+    assert f"0.0% to {valid.mean():.1%} of a view's pixels" in text and "no consistent depth in b.png" in text
     assert "saliency is used as foreground" in text and "--segmentation-model" in text
 
 
 def test_without_any_depth_geometry_does_not_count():
     (prior,), notes = view_priors([view(shapes()[0])], PriorConfig())
     assert not prior.disparity.any() and prior.depth_source == "none"
-    assert any("without a network and depth" in n for n in notes)
+    assert any("none from a network or from other views" in n for n in notes)
 
 
 def test_many_names_are_cut_short(tmp_path):

@@ -126,7 +126,7 @@ def _run(arguments: list[str]) -> int:
         with ignored_signals():
             return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
     except Exception as e:
-        return report_no_memory(e) if is_out_of_memory(e) else report_defect(e, arguments)
+        return report_no_memory(e, name) if is_out_of_memory(e) else report_defect(e, arguments)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.metadata
 import importlib.util
@@ -168,7 +169,7 @@ def _cuda() -> Iterable[Finding]:
     try:
         import torch
     except Exception as e:
-        yield Finding("CUDA", NOTE, f"cannot look: {_reason(e)}", "install torch first")
+        yield Finding("CUDA", NOTE, f"not checked: {_reason(e)}", "install torch first")
         return
     if torch.version.cuda is None:
         yield Finding(
@@ -223,11 +224,10 @@ def _warp_cuda() -> Finding:
 def _size(folder: Path) -> int:
     """Return the size of all files below a folder [bytes]."""
     size = 0
-    for path in folder.rglob("*"):
-        try:
-            size += path.stat().st_size if path.is_file() else 0
-        except OSError:  # another process tidies up
-            continue
+    for above, _, names in os.walk(folder):  # it skips folders that another process removes meanwhile
+        for name in names:
+            with contextlib.suppress(OSError):
+                size += os.stat(os.path.join(above, name)).st_size
     return size
 
 
@@ -278,7 +278,7 @@ def _rendering() -> Iterable[Finding]:
     if ok:
         yield Finding(topic, OK, detail)
     else:
-        remedy = "pip install pyvista vtk; where no screen is, also the system's libEGL or libOSMesa (libosmesa6)"
+        remedy = "pip install pyvista vtk; on a machine without a screen, also libEGL or libOSMesa (libosmesa6)"
         yield Finding(topic, NOTE, f"{detail}; reports come without the 3D overview", remedy)
 
 
@@ -297,8 +297,8 @@ def _video() -> Iterable[Finding]:
         return
     except Exception as e:
         why = _reason(e)
-    remedy = "pip install --force-reinstall opencv-contrib-python-headless (its wheels bring the encoder)"
-    yield Finding(topic, NOTE, f"{why}; fly-throughs are written as single frames", remedy)
+    remedy = "pip install --force-reinstall opencv-contrib-python-headless (its wheels include the encoder)"
+    yield Finding(topic, NOTE, f"{why}; films are written as single frames", remedy)
 
 
 def _disk() -> Iterable[Finding]:
@@ -306,7 +306,7 @@ def _disk() -> Iterable[Finding]:
     free = shutil.disk_usage(here).free
     detail = f"{format_bytes(free)} free at {here}"
     if free < LOW_DISK:
-        yield Finding("Disk", NOTE, detail, "free some, or work in a folder on another disk")
+        yield Finding("Disk", NOTE, detail, "free some disk space, or work in a folder on another disk")
     else:
         yield Finding("Disk", OK, detail)
 

@@ -7,10 +7,13 @@ from warpgs.runtime.ranks import last_words
 from warpgs.runtime.terminal import say
 from warpgs.version import __version__
 
+FITTING = ("fit", "farm", "compare", "ablate")
+"""Commands that fit, and take the flags of a fit."""
 
-def report_no_memory(error: Exception) -> int:
+
+def report_no_memory(error: Exception, command: str) -> int:
     """Print that the memory is exhausted, and the fix; return the exit code."""
-    return last_words(f"warpgs: {no_memory_message(error)}", ResourceError.exit_code)
+    return last_words(f"warpgs: {no_memory_message(error, fitting=command in FITTING)}", ResourceError.exit_code)
 
 
 def missing_package(error: Exception) -> str:
@@ -30,7 +33,7 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
 
     gone = missing_package(error)
     if gone:
-        line = f"warpgs: the Python package {gone} is missing, which warpgs needs here; install warpgs again with pip"
+        line = f"warpgs: the Python package {gone} is missing, which this command needs; install warpgs again with pip"
         return last_words(line, UsageError.exit_code)
     details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
     try:
@@ -48,7 +51,7 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
         line = f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})"
         return last_words(line, UsageError.exit_code)
     line = (
-        f"warpgs: internal error, {type(error).__name__}: {error}. This is a defect of warpgs; the details are {where}, "
-        "please report them"
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a bug in warpgs; please report it with the "
+        f"details {where}"
     )
     return last_words(line, WarpgsError.exit_code)

@@ -82,7 +82,9 @@ MAX_NUMBER = 3e38
 
 def _whole(words: list[str]) -> int:
     """Return the integer that a word stands for; ValueError if it is not an integer of 64 bits."""
-    if not re.fullmatch(r"[+-]?[0-9][0-9_]{0,40}", words[0]) or abs(number := int(words[0])) > MAX_WHOLE:
+    if not re.fullmatch(r"[+-]?[0-9][0-9_]*", words[0]):
+        raise ValueError(f"expected an integer, got {words[0][:40]!r}")
+    if len(words[0]) > 40 or abs(number := int(words[0])) > MAX_WHOLE:
         raise ValueError(f"expected an integer of at most 2^63 - 1, got {words[0][:40]!r}")
     return number
 
@@ -90,7 +92,9 @@ def _whole(words: list[str]) -> int:
 def _number(words: list[str]) -> float:
     """Return the number that a word stands for; ValueError if it is not a number, not finite, or beyond float32."""
     plain = re.fullmatch(r"[+-]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][+-]?[0-9]+)?", words[0])
-    if not plain or not abs(number := float(words[0])) <= MAX_NUMBER:
+    if not plain:
+        raise ValueError(f"expected a finite number, got {words[0][:40]!r}")
+    if not abs(number := float(words[0])) <= MAX_NUMBER:
         raise ValueError(f"expected a finite number of at most {MAX_NUMBER:g}, got {words[0][:40]!r}")
     return number
 

@@ -40,7 +40,7 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")
     bent = sum(c.model != "pinhole" for c in cameras)
-    notes = [f"{bent} of {len(cameras)} cameras have lenses with distortion, written as pinholes of the same K"] if bent else []
+    notes = [f"{bent} of {len(cameras)} cameras are written without their lens distortion, as pinholes"] if bent else []
     cameras = [pinhole_of(c) for c in cameras]
     if path.name == "transforms.json":
         write_json(path, {"camera_model": "PINHOLE", "frames": [_frame(i, c) for i, c in enumerate(cameras)]})
@@ -55,7 +55,10 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
         write_json(path, [_inria(i, c) for i, c in enumerate(cameras)])
         off = max((max(abs(c.K[0, 2] - c.width / 2), abs(c.K[1, 2] - c.height / 2)) for c in cameras), default=0.0)
         if off > MAX_OFF_CENTER:
-            notes.append(f"cameras.json holds no principal points; they lie up to {off:.1f} px from the middle of the images")
+            notes.append(
+                "cameras.json stores no principal points, which are up to "
+                f"{off:.1f} px off the image centre; write transforms.json to keep them"
+            )
     return notes
 
 

@@ -206,7 +206,7 @@ class CompressedPLY(Format):
     """The compressed PLY format."""
 
     suffix = ".compressed.ply"
-    description = "PlayCanvas: PLY of 8 to 11 bits within chunks of 256; SuperSplat"
+    description = "PlayCanvas, 8 to 11 bits within chunks of 256; SuperSplat"
     sorted = True
     declares = True
     decode = staticmethod(decode)

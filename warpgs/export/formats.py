@@ -55,7 +55,7 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     if choice is not None:
         chosen = find_format(choice)
         if not chosen.fits(path):
-            raise UsageError(f"{path}: is not named as a file of the format {chosen.name}; let its name end in {chosen.suffix}")
+            raise UsageError(f"{path}: expected a name that ends in {chosen.suffix}, for the format {chosen.name}")
         return chosen
     known = all_formats()
     for kind in known:

@@ -220,7 +220,7 @@ def _inside(path: Path, uri: object) -> bytes:
     """Return the bytes of a data URI; other URIs are rejected, so that a file cannot choose other files to open."""
     head, comma, text = uri.partition(",") if isinstance(uri, str) else ("", "", "")
     if not (head.startswith("data:") and head.endswith(";base64") and comma):
-        raise malformed(path, "its numbers are in another file, which is not opened; make one .glb of both")
+        raise malformed(path, "its numbers are in another file, which is not opened; combine both into one .glb")
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as e:
@@ -237,18 +237,18 @@ def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
             if isinstance(p, dict) and isinstance(p.get("extensions"), dict) and EXTENSION in p["extensions"]:
                 found.append(p)
     if len(found) != 1:
-        raise malformed(path, f"it has {len(found)} primitives with {EXTENSION}, and this reads exactly one")
+        raise malformed(path, f"it has {len(found)} primitives with {EXTENSION}; exactly one is supported")
     extension = found[0]["extensions"][EXTENSION]
     kernel, space = (extension.get(k) if isinstance(extension, dict) else None for k in ("kernel", "colorSpace"))
     if (kernel, space) != ("ellipse", COLOR_SPACE):
-        raise malformed(path, f"kernel {str(kernel)[:40]!r} in {str(space)[:40]!r}; this reads 'ellipse' in {COLOR_SPACE!r}")
+        raise malformed(path, f"kernel {str(kernel)[:40]!r} in {str(space)[:40]!r}; only 'ellipse' in {COLOR_SPACE!r} is read")
     if isinstance(extension, dict) and extension.get("extensions"):
         raise malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
     if not isinstance(found[0].get("attributes"), dict):
         raise malformed(path, "its primitive has no attributes")
     moved = {"matrix", "translation", "rotation", "scale"}
     if any(not isinstance(n, dict) or moved & n.keys() for n in (nodes if isinstance(nodes, list) else [None])):
-        raise malformed(path, "a node moves its mesh; apply the transformations, and export again")
+        raise malformed(path, "a node transforms its mesh; apply the transformations, and export again")
     return found[0]
 
 
@@ -300,6 +300,6 @@ class TextGltf(Format):
     """Text glTF."""
 
     suffix = ".gltf"
-    description = "glTF 2.0 with KHR_gaussian_splatting, text with its numbers inside"
+    description = "glTF 2.0 with KHR_gaussian_splatting, text with embedded numbers"
     encode = staticmethod(encode_gltf)
     decode = staticmethod(decode)

@@ -170,7 +170,7 @@ def _locate_vertices(path: Path, elements: list[Element], start: int) -> tuple[E
         raise ply_error(path, "the header must have one 'element vertex'")
     for element in elements:
         if element.has_list and (element.count or element.name == "vertex"):
-            raise ply_error(path, f"the lists in element {element.name[:40]!r} leave the place of the Gaussians unknown")
+            raise ply_error(path, f"element {element.name[:40]!r} has list properties, so the Gaussians cannot be located")
         if element.name == "vertex":
             break
         start += element.count * sum(np.dtype(kind).itemsize for _, kind in element.properties)
@@ -189,7 +189,7 @@ def _check_properties(path: Path, vertex: Element) -> int:
     # Normals are unused, and some tools leave them out.
     missing = sorted(set(_names(rest)) - set(names) - {"nx", "ny", "nz"})
     if missing == ["scale_2"]:
-        raise ply_error(path, "its Gaussians are flat (2DGS), without scale_2, which this program does not render")
+        raise ply_error(path, "its Gaussians are flat (2DGS, no scale_2), which is not supported")
     if missing:
         raise ply_error(path, f"properties missing: {', '.join(missing[:8])}{' ...' if len(missing) > 8 else ''}")
     return rest

@@ -107,6 +107,6 @@ def _check_comment(path: Path, words: list[str]) -> None:
     match text:
         case ["splatrendermode", mode] if mode not in ("default", "mip"):
             raise DataError(
-                f"{path}: its Gaussians are for the render mode {mode[:40]!r}, which this program does not have. Train or "
-                "export them in the mode 'default' or 'mip'."
+                f"{path}: its Gaussians need the render mode {mode[:40]!r}, which is not supported. Train or export them in "
+                "the mode 'default' or 'mip'."
             )

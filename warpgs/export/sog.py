@@ -168,7 +168,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         meta = _meta(path, archive)
         n = meta.get("count")
         if meta.get("model", "default") not in ("default", "antialiased"):
-            raise malformed(path, f"it is for the model {str(meta['model'])[:40]!r}, which this program does not render")
+            raise malformed(path, f"its model {str(meta['model'])[:40]!r} is not supported")
         if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
             raise malformed(path, f"{str(n)[:20]} Gaussians in {size} bytes")
         most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
@@ -332,7 +332,7 @@ class SOG(Format):
     """The SOG format."""
 
     suffix = ".sog"
-    description = "PlayCanvas: images of 8-bit indices in a zip archive; SuperSplat"
+    description = "PlayCanvas, images of 8-bit indices in a zip archive; SuperSplat"
     sorted = True
     archive = True
     declares = True

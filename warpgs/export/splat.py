@@ -59,7 +59,7 @@ class Splat(Format):
     """The .splat format."""
 
     suffix = ".splat"
-    description = "antimatter15: 8 bits, colours without a direction; small viewers"
+    description = "antimatter15, 8 bits, no view-dependent colours; small viewers"
     max_degree = 0
     encode = staticmethod(encode)
     decode = staticmethod(decode)

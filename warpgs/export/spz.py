@@ -68,7 +68,7 @@ def fractional_bits(means: np.ndarray) -> int:
         bits -= 1
     if bits < 0:
         raise DataError(
-            f"SPZ holds coordinates up to 8388607, and one is {largest:.0f}: move the scene to its origin, or use .ply"
+            f"SPZ coordinates must be at most 8388607, and one is {largest:.0f}; move the scene to the origin, or write .ply"
         )
     return bits
 
@@ -186,11 +186,11 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
     """Return the sizes of the sections [bytes]; DataError where the header cannot be true of a file of ``size`` bytes."""
     magic, version, n, degree, bits = header
     if magic != MAGIC:
-        raise malformed(path, "it does not start as SPZ does")
+        raise malformed(path, "it does not start with the SPZ signature")
     if version not in versions:
-        raise malformed(path, f"it is of version {version} here, and this reads {', '.join(map(str, versions))}")
+        raise malformed(path, f"version {version} is not supported here (supported: {', '.join(map(str, versions))})")
     if degree > 3:
-        raise malformed(path, f"its harmonics are of degree {degree}, and this reads degrees 0 to 3")
+        raise malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 3)")
     if bits > MAX_FRACTIONAL_BITS:
         raise malformed(path, f"its coordinates have {bits} fractional bits of 24")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
@@ -296,13 +296,13 @@ class SPZ(Format):
     """The SPZ format."""
 
     suffix = ".spz"
-    description = "Niantic: fixed point and 8 bits, gzip; Scaniverse, Babylon.js, SuperSplat"
+    description = "Niantic, fixed point and 8 bits, gzip; Scaniverse, Babylon.js, SuperSplat"
     Config = SPZConfig
     sorted = True
     declares = True
     note = (
-        "SPZ has y up, as Niantic defines it; SuperSplat, splat-transform 3, gsply and gaussforge take its axes for those of "
-        "PLY: --rotate 1,0,0,180 converts files from or for them"
+        "SPZ files have y up, as Niantic defines it. SuperSplat, splat-transform 3, gsply and gaussforge expect the axes of "
+        "PLY: use --rotate 1,0,0,180 for files to or from them"
     )
     decode = staticmethod(decode)
 

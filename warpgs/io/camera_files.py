@@ -39,7 +39,7 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     if not found:
         raise DataError(f"{path}: holds no camera. Give cameras.json, transforms.json, or the folder of a scene")
     bent = sum(any(lens.distortion) for _, lens in found.values())
-    notes = [f"{bent} of {len(found)} lenses have distortion, which renders do not have"] if bent else []
+    notes = [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
     return {name: Camera(viewmat, lens.K, lens.width, lens.height) for name, (viewmat, lens) in found.items()}, notes
 
 

@@ -107,7 +107,7 @@ def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """
     data = read_image_file(path, max_pixels)
     if not data.startswith(png.SIGNATURE):
-        raise DataError(f"{path}: is not a PNG, whatever its name says; save it as 16-bit PNG or NPY")
+        raise DataError(f"{path}: is not a PNG file; save it as 16-bit PNG or NPY")
     raw = _raster(path, data, max_pixels)
     return raw if raw.ndim == 2 else np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[2]]])
 

@@ -52,7 +52,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
     """
     if len(names) < least:
         raise DataError(
-            f"{where}: the protocol picks from {least} views, this scene has {len(names)}; restore the scan, or use llff:K or "
+            f"{where}: the protocol needs {least} views, and the scene has {len(names)}; restore the scan, or use llff:K or "
             "every:N"
         )
     ids = image_ids(names)
@@ -65,6 +65,6 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
         shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
         raise DataError(
             f"{where}: images with the ids {shown} are missing (ids are counted from 0, names run from {names[0]} to "
-            f"{names[-1]}); restore them, for the protocol's ids would name other views"
+            f"{names[-1]}); restore them, because the protocol's ids would otherwise select other views"
         )
     return {i: by_id[i] for i in wanted}

@@ -37,7 +37,7 @@ def read_rows(path: Path) -> np.ndarray:
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
     if len(rows) > MAX_ROWS:
-        raise DataError(f"{path}: has {len(rows):,} rows, and this reads {MAX_ROWS:,}; make it again")
+        raise DataError(f"{path}: has {len(rows):,} rows; at most {MAX_ROWS:,} are supported. Make it again")
     return rows.astype(np.float64)
 
 

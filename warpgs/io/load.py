@@ -129,12 +129,13 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     if not complete and broken:
         raise DataError(f"{root}: {broken[0]}, and no other format was found. Copy the whole reconstruction")
     if not complete:
-        images = ". It holds images without cameras: `warpgs poses` finds those" if list_images(root) else ""
+        images = bool(list_images(root))
         if not images and (unread := unread_note(root)):
             raise DataError(f"{root}: {unread}")
-        if not images:
-            images = f". It holds no photograph either ({READ})"
-        raise DataError(f"{root}: no scene format found. Looked for: {', '.join(r.description for r in readers)}{images}")
+        photographs = "" if images else f"no photographs ({READ}) and "
+        remedy = ". It holds images without cameras; `warpgs poses` finds the cameras" if images else ""
+        known = ", ".join(r.description for r in readers)
+        raise DataError(f"{root}: {photographs}no scene format found. Looked for: {known}{remedy}")
     taken, *others = complete
     notes = [f"{lack}; {taken.name} is complete and is used instead" for lack in broken]
     if others:
@@ -156,7 +157,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
         others = [p.found for r in all_readers() if (p := r.probe(root)) is not None]
         there = f"; the folder holds {' and '.join(others)}" if others else ""
         wanted = f" ({reader.description})" if reader.description else ""
-        raise DataError(f"{root}: the reader {reader.name} does not find its format{wanted}{there}. Choose another reader")
+        raise DataError(f"{root}: the reader {reader.name} finds no scene of its format{wanted}{there}. Choose another reader")
     if probe.missing:
         raise DataError(f"{root}: {probe.found} lacks {probe.missing}. Copy the whole scene")
     return reader

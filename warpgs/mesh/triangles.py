@@ -13,8 +13,8 @@ MAX_JUMP = 1.1
 With less, surfaces at grazing angles are left out; with more, false triangles extend behind depth edges. Chosen, as
 the truncation was, on a demo scene of another seed than the one that is reported (docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
-    "no surface inside the grid; give another --voxel (larger; smaller where it is near the size "
-    "of the scene), or fit with more steps"
+    "no surface inside the grid; give a larger --voxel (a smaller one if it is near the size of the scene), or fit "
+    "with more steps"
 )
 """Words where a grid holds no surface."""
 MIN_PART = 0.002

@@ -146,17 +146,17 @@ def _with_network(
     """
     count = len(found.views)
     if count == len(photographs):
-        return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, more exactly"]
+        return found, [f"{network.title} is not used: SIFT finds the poses of all photographs, and is more accurate"]
     small, second = [work / "small" / n for n in names], work / "network"
     make_folder(second)
     turned = write_matches(network, small, second / LEARNED, kind, EXHAUSTIVE, progress)
     (work / "small").rename(second / "small")
     other = find_model(photographs, names, kind, second, progress, threads, learned=True)
     if len(other.views) <= count:
-        return found, [f"{network.title} is not used: it finds {len(other.views)} poses, SIFT {count}"]
+        return found, [f"{network.title} is not used: it finds {len(other.views)} poses, and SIFT {count}"]
     shutil.rmtree(work / "model", ignore_errors=True)
     (second / "model").rename(work / "model")
-    notes = [f"keypoints and matches by {network.title}: {len(other.views)} poses; SIFT finds {count}, more exactly"]
+    notes = [f"keypoints and matches by {network.title}: {len(other.views)} poses; SIFT, which is more accurate, finds {count}"]
     if turned:
         notes.append(f"matched after quarter turns: {', '.join(photographs[i].name for i in turned)}")
     return other, notes
@@ -187,7 +187,7 @@ def _check(source: Path, out: Path, allow_outside: bool) -> None:
         if out.exists() and not (out.is_dir() and is_empty(out)):
             raise UsageError(f"{out} exists already; choose another --out, or remove it")
     except OSError as e:
-        raise UsageError(f"{e.filename or out}: cannot be looked into ({e.strerror or e}); choose another folder") from e
+        raise UsageError(f"{e.filename or out}: cannot be read ({e.strerror or e}); choose another folder") from e
 
 
 def _prepared(
@@ -214,7 +214,7 @@ def _prepared(
     photographs, names = [], []
     copies = to_jpeg([p for p in paths if is_heic(p)], root, work / "heic", max_pixels, progress)
     if copies:
-        notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} coded again as JPEG")
+        notes.append(f"{len(copies)} HEIC photograph{'s' if len(copies) != 1 else ''} converted to JPEG")
     for i, path in enumerate(paths):
         progress(f"reading photographs: {i + 1} of {len(paths)}")
         names.append(f"{i:06d}.png")
@@ -265,7 +265,7 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
         most = max(found.keypoints)
         why = (
             f"{blank} of {count} show almost nothing that can be matched (at most {most:,} keypoints): a blank wall, "
-            "darkness or blur. Photograph something patterned, sharp and in light"
+            "darkness or blur. Take sharp photographs of textured things, in good light"
         )
     elif not largest:
         why = f"no two of {count} show the same place. Take photographs that overlap by two thirds, in small steps"

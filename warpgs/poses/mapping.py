@@ -100,7 +100,7 @@ def check_installed() -> None:
         UsageError: It is not.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise UsageError("poses are found with pycolmap, which is not installed; `pip install 'warpgs[poses]'`")
+        raise UsageError("finding poses needs pycolmap, which is not installed; `pip install 'warpgs[poses]'`")
 
 
 def camera_groups(photographs: list[Photograph]) -> list[int]:
@@ -154,7 +154,7 @@ def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
             ) from e
         last = e.errors[-LAST_WORDS:].replace("\n", " ")
         raise ResourceError(
-            f"pycolmap ended with code {e.code}; it may have had too little memory. Its last words: {last}"
+            f"pycolmap ended with code {e.code}; it may have had too little memory. Its last message: {last}"
         ) from e
 
 

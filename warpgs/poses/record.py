@@ -53,16 +53,16 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         })  # fmt: skip
     remarks = [summary(found, len(names))]
     if found.kept_focal:
-        remarks.append(f"the focal length is that of EXIF: {len(found.views)} photographs do not determine it better")
+        remarks.append(f"the focal length is taken from EXIF, because {len(found.views)} photographs cannot improve it")
     elif found.kept_focal is False:
         remarks.append(
-            f"the focal length of EXIF does not fit the {len(found.views)} photographs, maybe cropped; it was estimated from "
-            "them instead, often 5 % off, at worst 20 % and more"
+            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; it was estimated "
+            "from them instead. Such an estimate is often 5 % off, at worst 20 % or more"
         )
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
-            f"EXIF holds no focal length; an estimate from {len(found.views)} photographs is often 5 % off, at worst 20 % and "
-            "more, and depth with it. Add photographs from more directions"
+            f"EXIF holds no focal length. An estimate from {len(found.views)} photographs is often 5 % off, at worst 20 % or "
+            "more, and so is depth. Add photographs from more directions"
         )
     if found.method == "global":
         remarks.append(

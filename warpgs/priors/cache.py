@@ -34,7 +34,7 @@ def cache_folder() -> Path:
     if own := os.environ.get("WARPGS_CACHE"):
         asked = Path(os.path.expanduser(own))  # as a shell does, but not within quotes
         if own.startswith("~") and not asked.is_absolute():
-            raise ResourceError(f"WARPGS_CACHE: {own} is in an unknown home folder; give the whole path")
+            raise ResourceError(f"WARPGS_CACHE: the home folder of {own} is unknown; give an absolute path")
         return asked
     home = cache_home()
     if home is None:

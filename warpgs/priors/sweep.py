@@ -79,7 +79,7 @@ def _backend(
         smallest = min(min(v.image.shape[:2]) for v in views.values())
         # not by the free memory: a resumed fit must find the same depths again
         if needed > GPU_FRACTION * installed_bytes(device):
-            notes.append(f"swept on the CPU: a GPU should have {format_bytes(needed / GPU_FRACTION)} of memory for it")
+            notes.append(f"depth is swept on the CPU, since a GPU needs {format_bytes(needed / GPU_FRACTION)} of memory")
         elif smallest > config.window // 2:  # torch mirrors no border wider than the image
             return lambda view, others, p: sweep_cuda.inverse_depths(view, others, p, config, device), notes
     return lambda view, others, p: sweep_cpu.inverse_depths(view, others, p, config), notes
@@ -145,10 +145,7 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [
-            _unswept(v, f"not swept: only {len(swept)} of {len(views)} views are, which together see most of the scene")
-            for v in views
-        ]
+        out = [_unswept(v, f"not swept: {len(swept)} of the {len(views)} views together see most of the scene") for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

@@ -116,14 +116,14 @@ def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cac
 
 def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
     if depths is None:
-        notes.append("depth: none, without a network and depth from other views; geometry is not scored")
+        notes.append("depth: none from a network or from other views, so geometry is not scored")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
     fractions = [float(d.valid.mean()) for d in depths]
     span = f"{min(fractions):.1%} to {max(fractions):.1%}"
     notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
     poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
     if poor:
-        notes.append(f"no depth is consistent in {', '.join(poor)}: geometry does not count there; --depth-model would help")
+        notes.append(f"no consistent depth in {', '.join(poor)}, so geometry is not scored there; --depth-model adds depth")
 
     def disparity(i: int) -> tuple[np.ndarray, str]:
         view, d = views[i], depths[i]
@@ -162,7 +162,7 @@ def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: i
 
 def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], object]) -> SemanticsSource:
     words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
-    notes.append(Detail(f"{words}; --segmentation-model takes one"))
+    notes.append(Detail(f"{words}; --segmentation-model adds a network"))
 
     found = classical_maps([v.image for v in views], tell)
     return lambda i: (found[i], "saliency and edges")
@@ -197,7 +197,7 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
         words = f"semantics: {reason}, so the mask or black background is used as foreground in {_names(replaced)}"
         notes.append(Detail(words) if classical else words)
     if empty:
-        notes.append(f"semantics: hardly any foreground and no mask of an object in {_names(empty)}: they do not count there")
+        notes.append(f"semantics: not scored in {_names(empty)}, which have hardly any foreground and no object mask")
     return result
 
 

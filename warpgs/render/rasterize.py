@@ -99,7 +99,7 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
             listed = isinstance(given, (list, tuple))
             order = "a list needs a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
             wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
-            raise TypeError(f"{name} must be of {wanted}, not {type(given).__name__}; {order}")
+            raise TypeError(f"{name} must be an instance of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
         raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
     _check_tensor("means", gaussians.means)  # first, since the harmonics of None are made like them

@@ -55,13 +55,19 @@ def is_out_of_memory(error: BaseException) -> bool:
     return False
 
 
-def no_memory_message(error: BaseException, purpose: str = "") -> str:
-    """Return the message for a lack of memory, with remedies; ``purpose`` may state its use, such as " for step 3"."""
-    reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
-    return (
-        f"no memory is left{purpose} ({reason[:200]}). Give the fit less with --memory-limit, fit smaller images with "
-        "--downscale, or end other programs; --resume continues from the last checkpoint"
+def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
+    """Return the message for a lack of memory, with remedies: the flags of a fit, where one was running.
+
+    ``purpose`` may state the use of the memory, such as " for step 3".
+    """
+    remedy = (
+        "Lower the need of the fit by --memory-limit or --downscale, or end other programs; --resume continues from the last "
+        "checkpoint"
+        if fitting
+        else "End other programs, and try again"
     )
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
+    return f"out of memory{purpose} ({reason[:200]}). {remedy}"
 
 
 @functools.cache

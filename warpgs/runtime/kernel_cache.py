@@ -69,7 +69,7 @@ def choose_kernel_cache(configured: str | None = None) -> KernelCache:
         own.mkdir(exist_ok=True)
         return KernelCache(own, refused)
     except (ResourceError, OSError) as e:
-        raise ResourceError(f"kernels have nowhere to be compiled to: {refused}, and {e}. {REMEDY}") from e
+        raise ResourceError(f"no folder for compiled kernels can be written: {refused}, and {e}. {REMEDY}") from e
 
 
 def _usual(configured: str | None) -> tuple[Path | None, str]:
@@ -78,7 +78,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
     if asked:
         folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
         if asked.startswith("~") and not folder.is_absolute():
-            return None, f"the kernel cache {asked} is in an unknown home folder"
+            return None, f"the home folder of the kernel cache {asked} is unknown"
         return folder.resolve(), ""
     home = cache_home()
     if home is None:

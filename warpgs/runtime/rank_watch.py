@@ -78,8 +78,8 @@ class RankWatch:
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
                 raise ResourceError(
-                    f"{self.count - len(missing)} of {self.count} ranks came within {seconds:.0f} s, rank {missing[0]} did "
-                    "not: start all of them, with the same MASTER_ADDR and MASTER_PORT"
+                    f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s, without rank "
+                    f"{missing[0]}; start all of them, with the same MASTER_ADDR and MASTER_PORT"
                 )
             time.sleep(0.05)
 

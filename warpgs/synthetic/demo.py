@@ -257,7 +257,7 @@ def _check(folder: Path, width: int, height: int) -> None:
         if folder.exists() and not is_empty(folder):
             raise UsageError(f"{folder} is not empty, and the demo overwrites nothing; name a new or an empty folder")
     except OSError as e:
-        raise ResourceError(f"cannot look into {folder} ({e.strerror or e}); name a folder that you may write to") from e
+        raise ResourceError(f"{folder} cannot be read ({e.strerror or e}); name a folder that you may write to") from e
 
 
 def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:

@@ -52,9 +52,9 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
         raise DataError(f"{path}: is a web page; open this file in a browser")
     elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
         known = ", ".join(suffixes())
-        raise DataError(
-            f"{path}: is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known}); give one of these"
-        )
+        what = f"is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known})"
+        remedy = "give a run folder or a file of Gaussians" if not path.exists() else "give one of these"
+        raise DataError(f"{path}: {what if path.exists() else 'no such file or folder'}; {remedy}")
     require_viser()
     with contextlib.suppress(KeyboardInterrupt):
         server = open_server(port)

@@ -189,8 +189,7 @@ def _check_time_budget(a: Any, arguments: list[str]) -> None:
         return
     if a.resume or word_after(arguments, "--steps"):
         raise UsageError(
-            "--time-budget chooses the number of steps: leave out --steps, and to continue such a run give --resume with "
-            "the --steps that it chose instead of --time-budget"
+            "--time-budget chooses the number of steps; leave out --steps. To continue such a run, use only --out RUN --resume"
         )
     check_budget(a.time_budget)
 

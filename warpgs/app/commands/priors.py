@@ -7,6 +7,13 @@ from warpgs.app.flags import MAX_THREADS, check_range, parse_flags
 from warpgs.errors import UsageError
 from warpgs.runtime.terminal import say
 
+USAGE = (
+    "usage: warpgs priors show SCENE --out DIR [flags]",
+    "       warpgs priors export --model MODEL --out FILE.onnx [flags]",
+    "",
+    "`warpgs priors show --help` and `warpgs priors export --help` list their flags.",
+)
+
 
 def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help.
@@ -16,15 +23,15 @@ def run(arguments: list[str], about: str) -> int:
     """
     kinds = {"show": _show, "export": _export}
     if not arguments or arguments[0] not in kinds:
-        if arguments and arguments[0] in ("-h", "--help"):
-            say("usage: warpgs priors show SCENE --out DIR [flags]")
-            say("       warpgs priors export --model MODEL --out FILE.onnx [flags]")
+        if arguments and arguments[0] in ("-h", "--help", "--help-all"):
+            for line in (f"warpgs priors: {about}", "", *USAGE):
+                say(line)
             return 0
-        raise UsageError("priors: give show or export; `warpgs priors show --help` lists flags")
-    return kinds[arguments[0]](arguments[1:], about)
+        raise UsageError("priors: give show or export; `warpgs priors --help` shows how")
+    return kinds[arguments[0]](arguments[1:])
 
 
-def _show(arguments: list[str], about: str) -> int:
+def _show(arguments: list[str]) -> int:
     import tyro
 
     from warpgs.io.decoding import MAX_PIXELS
@@ -52,7 +59,7 @@ def _show(arguments: list[str], about: str) -> int:
         """Method of depth estimation without a network: sweep or flow, as --init.source of a fit."""
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
-    a = parse_flags(Show, arguments, "warpgs priors show", about)
+    a = parse_flags(Show, arguments, "warpgs priors show", "write depth and saliency of each training view as images")
     from warpgs.pipeline.runs.preview import show_priors
     from warpgs.pipeline.runs.request import SceneRequest
 
@@ -65,7 +72,7 @@ def _show(arguments: list[str], about: str) -> int:
     return 0
 
 
-def _export(arguments: list[str], about: str) -> int:
+def _export(arguments: list[str]) -> int:
     import tyro
 
     from warpgs.priors.export import ExportRequest
@@ -76,7 +83,7 @@ def _export(arguments: list[str], about: str) -> int:
         out: Path
         """ONNX file to write; FILE.onnx.json beside it describes its input."""
 
-    a = parse_flags(Export, arguments, "warpgs priors export", about)
+    a = parse_flags(Export, arguments, "warpgs priors export", "write a network as an ONNX file")
     from warpgs.priors.export import export_network
 
     for line in export_network(a.request, a.out):

@@ -62,12 +62,12 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     for job in found:
         if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} cannot be the name of a job, and so of a folder; name it in a .jsonl file"
+                f"{jobs}: {job.name[:100]!r} is not a valid name for a job and its folder; give another name in a .jsonl file"
             )
         if (size := len(os.fsencode(job.name))) > MOST_BYTES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} has {size} bytes, and the name of a job at most {MOST_BYTES}; name it in a .jsonl "
-                "file"
+                f"{jobs}: {job.name[:100]!r} has {size} bytes, and a job's name at most {MOST_BYTES}; give another name "
+                "in a .jsonl file"
             )
         if job.name.casefold() in taken:
             raise UsageError(f"{jobs}: two jobs have the name {job.name!r}; give each line of a .jsonl file its own name")
@@ -117,7 +117,7 @@ def _flag(key: str, value: Any) -> list[str]:
     """Return a setting of a line as words of a command line."""
     name = key.replace("_", "-")
     if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
-        raise schema.SchemaError(f"{key[:40]!r} cannot be set for one job")
+        raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")
     if isinstance(value, bool):
         group, dot, last = name.rpartition(".")
         return [f"--{name}" if value else f"--{group}{dot}no-{last}"]
@@ -125,5 +125,5 @@ def _flag(key: str, value: Any) -> list[str]:
         raise schema.SchemaError(f"{key[:40]} must be text, a number, true or false")
     schema.text(str(value), key[:40])
     if name in PLUGINS and ":" in str(value):
-        raise schema.SchemaError(f"{key} names code of your own: give --{name} on the command line of the farm")
+        raise schema.SchemaError(f"{key} names user code; give it as --{name} on the command line of the farm")
     return [f"--{name}={value}"]

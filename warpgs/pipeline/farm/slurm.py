@@ -111,7 +111,7 @@ class SlurmEngine:
         done = _call("sbatch", "--parsable", *self._options, f"--output={log}", script=script)
         slurm_id = done.output.strip().partition(";")[0]
         if done.code or not slurm_id.isdecimal():
-            raise ResourceError(f"sbatch did not take job {job.name}: {_last_line(done.errors + done.output)}")
+            raise ResourceError(f"sbatch rejected job {job.name}: {_last_line(done.errors + done.output)}")
         self._running[job.name] = _Queued(slurm_id, number)
 
     def wait(self, seconds: float) -> list[Event]:
@@ -147,7 +147,7 @@ class SlurmEngine:
         if done.code:  # Slurm is busy or away: nothing is known, and answers still count
             if not self._told:
                 self._told = True
-                say(f"squeue failed, and is called again: {_last_line(done.errors)}", error=True)
+                say(f"squeue failed; trying again: {_last_line(done.errors)}", error=True)
             return
         there = set(done.output.split())
         for job in self._running.values():

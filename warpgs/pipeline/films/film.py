@@ -73,9 +73,11 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
         raise UsageError(f"{out}: unknown film suffix; use {', '.join(SUFFIXES)}, or a folder without a suffix for images")
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
-        raise UsageError(f"{out}: the views differ in size, and a film or a sheet has one; give a size for all, or a folder")
+        raise UsageError(
+            f"{out}: the views differ in size, not allowed in a film or sheet; give --size, or a folder without --sheet"
+        )
     if alone and coverage:
-        raise UsageError(f"{out}: images of coverage are PNG files; give a folder")
+        raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")
     return alone, one_size
 
 

@@ -63,16 +63,16 @@ class FilmSettings:
         """
         low, high = LIMITS["width"]
         if self.size is not None and not all(low <= s <= high for s in self.size):
-            raise UsageError(f"a film of {self.size[0]} x {self.size[1]} px: each side must have {low} to {high} px")
+            raise UsageError(f"each side of a film must have {low} to {high} px, not {self.size[0]} x {self.size[1]}")
         narrow, wide = (math.radians(v) for v in LIMITS["fov"])
         if self.fov_y is not None and not narrow <= self.fov_y <= wide:
             raise UsageError(
-                f"a field of view of {math.degrees(self.fov_y):g} degrees: give {LIMITS['fov'][0]:g} to {LIMITS['fov'][1]:g}"
+                f"--fov must be {LIMITS['fov'][0]:g} to {LIMITS['fov'][1]:g} degrees, not {math.degrees(self.fov_y):g}"
             )
         if self.seconds is not None and not 0 < self.seconds * self.fps <= MAX_FRAMES:
-            raise UsageError(f"a film of {self.seconds:g} s: give more than 0, and at most {MAX_FRAMES:,} frames")
+            raise UsageError(f"a film must be longer than 0 s and have at most {MAX_FRAMES:,} frames, not {self.seconds:g} s")
         if self.frames is not None and not 1 <= self.frames <= MAX_FRAMES:
-            raise UsageError(f"a film needs at least 1 frame and may have at most {MAX_FRAMES:,}, not {self.frames}")
+            raise UsageError(f"a film must have 1 to {MAX_FRAMES:,} frames, not {self.frames}")
 
     def count(self, seconds: float) -> int:
         """Return the number of frames of a film that lasts ``seconds`` where no duration is given."""
@@ -123,7 +123,7 @@ def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[C
     words = "in the order of their names" if tour.by_name else "from neighbour to neighbour"
     back = ", and back to the first" if tour.closed else ""
     cameras = through(tour.keyframes, frames, closed=tour.closed)
-    return cameras, f"path interpolate: through {count} of {len(train)} training views {words}{back}"
+    return cameras, f"path: interpolate, through {count} of {len(train)} training views {words}{back}"
 
 
 def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:
@@ -135,7 +135,7 @@ def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings
         keyframes = [replace(k, reach=rig.reach(k.camera)) for k in keyframes]
     last = keyframes[-1].seconds
     cameras = through(keyframes, settings.count(last + 1 / settings.fps))
-    return cameras, f"path of {len(keyframes)} keyframes over {last:g} s"
+    return cameras, f"path: {len(keyframes)} keyframes over {last:g} s"
 
 
 def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan:
@@ -168,17 +168,17 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         remedy = "c2w of keyframes is camera-to-world in OpenCV axes, in the units of the scene's files"
         nearer = _nearer(cameras, train, "move the keyframes nearer to the photographs' cameras")
         return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
-    notes = [f"{len(train)} training cameras look {rig.describe()}"]
+    notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
     if rig.turned:
-        notes.append("the photographs are rotated; the film is upright, by the plane of the cameras")
+        notes.append("the photographs are rotated; the film is upright, by the common plane of the cameras")
     kind = path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)
         remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
     else:
         cameras = camera_path(kind, rig, train, settings.count(SECONDS))
-        there_and_back = " there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
-        words = f"path {kind}{there_and_back}"
+        there_and_back = ", there and back over the captured area" if rig.span is not None and kind == "turntable" else ""
+        words = f"path: {kind}{there_and_back}"
         remedy = nearer = "--path interpolate stays at the training views"
     cameras = [framed(c, settings.size, settings.fov_y) for c in cameras]
     return FilmPlan(_numbered(cameras), coverage, remedy, [*notes, words], _nearer(cameras, train, nearer))

@@ -12,9 +12,10 @@ from warpgs.scene import Camera
 
 KINDS = ("forward", "ring", "room", "free")
 NAMES = {
-    "forward": "from one side", "ring": "around an object", "room": "outwards, as in a room", "free": "in no order known here",
+    "forward": "on one side of the scene", "ring": "around the scene", "room": "looking outwards, as in a room",
+    "free": "without a known layout",
 }  # fmt: skip
-"""Words for each kind, after "the cameras look"."""
+"""Words for each kind, after "training cameras"."""
 MIN_AGREEMENT = 0.8
 """Fraction of the cameras that must look at one point, or away from it."""
 MIN_COSINE = 0.8
@@ -55,7 +56,7 @@ class Rig:
     """True if the photographs are rotated by a quarter turn, so that an upright film swaps width and height."""
 
     def describe(self) -> str:
-        """Return a phrase on where the cameras look."""
+        """Return a phrase on where the cameras are."""
         if self.span is None:
             return f"{NAMES[self.kind]}, from all sides" if self.kind == "ring" else NAMES[self.kind]
         degrees = math.degrees(self.span[1] - self.span[0])

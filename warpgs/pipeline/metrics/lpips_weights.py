@@ -206,10 +206,10 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
     notes = [f"{out}: LPIPS with {net.title}, heads of version {version}"]
     if not backbone_hash.startswith(net.published):
         notes.append(
-            f"{backbone} is not the file that torchvision publishes (SHA-256 {net.published}...): figures will not compare"
+            f"{backbone} is not the file that torchvision publishes (SHA-256 {net.published}...); scores are not comparable"
         )
     if version == "unknown":
-        notes.append(f"{heads} is neither v0.0 nor v0.1 of the published heads: figures will not compare")
+        notes.append(f"{heads} is neither v0.0 nor v0.1 of the published heads; scores are not comparable")
     return notes
 
 

@@ -169,7 +169,7 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
         return nothing, f"no hull: {len(shapes)} of {len(views)} views have an alpha channel; at least two are needed"
     cells, width = carve(shapes)
     if not len(cells):
-        return nothing, "no hull: the silhouettes have no place in common; do the poses belong to the images?"
+        return nothing, "no hull: the silhouettes do not overlap in space; check that the poses belong to the images"
     colors, kept = _seen_colors(shapes, cells, width)
     total, cells, colors = len(cells), cells[kept], colors[kept]
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))

@@ -212,8 +212,8 @@ def on_object(start: Start, views: list[View]) -> Start:
         return start
     count = int(keep.sum())
     if count < MIN_POINTS:
-        return start._replace(how=f"{start.how}\na view is empty at all but {count} of them; do poses and images agree?")
-    how = f"{start.how}\n{len(keep) - count:,} of them left out: a view is empty there"
+        return start._replace(how=f"{start.how}\nonly {count} of them are in no empty area of a view; check the poses")
+    how = f"{start.how}\n{len(keep) - count:,} of them left out, in empty areas of a view"
     return start._replace(cloud=PointCloud(cloud.points[keep], cloud.colors[keep]), how=how)
 
 
@@ -237,7 +237,7 @@ def initial_points(
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
     found = on_object(_found_points(views, points, config, generator, device, progress), views)
     if config.extrapolate and found.depths is None:
-        return found._replace(how=f"{found.how}\nno extrapolated points: they need a start by sweep or flow")
+        return found._replace(how=f"{found.how}\nno extrapolated points, which need --init.source sweep or flow")
     return found
 
 

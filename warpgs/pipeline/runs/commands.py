@@ -13,7 +13,7 @@ from typing import Any
 from warpgs.errors import DataError, UsageError, WarpgsError
 from warpgs.files import write_json, writing_into
 from warpgs.io.splits import Split
-from warpgs.pipeline.films.film import COVERAGE, FILM, render_film, sheet_path
+from warpgs.pipeline.films.film import COVERAGE, FILM, SHEET_FRAMES, render_film, sheet_path
 from warpgs.pipeline.films.plan import FilmSettings, plan_film
 from warpgs.pipeline.metrics.lpips import load_lpips
 from warpgs.pipeline.model.model_file import FittedModel
@@ -32,7 +32,7 @@ from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
-VP9 = "VP9: plays in browsers and VLC; H.264 for others: ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
+VP9 = "the film is VP9, for browsers and VLC; for other players: ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
 """Note on a film in .mp4, of which {} is the path."""
 ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
 """Scores of the rendered alpha, with the words for each view's line."""
@@ -105,13 +105,14 @@ def evaluate(
         return [*notes, f"no view is held out; training PSNR {metrics['train']['psnr']:.2f} dB"]
     lines = [_view_line(r) for r in metrics["views"]]
     lines += coverage_lines(metrics["coverage"]) if by_coverage else []
-    return [*notes, *lines, f"mean of {len(test)}: {score_line(metrics['test'])}"]
+    return [*notes, *lines, f"mean of {len(test)} held-out views: {score_line(metrics['test'])}"]
 
 
 def _view_line(row: dict[str, Any]) -> str:
     """Return the scores of a view as a line for the user."""
     alphas = [f", alpha {row[k]:.3f} {words}" for k, words in ALPHAS.items() if not math.isnan(row.get(k, math.nan))]
-    return f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.4f}{''.join(alphas)} ({row['region']})"
+    region = "" if row["region"] == "all" else f" (over {row['region']})"
+    return f"{row['name']}: PSNR {row['psnr']:.2f} dB, SSIM {row['ssim']:.3f}{''.join(alphas)}{region}"
 
 
 def render(
@@ -168,7 +169,7 @@ def render(
     *files, last = done.files
     if last.suffix.lower() == ".mp4":
         notes.append(VP9.format(shlex.quote(str(last))))
-    notes += done.notes + ([f"six frames in {sheet_path(out)}"] if sheet else [])
+    notes += done.notes + ([f"sheet of {min(SHEET_FRAMES, len(plan.cameras))} frames in {sheet_path(out)}"] if sheet else [])
     if last == out:
         return [*notes, f"{len(plan.cameras)} frames in {out}"]
     if last.name == FILM:

@@ -62,8 +62,9 @@ def filtered(
         lines.append(f"{int((~keep).sum()):,} Gaussians are outside the box")
     if cleaned if filters.clean is None else filters.clean:
         removed = disturbing(gaussians, None if stored is None else _maxima(stored))
-        counts = ", ".join(f"{int((where & keep).sum()):,} {reason}" for reason, where in removed.items())
-        lines.append(f"removed: {counts} (--no-clean keeps them)")
+        counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}
+        if words := [f"{count:,} {reason}" for reason, count in counts.items() if count]:
+            lines.append(f"removed Gaussians: {', '.join(words)} (--no-clean keeps them)")
         for where in removed.values():
             keep &= ~where
     gaussians = select(gaussians, keep)

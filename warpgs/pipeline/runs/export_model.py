@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,7 +25,8 @@ from warpgs.pipeline.runs.export_filters import (
     training_cameras,
     turned_line,
 )
-from warpgs.pipeline.runs.folder import StoredRun, open_run
+from warpgs.pipeline.runs.folder import CONFIG, StoredRun, open_run
+from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.folder_lock import hold_file
 from warpgs.scene import Camera, Gaussians
 
@@ -56,6 +58,10 @@ def convert(
     given = [find_format(f) for f in formats]
     for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
         format_of(target, unused)  # says that its name is another
+    if (source / CONFIG).is_file():
+        raise UsageError(
+            f"{source}: is a run folder; use `warpgs export {shlex.quote(str(source))} --to {shlex.quote(str(target))}`"
+        )
     read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
     rotation_of(filters.rotate, None)  # before anything is read
     gaussians, antialiased = read_with_antialiasing(source, None, "file", read)
@@ -96,16 +102,16 @@ def _written(
     if not len(gaussians):
         raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
-        lines.append(f"harmonics above degree {kind.max_degree} are dropped: {kind.suffix} files cannot hold them")
+        lines.append(f"harmonics above degree {kind.max_degree} are dropped, because {kind.suffix} files cannot store them")
         gaussians = limit_degree(gaussians, kind.max_degree)
     if stored is not None:
         lines = [*stored.notes(), *lines]
     if stored is not None and any(stored.background):
         color = "".join(f"{round(255 * v):02x}" for v in stored.background)
-        lines.append(f"the file does not hold the background colour of the fit, #{color}")
+        lines.append(f"the file does not store the background colour of the fit, #{color}; set it in your viewer")
     if antialiased and not kind.declares:
         lines.append(
-            f"{kind.suffix} files cannot declare that the model is antialiased: choose the antialiased mode in your viewer"
+            f"{kind.suffix} files cannot declare that the model is antialiased; choose the antialiased mode in your viewer"
         )
     if kind.sorted:
         gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
@@ -113,7 +119,7 @@ def _written(
         write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
     lines += _changes(target, gaussians, kind) if type(kind).decode is not Format.decode else []
     lines += [kind.note] if kind.note else []
-    return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {target.stat().st_size / 2**20:.2f} MiB"]
+    return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"]
 
 
 def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
@@ -124,8 +130,8 @@ def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
     if moved == 0 and float(scales.max()) < ROUNDING:
         return []
     other = int((scales > 0.1).sum())
-    text = f"rounded by the format: positions by at most {moved:.2g} of the scene's units"
-    return [text + (f"; {other:,} Gaussians have an axis that is off by more than a tenth" if other else "")]
+    text = f"the format rounds positions, by at most {moved:.2g} units of the scene's files"
+    return [text + (f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else "")]
 
 
 def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:

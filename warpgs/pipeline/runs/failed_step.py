@@ -10,7 +10,7 @@ import torch
 
 from warpgs.errors import DataError
 from warpgs.files import write_bytes
-from warpgs.input_files import open_input
+from warpgs.input_files import open_input, unread_reason
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.learned_views import LearnedViews
@@ -82,7 +82,9 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
         open_input(path).close()
         with safe_open(path, framework="pt", device=str(device)) as f:
             return {n: f.get_tensor(n) for n in f.keys()}, json.loads((f.metadata() or {})["step"])
-    except (OSError, SafetensorError, KeyError, ValueError, RecursionError) as e:
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give the {FILE} of a run folder") from e
+    except (SafetensorError, KeyError, ValueError, RecursionError) as e:
         raise DataError(f"{path}: not a failed step ({e}); give the {FILE} of a run folder") from e
 
 

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shlex
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -133,7 +134,8 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         record = schema.read(path, folder)
     except FileNotFoundError as e:
-        raise DataError(f"{folder}: holds no run ({CONFIG} is missing); give a folder that `warpgs fit --out` filled") from e
+        lack = f"holds no run ({CONFIG} is missing)" if folder.is_dir() else "no such folder"
+        raise DataError(f"{folder}: {lack}; give a folder that `warpgs fit --out` filled") from e
     except NotADirectoryError as e:
         raise DataError(f"{folder}: is a file, not the folder of a run; give a folder that `warpgs fit --out` filled") from e
     except (OSError, schema.SchemaError) as e:
@@ -177,13 +179,15 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
                 key = f"{key} ({', '.join(changed)})"
-            given = "images, cameras, points or given maps, as --downscale, --max-side and --reader give them"
-            words = {"fingerprint": f"the scene ({given})"}
+            words = {
+                "fingerprint": "the scene (its images, cameras, points or maps, or a flag that changes them, like --downscale)",
+                "train": "the set of training views", "test": "the set of held-out views",
+            }  # fmt: skip
             options = [f"{k} was {stored['scene'].get(k)}" for k, v in record["scene"].items() if stored["scene"].get(k) != v]
             was = f" ({', '.join(o for o in options if not o.startswith('path '))})" if key != "device" else ""
             raise UsageError(
-                f"--resume: {words.get(key, key)} differs from the run in {out}{was if len(was) > 3 else ''}; give all flags "
-                "that it was started with, or a new --out"
+                f"--resume: {words.get(key, key)} differs from the run in {out}{was if len(was) > 3 else ''}. To continue with "
+                f"the flags that it was started with, use only --out {shlex.quote(str(out))} --resume; else give a new --out"
             )
 
 

@@ -51,9 +51,10 @@ def mesh(
         options = replace(options, voxel=options.voxel * scale)
 
     def planned(plan: GridPlan, memory: str) -> None:
+        lost = f"{100 * (1 - plan.inside):.1f} %"
         say(
             f"grid: {' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} in units of the "
-            f"scene's files; {100 * (1 - plan.inside):.1f} % of the observed surface is outside the grid and left out"
+            "scene's files" + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
         )
 
     with hold_file(target) as notes:

@@ -137,5 +137,6 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     with hold_file(out) as held:
         tell("drawing the plot")
         write_bytes(out, render_plot(contents, settings.size, settings.background))
-    what = "points of the reconstruction" if settings.points == "start" else "Gaussians"
+    faint = f"Gaussians of opacity {MIN_OPACITY:g} or more"
+    what = "points of the reconstruction" if settings.points == "start" else faint
     return [*held, *notes, f"{len(points):,} {what}, {len(train)} training and {len(test)} held-out cameras in {out}"]

@@ -11,7 +11,7 @@ from warpgs.errors import UsageError
 from warpgs.files import write_bytes
 from warpgs.pipeline.metrics.region import counted_region
 from warpgs.pipeline.model.init import InitConfig, consistent_depths, seen_points
-from warpgs.pipeline.runs.request import SceneRequest, read_scene
+from warpgs.pipeline.runs.request import NO_SCORES, SceneRequest, read_scene
 from warpgs.pipeline.train.strategies.importance import ImportanceConfig, geometry_score, semantic_score
 from warpgs.priors.cache import cache_folder
 from warpgs.priors.view_prior import PriorConfig, view_priors
@@ -75,4 +75,5 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
         priors, found = view_priors(views, config, depths=lambda: depths, regions=regions, threads=threads, cache=cache)
         for view, prior in zip(views, priors):
             write_bytes(out / f"{names[view.name]}.png", png(prior_sheet(view, prior)))
+        notes = [n for n in notes if n != NO_SCORES]
         return [*notes, *held, *renaming_notes(names), *found, f"{len(views)} sheets in {out}"]

@@ -26,7 +26,6 @@ from warpgs.pipeline.metrics.evaluate import (
 )
 from warpgs.pipeline.metrics.lpips import Lpips
 from warpgs.pipeline.runs.coverage_report import coverage_section
-from warpgs.pipeline.runs.request import NO_SCORES
 from warpgs.render.options import RasterizeOptions
 from warpgs.report.curve import curve
 from warpgs.report.events import read_events
@@ -95,13 +94,13 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
             *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),
         ]
     else:
-        lines = [NO_SCORES, f"training PSNR {metrics['train']['psnr']:.2f} dB"]
+        lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no view is held out, so there are no scores)"]
     compiling = metrics["seconds"].get("compiling", 0.0)
     once = f", {duration(compiling)} of it for kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
     if out is None:
-        return [*lines, "no folder was asked for, so nothing is written"]
+        return [*lines, "nothing is written to disk, because no run folder (out) was given"]
     run = shlex.quote(str(out))
     commands = {
         f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",

@@ -188,10 +188,10 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     events, layers = figures["events"], figures["layers"]
     if not events["count"]:
         return None
-    how = "sampled at random, the likelier the higher their S_importance," if method.agp else "the highest in S_importance"
+    how = "sampled at random in proportion to S_importance," if method.agp else "the highest in S_importance"
     weighted = sum(method.weights()) > 0
     if method.agp and not weighted:
-        how = "sampled at random, all alike,"
+        how = "sampled uniformly at random,"
     consistent = method.sampler.depth == "consistent"
     gate = _open_pixels(consistent and method.ra, method.asked_quantile)
     words = (
@@ -202,8 +202,8 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     )  # fmt: skip
     if events["widened"]:
         words += (
-            f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened: fewer than {SUPPORT} times "
-            f"as many pixels as are sampled passed at the {method.asked_quantile:g} quantile."
+            f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened, because fewer than "
+            f"{SUPPORT} candidates for each sample passed at the {method.asked_quantile:g} quantile."
         )
     table = [
         ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],

@@ -35,19 +35,17 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
-            raise UsageError(
-                f"--matcher finds poses, and {source} is not a folder of photographs without cameras; leave it out"
-            )
+            raise UsageError(f"--matcher requires photographs without cameras, and {source} holds none; leave it out")
         return request, []
     if out is None:
-        raise UsageError(f"{source}: has no cameras, and those found are kept in a run folder; give out")
+        raise UsageError(f"{source}: has no cameras, and finding them needs a run folder; give out=")
     scene = out / POSED_SCENE
     if (scene / JSON).is_file():
         record = read_record(scene)
         if record["source_sha256"] != source_digest(source, request.allow_outside):
-            raise UsageError(f"{source} holds the poses of other photographs than {scene}; give another --out")
+            raise UsageError(f"{scene} holds the poses of other photographs than {source}; give another --out")
     else:
-        progress(f"{source} holds no cameras: finding poses of its photographs, kept in {scene}")
+        progress(f"{source} has no cameras: finding the poses of its photographs; they are stored in {scene}")
         threads = torch.get_num_threads()
         record = find_poses(
             source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,

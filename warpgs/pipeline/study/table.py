@@ -76,7 +76,7 @@ class Table:
         return (max if metric.upwards else min)(means, default=math.nan)
 
 
-INTERVALS = ("The t interval has 95 %", "The t intervals of a column hold together with 95 % (Bonferroni)")
+INTERVALS = ("a 95 % t interval", "t intervals that hold together for a column with 95 % (Bonferroni)")
 """Words on the intervals of a table with one difference, or with several."""
 
 
@@ -131,7 +131,7 @@ def markdown(table: Table) -> str:
     lines = [*_grid(head, body, 1 + len(marks)), ""]
     rows = [r for r in table.rows if r.differences]
     lines += [
-        f"Difference to {table.base}, paired by seed. {INTERVALS[len(rows) > 1]}; an interval without 0 is marked \\*:",
+        f"Difference to {table.base}, paired by seed, with {INTERVALS[len(rows) > 1]}; \\* marks an interval without 0:",
         "",
     ]
 

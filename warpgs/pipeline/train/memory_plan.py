@@ -135,7 +135,7 @@ class MemoryPlan:
 
     def summary(self) -> str:
         """Return one line for the user."""
-        text = f"memory: {format_bytes(self.planned)} planned for a step now"
+        text = f"memory: a step takes {format_bytes(self.planned)} now"
         if self.chunked:
             text += ", the image in chunks"
         if self.cap > self.gaussians:
@@ -147,9 +147,7 @@ class MemoryPlan:
             if self.planned_at_cap > self.available:
                 fraction = (self.available - self.planned) / max(1, self.planned_at_cap - self.planned)
                 reached = int(self.gaussians + max(0.0, fraction) * (self.cap - self.gaussians))
-                text += (
-                    f"; the {format_bytes(self.available)} that are free are reached at about {reached:,}, --memory-limit helps"
-                )
+                text += f"; the free {format_bytes(self.available)} are used up at about {reached:,}; set --memory-limit"
                 return text
             return text if self.chunked else Detail(text)
         text += f"; limit {format_bytes(self.limit)}"

@@ -35,8 +35,8 @@ def check_ranks(batch: int, ranks: Ranks) -> None:
     """
     if batch < ranks.count:
         raise UsageError(
-            f"{ranks.count} ranks share the views of a step, and --batch {batch} gives it {batch}: give --batch {ranks.count} "
-            "or a multiple of it, or start fewer ranks"
+            f"--batch {batch} gives a step fewer views than the {ranks.count} ranks that share them; give --batch "
+            f"{ranks.count} or a multiple of it, or start fewer ranks"
         )
 
 

@@ -143,8 +143,8 @@ class Exposure(ViewModule):
         each = zip(fitted.train, maps, gains, strict=True)
         views = [{"name": n, "affine": m.tolist(), "gain": float(g)} for n, m, g in each]
         summary = (
-            f"exposures learned: the training views show a middle gray {gains.min():.2f} to {gains.max():.2f} times as bright "
-            "as the model, with colours of their mean exposure; all scores use renders without an exposure"
+            f"exposures learned: the training views are {gains.min():.2f} to {gains.max():.2f} times as bright as the model, "
+            "which has their mean exposure; all scores use renders without a learned exposure"
         )
         renders = ((v, render_view(fitted.gaussians, v, fitted.options)[0]) for v in fitted.test)
         scores = [s for v, image in renders if np.isfinite(s := matched_psnr(v, image))]

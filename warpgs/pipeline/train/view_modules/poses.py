@@ -180,8 +180,8 @@ def pose_figures(
         rows.append({"name": name, "degrees": float(np.degrees(2 * np.arcsin(sine))), "units": shift})
     degrees, units = ([r[key] for r in rows] for key in ("degrees", "units"))
     summary = (
-        f"poses refined: {len(train)} training cameras turned by {np.median(degrees):.3f} degrees in the median, "
-        f"{max(degrees):.3f} at most, and moved by {np.median(units):.4g} and {max(units):.4g} units; the first one is fixed"
+        f"poses refined: {len(train)} training cameras; median rotation {np.median(degrees):.3f} degrees, largest "
+        f"{max(degrees):.3f}; median shift {np.median(units):.4g} units, largest {max(units):.4g}; the first camera is fixed"
     )
     first = dict(zip(reversed(camera_numbers([given[n] for n in train])), reversed(train)))
     lenses = [
