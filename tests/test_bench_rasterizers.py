@@ -134,6 +134,7 @@ def test_tables_of_other_rasterizers():
     assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 | 2.5 | 5 | 12.5 | 3.5 |" in made
     chosen = rasterizers_page.times_table(result, 32, ("gsplat dense",))
     assert "| 1k, 320 x 240 | gsplat dense | 4 | 8 | 20 | 8 | 16 | 40 | 7 |" in chosen and "warpgs" not in chosen
+    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 |\n" in rasterizers_page.gpu_table(result)
     ratios = "0.50 | 0.50 | 0.50 | 0.50 | 0.50 | 0.50 | 1.00 |"
     assert f"| 1k, 320 x 240 | gsplat dense | {ratios}" in rasterizers_page.ratios_table(result)
     assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)

@@ -10,10 +10,10 @@ from warpgs.errors import UsageError
 from warpgs.field_docs import document_fields
 
 ALPHA_CUT = 1.0 / 255.0
-"""Smallest alpha that is blended: half of what an 8-bit channel resolves, doubled (Kerbl et al. 2023, renderer)."""
+"""Smallest alpha that is blended: one step of an 8-bit channel (renderer of Kerbl et al. 2023)."""
 
 TRANSMITTANCE_STOP = 1e-4
-"""A pixel is finished below this transmittance. Tied to the clamp: (1 - 0.99)^2 = 1e-4, two opaque layers."""
+"""Transmittance below which a pixel is finished: that behind two layers of the largest alpha, (1 - 0.99)^2 = 1e-4."""
 
 ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
@@ -28,7 +28,7 @@ K_TOLERANCE = 1e-5
 """Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""
 
 POSE_TOLERANCE = 1e-3
-"""Largest entry of R R^T - 1 of a pose, and largest error of its last row, that is put down to rounding. The product of a
+"""Largest entry of R R^T - 1 of a pose, and largest error of its last row, that counts as rounding. The product of a
 thousand rotations in float32 is off by at most 1000 x 3 x 2^-23 = 4e-4; within the tolerance lengths are off by 0.05 %."""
 
 NEAR = 0.01
@@ -88,8 +88,8 @@ class Rule:
     transmittance_stop: float = TRANSMITTANCE_STOP
     """Transmittance below which a pixel is finished."""
     inclusive_stop: bool = True
-    """True to blend the Gaussian that crosses the stop. Then at most 1e-4 of the pixel is lost, and accumulated alpha is
-    monotone in every opacity within that. False to drop it, which loses up to 1e-2."""
+    """True to blend the Gaussian that crosses the stop. By default at most 1e-4 of the pixel is then lost, and alpha is
+    monotone in every opacity up to that amount. False to drop it, which loses up to 1e-2."""
     near: float = NEAR
     """Nearest depth rendered [u], at least 0."""
     far: float = FAR

@@ -12,19 +12,19 @@ class WarpgsError(Exception):
 
 
 class UsageError(WarpgsError):
-    """A flag or an argument cannot be honoured as given."""
+    """A flag or an argument that cannot be used as given."""
 
     exit_code = 2
 
 
 class DataError(WarpgsError):
-    """A scene, an image, a model file or a run folder is invalid."""
+    """An invalid scene, image, model file or run folder."""
 
     exit_code = 3
 
 
 class NotFiniteError(WarpgsError):
-    """The loss or a parameter of a fit became non-finite."""
+    """A non-finite loss or parameter of a fit."""
 
     view: int | None = None
     """Number of the training view with that loss; None for other values."""
@@ -33,17 +33,17 @@ class NotFiniteError(WarpgsError):
 
 
 class ResourceError(WarpgsError):
-    """Memory, disk or a device does not suffice; the message names need and supply."""
+    """Too little memory or disk space, or a device that cannot be used; the message names what is needed and available."""
 
     exit_code = 4
 
 
 class FolderHeldError(ResourceError):
-    """Another process holds a folder that it writes into."""
+    """A folder that another process is writing into."""
 
 
 class OutOfMemoryError(ResourceError):
-    """A step of a fit requested more memory than the device had."""
+    """A step of a fit that needed more memory than the device had."""
 
     def __init__(self, message: str, intact: bool):
         """Take a message, and whether the state of the fit is still that before the step."""

@@ -167,7 +167,7 @@ def _remedy(error: OSError) -> str:
 
 
 def _sync(folder: Folder) -> None:
-    """Have the disk keep the names in a folder through a power failure.
+    """Sync a folder to the disk, so that the names in it survive a power failure.
 
     Raises:
         ResourceError: The disk fails.

@@ -158,7 +158,7 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
 
 
 def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
-    """Return what `back_project` returns for tensors, of a pinhole R^T (d K^-1 [x y 1] - t), without a product of matrices.
+    """Return what `back_project` returns, from tensors and without a matrix product: R^T (d K^-1 [x y 1] - t) for a pinhole.
 
     Such a product would load another library on CUDA. Of K only focal lengths and principal point count, as in projection.
 
@@ -186,7 +186,7 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
 
 
 def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what `project_points` returns for tensors, without a product of matrices: pixels [S, 2] and depths [S] [u].
+    """Return what `project_points` returns, from tensors and without a matrix product: pixels [S, 2] and depths [S] [u].
 
     Where a camera cannot see a point, its depth is at most 0 and its pixel means nothing.
 

@@ -78,7 +78,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
 
 
 def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
-    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1, else NaN.
+    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN if not on the lens.
 
     An orthographic camera has them at (u, v, 1) for every depth.
 

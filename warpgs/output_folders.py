@@ -158,7 +158,7 @@ class Folder:
         return os.listdir(self.path if self.descriptor is None else self.descriptor)
 
     def sync(self) -> None:
-        """Have the disk keep the names through a power failure, where the system can: Windows has no such call."""
+        """Sync the names to the disk, so that they survive a power failure; Windows has no such call."""
         if self.descriptor is None:
             return
         try:
@@ -283,7 +283,7 @@ def _again(root: _Root) -> Folder:
 
 
 def _entered(above: Folder, name: str, make: bool) -> Folder:
-    """Open a folder in another one, and make it first if it is missing and shall be."""
+    """Open a folder in another one, and make it first if it is missing and ``make`` is True."""
     if name == os.pardir:
         raise RefusedError(f"{above.path / name}: points outside the folder; name the place without {os.pardir}")
     try:

@@ -37,12 +37,12 @@ class Registry(Generic[T]):
     """
 
     def __init__(self, kind: str, base: type[T], package: str):
-        """Begin with nothing.
+        """Start without classes.
 
         Args:
             kind: What the classes are, for messages: strategy, loss term, view module, reader.
             base: What each class derives from.
-            package: Dotted name of the package, or module, that ours live in.
+            package: Dotted name of the package, or module, of the built-in classes.
         """
         self.kind, self.base, self.package = kind, base, package
         self._classes: dict[str, type[T]] = {}
@@ -51,10 +51,11 @@ class Registry(Generic[T]):
     def register(self, name: str) -> Callable[[type[T]], type[T]]:
         """Return a decorator that registers a class by a name and sets its ``name``.
 
-        A class of the user's own may take the place of an earlier one, as when its file is loaded again, but not of ours.
+        A user's class replaces an earlier one of that name, for example when its file is loaded again. It cannot replace a
+        built-in class.
 
         Raises:
-            UsageError: One of ours has that name.
+            UsageError: A built-in class has that name.
         """
 
         def decorate(cls: type[T]) -> type[T]:
@@ -68,7 +69,7 @@ class Registry(Generic[T]):
         return decorate
 
     def names(self) -> list[str]:
-        """Return the names of ours, sorted."""
+        """Return the names of the built-in classes, sorted."""
         if not self._searched:
             package = importlib.import_module(self.package)
             for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
@@ -90,7 +91,7 @@ class Registry(Generic[T]):
         return {name: _line_about(self._classes[name]) for name in self.names()}
 
     def knows(self, name: str) -> bool:
-        """Return whether `find` needs no class that was not loaded: True for all names without a colon."""
+        """Return whether `find` can look up a name: True without a colon, or for a user's class that was loaded."""
         return ":" not in name or name in self._classes
 
     def has(self, cls: type) -> bool:
@@ -136,7 +137,7 @@ class Registry(Generic[T]):
 
 
 _PREFIX = "_warpgs_"
-"""Begin of the names of modules that were loaded by their path."""
+"""Start of the names of modules that were loaded by their path."""
 LOADED: set[str] = set()
 """Names of the modules that users' own classes were loaded from."""
 

@@ -1,4 +1,4 @@
-"""The types that flow through the program: scenes, models and renders.
+"""Data types of the whole package: scenes, models and renders.
 
 Conventions (docs/conventions.md): camera_from_world poses, OpenCV axes (+x right, +y down, +z forward), pixel centres at
 +0.5, quaternions wxyz, log scales, logit opacities, colours in [0, 1]. Lengths are in scene units [u].
@@ -212,7 +212,7 @@ class ViewDepth:
     notes: tuple[str, ...] = ()
     """Messages for the user: pairs left out, files missing, nothing found."""
     searched: bool = True
-    """False where the view's depth was not looked for, because there are others enough."""
+    """False where the depth of the view was not estimated, because enough other views have depth."""
     given: np.ndarray | None = None
     """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None without a map."""
 

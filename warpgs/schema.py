@@ -19,13 +19,13 @@ from warpgs.input_files import read_input
 MAX_BYTES = 2**25
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
 MAX_DEPTH = 50
-"""Number of lists and objects that may lie in each other: whoever walks through a value needs no guard of its own."""
+"""Number of lists and objects that may lie in each other, so that code that walks through a value needs no limit of its own."""
 MAX_PARTS = 2**19
 """Number of lists and objects, each of which takes some thirty times as much memory as text."""
 MAX_WHOLE = 2**63 - 1
 """Largest integer: that of 64 bits."""
 MAX_NUMBER = 1e300
-"""Largest number: no integer beyond it becomes a float."""
+"""Largest magnitude of an integer that stands for a number: a larger one could overflow a float."""
 
 Schema = Callable[[Any, str], None]
 

@@ -39,7 +39,7 @@ _LOCK = threading.Lock()
 def shared_locks() -> Iterator[tuple[int, ...]]:
     """Give descriptors of all locks of temporary folders, for a child process to inherit (``pass_fds``).
 
-    It may work in these folders, and so they are held until it has ended, too, even if this process dies before.
+    The child may work in these folders. So they stay locked until it has ended, even if this process dies first.
     """
     with _LOCK:
         copies = tuple(map(os.dup, _HELD)) if sys.platform != "win32" else ()
@@ -80,7 +80,7 @@ class TemporaryFile:
             self.close()
 
     def close(self) -> None:
-        """Close the file, and give its lock free; a file system may only now say that it could not keep it."""
+        """Close the file and release its lock; some file systems report a failed write only now."""
         if self._open:
             self._open = False
             os.close(self.descriptor)

@@ -1,8 +1,8 @@
 """Farms of small fits: equal bytes and time by engine, and fits per hour by scenes that share a GPU and by GPUs.
 
-`engines` fits demo scenes one by one with `warpgs fit`, and then by each engine; it also kills a worker in mid-job, and starts
-two farms on one folder. `packing` needs CUDA: every slot of a GPU gets --fits fits of one scene, with a seed each, after a tiny
-one that starts its process; first on one GPU with several numbers of slots, then with the best one on several GPUs.
+`engines` fits demo scenes one by one with `warpgs fit`, and then by each engine; it also kills a worker during a job, and
+starts two farms on one folder. `packing` needs CUDA: every slot of a GPU gets --fits fits of one scene, with a seed each, after
+a tiny one that starts its process; first on one GPU with several numbers of slots, then with the best one on several GPUs.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def one_by_one(scenes: dict[str, Path], out: Path, steps: int) -> float:
 
 
 def timed(jobs: list[FarmJob], engine: Callable[[], Engine], show: Callable[[list[JobStatus], Engine], object]) -> dict:
-    """Run a farm and return its time, from the start of the engine to its end, and what became of the jobs."""
+    """Run a farm and return its time, from the start of the engine to its end, and the results of the jobs."""
     began = time.perf_counter()
     running = engine()
     try:

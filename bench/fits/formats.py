@@ -1,7 +1,7 @@
 """Size of each file format, and its cost in PSNR on the held-out views of runs, whole and cleaned.
 
-A run is written in each format, read back and rendered at its held-out views; what the PSNR is lower than that of the model in
-memory is what the format costs. The last rows are SPZ in each version.
+A run is written in each format, read back and rendered at its held-out views. The cost of the format is the drop in PSNR
+against the model in memory. The last rows are SPZ in each version.
 """
 
 from __future__ import annotations

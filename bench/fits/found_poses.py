@@ -1,4 +1,4 @@
-"""Fits with found poses beside fits with given ones: held-out PSNR of the same photographs, and how far the poses are apart.
+"""Fits with found poses beside fits with given ones: held-out PSNR of the same photographs, and the distance of the poses.
 
 SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; of the others
 so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and

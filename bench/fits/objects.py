@@ -45,7 +45,7 @@ class Task:
     format: str
     """``transforms`` or ``colmap``."""
     preset: str
-    """As in `bench.lib.one_fit.config_of`."""
+    """Preset and settings for `bench.lib.one_fit.config_of`."""
     seed: int
     """Seed of the fit."""
     views: int
@@ -55,7 +55,7 @@ class Task:
 
     @property
     def key(self) -> dict:
-        """What tells one result from another."""
+        """Values that tell one result from another."""
         return {k: v for k, v in dataclasses.asdict(self).items() if k != "device"}
 
 

@@ -1,12 +1,12 @@
-"""What poses that are a little off cost, and what `--refine-poses` regains: the same fits with given, noisy and refined poses.
+"""Cost of slightly wrong poses, and gain of `--refine-poses`: the same fits with given, noisy and refined poses.
 
 Each training camera is turned about its centre by an angle and moved by a fraction of the cameras' extent, in random
 directions; the points of the scene stay. A model whose training cameras moved is turned and moved as a whole, too: "psnr" is of
 held-out cameras that the similarity of the true training cameras to the model's takes there, with noisy and refined poses
-alike; "psnr_as_reported" is what the fit itself reports, which knows the noisy cameras alone. Cameras side by side leave a
-bend of the whole scene nearly free, which a similarity does not follow; so "psnr_cameras_refined" is of held-out cameras that
-are then moved to where the finished model explains their photographs best, as is usual where poses are learned (Lin et al.
-2021, BARF, arXiv 2104.06405, section 4), for all three alike. It tells how good the model is, wherever it lies.
+alike; "psnr_as_reported" is the score that the fit itself reports, from the noisy cameras alone. With side-by-side cameras, a
+global bend of the scene is nearly unconstrained, and a similarity cannot absorb it. So "psnr_cameras_refined" is of held-out
+cameras that are then moved to where the finished model fits their photographs best, as is usual where poses are learned (Lin et
+al. 2021, BARF, arXiv 2104.06405, section 4), for all three alike. It measures the model independent of its position.
 """
 
 import dataclasses

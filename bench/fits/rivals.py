@@ -2,8 +2,9 @@
 
 All arms of a set start from the same points, stand before the same background, have the same degree and are scored alike. Where
 an arm lists several numbers of steps, training views left out choose: of up to four each in turn, the middle one first, or only
-the first --folds of them; of more, two at once. Then all training views are fitted, seed by seed, so that each arm has one seed
-before any has two. Rows that --out holds are kept when the command is given again. --arms N takes the first N arms of the set.
+the first --folds of them; of more, two at once. Then all training views are fitted, seed by seed, so that every arm has one
+seed before one has two. Rows that --out holds are kept when the command is given again. --arms N takes the first N arms of the
+set.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ WHAT = "scores, sizes and times of methods by row and seed, under one rule"
 
 
 def work(fit: Fit) -> int:
-    """Return roughly what a fit takes, in steps: a step of two models takes as long as four."""
+    """Return roughly the time of a fit, in steps: a step of two models takes as long as four."""
     return steps_in(fit.preset) * (4 if "CorGS" in fit.preset else 1)
 
 

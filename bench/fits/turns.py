@@ -51,7 +51,7 @@ def compile_kernels(checkout: Path, env: dict[str, str]) -> None:
 
 
 def timed(words: list[str], checkout: Path, env: dict[str, str], out: Path) -> dict:
-    """Run a fit and return its wall time [s] and what its metrics.json tells.
+    """Run a fit and return its wall time [s] and the figures of its metrics.json.
 
     Raises:
         RuntimeError: The fit failed.

@@ -1,4 +1,4 @@
-"""Time of drawing the opacity factors of N Gaussians."""
+"""Time of sampling the opacity factors of N Gaussians."""
 
 import torch
 

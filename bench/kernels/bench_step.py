@@ -16,7 +16,7 @@ LR = 1e-12
 
 
 def cost(point, device) -> roofline.Cost:
-    """All stages together; the loss beside SSIM is a few bytes a pixel and left out."""
+    """Return the cost of all stages together; the loss besides SSIM is a few bytes a pixel and left out."""
     numbers = point.count * (11 + 3 * (point.degree + 1) ** 2)
     total = roofline.adam(numbers)
     for stage in (*image_costs(point, device), *roofline.ssim(point.pixels)):

@@ -1,4 +1,4 @@
-"""Time of what a recorded step does beside drawing and learning: it finds its view and rates, and writes its result down."""
+"""Time of a captured step besides rendering and learning: it finds its view and rates, and stores its result."""
 
 import torch
 

@@ -1,7 +1,7 @@
 """The price of determinism: ordered and atomic sums of gradients, time, memory and whether bits repeat.
 
-Ours in both modes, and naive kernels whose atomics are plain, or made repeatable by Warp (`wp.DeterministicMode`). On a CPU
-all modes run the same code, and so is what they measure; the program then runs and says so.
+Ours in both modes, and naive kernels whose atomics are plain, or made repeatable by Warp (`wp.DeterministicMode`). On a CPU all
+modes run the same code and give the same figures; the program notes this.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def works_of(g: Gaussians, cam: Camera) -> dict[str, Callable[[], tuple[torch.Te
 
 
 def repeats_that_differ(work: Callable[[], tuple[torch.Tensor, ...]], repeats: int) -> int:
-    """Return how many repeats have not the bits of the first."""
+    """Return how many repeats differ in bits from the first."""
     first = work()
     return sum(not all(map(torch.equal, first, work())) for _ in range(repeats - 1))
 

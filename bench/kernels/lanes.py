@@ -1,4 +1,4 @@
-"""CPU blending per lane, against naive kernels, on a seeded cloud; prints what the cloud is made of.
+"""CPU blending per lane, against naive kernels, on a seeded cloud; prints the contents of the cloud.
 
 A lane is one (Gaussian, pixel) pair that the inner loop evaluates: those of the strips of eight pixels that the Gaussian's
 ellipse touches, until the last pixel of the strip is finished. The forward pass looks for finished strips once for each
@@ -34,7 +34,7 @@ OPACITIES = (0.02, 0.5)
 
 
 def cloud(count: int) -> tuple[torch.Tensor, Tiles]:
-    """Records and tiles of round and long Gaussians all over the image, most of them faint, as in a scene half fitted."""
+    """Return records and tiles of round and long Gaussians all over the image, most of them faint, as halfway through a fit."""
     g = torch.Generator().manual_seed(0)
 
     def log_uniform(bounds: tuple[float, float], *shape: int) -> torch.Tensor:
@@ -58,7 +58,7 @@ def cloud(count: int) -> tuple[torch.Tensor, Tiles]:
 
 
 def lanes(projected: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tuple[int, int]:
-    """Lanes evaluated and boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the shape of the image."""
+    """Return the lanes evaluated and the boxed lanes, by the formulas of the kernels; ``pixel_ends`` has the image shape."""
     side, strips = tiles.size, tiles.size // STRIP
     ends = pixel_ends.view(HEIGHT // side, side, WIDTH // side, strips, STRIP).amax(4).permute(0, 2, 1, 3).flatten(0, 1)
     first, last = tiles.ranges.long().unbind(1)
@@ -81,7 +81,7 @@ def lanes(projected: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tu
 
 
 def fastest(works: dict[str, Callable[[], object]], repeats: int, clock: Callable[[], int]) -> dict[str, float]:
-    """Smallest time of each [ns], taken in turn."""
+    """Return the smallest time of each [ns]; they run in turn."""
     best = dict.fromkeys(works, float("inf"))
     for _ in range(repeats):
         for name, work in works.items():

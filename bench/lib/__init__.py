@@ -1,1 +1,1 @@
-"""What several programs share: inputs, timing, fits, results, tables, pages, command lines."""
+"""Shared parts of the programs: inputs, timing, fits, results, tables, pages, command lines."""

@@ -43,7 +43,7 @@ def _most(rows: list[dict]) -> str:
 
 
 def budget_text(results: dict[str, dict]) -> str:
-    """A table of the first machine, images and gradients by scene; a sentence on each machine."""
+    """Return a table of the first machine, images and gradients by scene, and a sentence on each machine."""
     parts = []
     for stem, result in results.items():
         kept = "All limits are met." if not result["broken"] else "Broken: " + "; ".join(result["broken"]) + "."
@@ -67,7 +67,7 @@ def budget_text(results: dict[str, dict]) -> str:
 
 
 def needles_text(results: dict[str, dict]) -> str:
-    """A table of the first machine: largest errors by length, and how many times the factor form is better."""
+    """Return a table of the first machine: largest errors by length, and how many times better the factor form is."""
     parts = []
     for stem, result in list(results.items())[:1]:
         rows = []
@@ -87,7 +87,7 @@ def needles_text(results: dict[str, dict]) -> str:
 
 
 def gradients_text(results: dict[str, dict]) -> str:
-    """The table of gradients beside other programs, and where its figures are from."""
+    """Return the table of gradients beside other programs, and the source of its figures."""
     stems = sorted(results, key=len)  # that of all programs first, then the one of fast math
     sources = "\n".join(result_file.source(f"gradients_{stem}") for stem in stems)
     return f"{rasterizers_page.gradients_table([results[stem] for stem in stems])}\n{sources}"

@@ -24,7 +24,7 @@ class Arm:
     """One row of a table."""
 
     words: str
-    """Its name on the page."""
+    """Name on the page."""
     preset: str
     """Preset with its settings, as `bench.lib.one_fit.Fit` takes it, without steps that are chosen."""
     steps: tuple[int, ...] = ()

@@ -10,7 +10,7 @@ from warpgs.scene import Camera, Gaussians
 
 
 def gradients_of(g: Gaussians, cam: Camera, *, deterministic: bool) -> list[torch.Tensor]:
-    """Colour, alpha and depth, and the gradients of a fixed mix of them in the five tensors of ``g``."""
+    """Return colour, alpha and depth, and the gradients of a fixed mix of them in the five tensors of ``g``."""
     leaves = {n: t.detach().requires_grad_() for n, t in g.tensors().items()}
     r = rasterize(Gaussians(**leaves), cam, RasterizeOptions(deterministic=deterministic, record=False))
     loss = r.rgb.square().sum() + (r.alpha * r.depth).sum()

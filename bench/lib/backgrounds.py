@@ -1,4 +1,4 @@
-"""Images with true alpha before other backgrounds, and what Gaussians that know no background score before each."""
+"""Images with true alpha over other backgrounds, and scores of Gaussians without a background over each."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def over(view: View, behind: np.ndarray, ours: tuple[float, float, float]) -> np
 
 @torch.no_grad()
 def ply_scores(gaussians: Gaussians, views: list[View], own: tuple[float, float, float]) -> dict[str, float]:
-    """Return the mean PSNR [dB] of Gaussians that know no background, as any viewer renders them, before each background.
+    """Return the mean PSNR [dB] over each background of Gaussians rendered as a viewer does, without their own background.
 
     Args:
         gaussians: Those of a PLY file, in scene units [u].

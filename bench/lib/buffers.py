@@ -1,4 +1,4 @@
-"""What the buffers of a render with gradients cost on CUDA, as the kernels declare them, and when they live.
+"""Bytes of the buffers of a render with gradients on CUDA, as the kernels declare them, and the moments at which they exist.
 
 One camera, three channels, gradients in the five tensors. Upstream gradients and the Gaussians themselves are inputs, and do
 not count, nor does alpha, which nobody keeps. A sort takes memory from Warp's pool before these are at their peak.
@@ -46,7 +46,7 @@ class Counts:
 BLEND = "blending backward"
 PROJECT = "projection backward"
 MOMENTS = (BLEND, PROJECT)
-"""When memory is largest: in the first where images are large, in the second where Gaussians are many."""
+"""Moments of largest memory: the first with large images, the second with many Gaussians."""
 
 
 def buffers(n: Counts, deterministic: bool = True) -> dict[str, tuple[int, tuple[str, ...]]]:

@@ -13,13 +13,13 @@ STATISTICS = ("min", "max", "mean", "stdDev")
 
 
 def statistics(gaussians: Gaussians, axes: bool = False) -> dict[str, list[float]]:
-    """Return least, largest, mean and standard deviation of each column, as splat-transform names and states them.
+    """Return least, largest, mean and standard deviation of each column, as splat-transform names and reports them.
 
-    It takes them of the columns of PLY, and states those of scales, opacities and colours as lengths, opacities and colours.
+    It computes them from the columns of PLY, and reports scales, opacities and colours after activation.
 
     Args:
         gaussians: N Gaussians.
-        axes: Whether rotations are stated as the sizes of the entries of their matrices instead of as they are: several
+        axes: True to report rotations by the magnitudes of the entries of their matrices: several
             quaternions stand for the same Gaussian.
     """
     a = {name: array.astype(np.float64) for name, array in arrays_of(gaussians).items()}

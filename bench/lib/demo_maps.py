@@ -1,4 +1,4 @@
-"""Maps of the demo scene as sensors, laser scanners and networks would give them, made of its true depth and normals."""
+"""Maps of the demo scene as from sensors, laser scanners and networks, made from its true depth and normals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether rendered depth has near and far in the order of points whose depth is known."""
+"""Order of near and far in rendered depth, compared with points whose depth is known."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from warpgs import geometry
 from warpgs.scene import Camera, PointCloud
 
 MIN_POINTS = 10
-"""Points on which something must be drawn; a correlation of fewer says little."""
+"""Fewest points for a correlation: with fewer it is not significant."""
 MIN_ALPHA = 0.5
-"""A pixel that is covered less has no depth."""
+"""Opacity below which a pixel has no depth."""
 
 
 def depth_order(depth: np.ndarray, alpha: np.ndarray, camera: Camera, seen: PointCloud) -> dict:

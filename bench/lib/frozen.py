@@ -44,7 +44,7 @@ def _make(means, log_scales, logits, colors, quats=None) -> Gaussians:
 
 
 def generated(count: int, seed: int) -> Gaussians:
-    """Like what a fit leaves: flat and long ones on a few slanted sheets, most of them either faint or opaque."""
+    """Return Gaussians like those of a fit: flat and long ones on a few slanted sheets, most of them faint or opaque."""
     g = torch.Generator().manual_seed(seed)
     sheet = torch.randint(0, 5, (count,), generator=g)
     across = (_uniform(g, count, 2) - 0.5) * torch.tensor([4.4, 3.4], dtype=torch.float64)
@@ -65,7 +65,7 @@ def generated(count: int, seed: int) -> Gaussians:
 
 
 def needles(count: int, seed: int) -> Gaussians:
-    """Long axes of 30 to 300 px in an image 500 px wide, the others far below a pixel."""
+    """Return needles: long axes of 30 to 300 px in an image 500 px wide, the other axes far below a pixel."""
     g = torch.Generator().manual_seed(seed)
     means = (_uniform(g, count, 3) - 0.5) * torch.tensor([4.0, 3.0, 1.0]) + torch.tensor([0.0, 0, 4.0])
     long = torch.log(0.26 * 10 ** _uniform(g, count))
@@ -74,7 +74,7 @@ def needles(count: int, seed: int) -> Gaussians:
 
 
 def fog(layers: int, seed: int, alpha: float = 0.0039) -> Gaussians:
-    """Layers that fill the image; of alpha 0.0039, just below 1/255, they are 98 % opaque together, nothing after the cut."""
+    """Return layers that fill the image. With alpha 0.0039, below 1/255, they are 98 % opaque together, but all are cut."""
     g = torch.Generator().manual_seed(seed)
     means = torch.zeros(layers, 3, dtype=torch.float64)
     means[:, 2] = torch.linspace(2, 6, layers, dtype=torch.float64)
@@ -83,7 +83,7 @@ def fog(layers: int, seed: int, alpha: float = 0.0039) -> Gaussians:
 
 
 def wall(count: int, seed: int) -> Gaussians:
-    """Ten opaque sheets, one behind the other: all but the first two are hidden."""
+    """Return ten opaque sheets, one behind the other: all but the first two are hidden."""
     g = torch.Generator().manual_seed(seed)
     means = (_uniform(g, count, 3) - 0.5) * torch.tensor([5.0, 4.0, 0.02]) + torch.tensor([0.0, 0, 3.0])
     means[:, 2] += 0.3 * torch.randint(0, 10, (count,), generator=g)
@@ -92,7 +92,7 @@ def wall(count: int, seed: int) -> Gaussians:
 
 
 def huge(count: int, seed: int) -> Gaussians:
-    """One Gaussian of ten thousand pixels in front of what `generated` makes."""
+    """Return one Gaussian of ten thousand pixels in front of those of `generated`."""
     base = generated(count, seed)
     one = _make(
         torch.tensor([[0.3, 0.2, 1.0]]), torch.tensor([[3.0, 2.5, -3.0]]), torch.tensor([0.0]), torch.tensor([[0.9, 0.4, 0.1]]),

@@ -29,7 +29,7 @@ EDGE = 5
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of gsplat's example trainer, for MCMC where nothing else is said; lengths are in the units of its world."""
+    """Settings of gsplat's example trainer, by default for MCMC; lengths are in the units of its world."""
 
     steps: int
     cap: int
@@ -125,7 +125,7 @@ def optimizers_of(params: torch.nn.ParameterDict, s: Settings, size: float) -> d
 
 
 def render(params, viewmat: torch.Tensor, K: torch.Tensor, width: int, height: int, degree: int, background=BLACK):
-    """Return gsplat's image [H, W, 3] over a background [3], and what its rasterizer tells the strategy."""
+    """Return gsplat's image [H, W, 3] over a background [3], and its rasterizer's info for the strategy."""
     from gsplat import rasterization
 
     behind = {"backgrounds": torch.tensor([background], device=viewmat.device)} if any(background) else {}
@@ -257,7 +257,7 @@ def image_of(params, view: View, scale: float, draw: Callable = render, backgrou
 
 
 def compile_kernels(device: torch.device) -> None:
-    """Draw a few Gaussians and their gradients: gsplat builds its kernels at the first call, which takes minutes."""
+    """Render a few Gaussians with gradients: gsplat builds its kernels at the first call, which takes minutes."""
     points = torch.rand(8, 3, device=device)
     params = start(points, points, default_settings(1))
     viewmat, K = torch.eye(4, device=device), torch.tensor([[16.0, 0, 8], [0, 16, 8], [0, 0, 1]], device=device)

@@ -1,4 +1,4 @@
-"""Scores of pixels by which fine Gaussians could be placed, and the gains that they are judged by.
+"""Scores of pixels by which fine Gaussians could be placed, and the gains that they are compared with.
 
 A candidate is a fine Gaussian behind every second pixel of a training view, as an event would place it. Its gain over some
 views is what its opacity changes in their squared error: to first order from one backward pass over all candidates at once,

@@ -10,7 +10,7 @@ from warpgs.scene import Camera, Gaussians
 
 
 def gaussians(count: int, device: torch.device, degree: int = 3) -> Gaussians:
-    """A cloud in front of `camera` whose Gaussians shrink as their number grows, so that cover stays alike."""
+    """Return a cloud in front of `camera`. Its Gaussians shrink as their number grows, so that coverage stays similar."""
     generator = torch.Generator().manual_seed(0)
     means = (torch.rand(count, 3, generator=generator) - 0.5) * torch.tensor([4.0, 3.0, 2.0]) + torch.tensor([0.0, 0.0, 4.0])
     scales = (torch.rand(count, 3, generator=generator) + 0.1) * 0.8 * count ** (-1 / 3)
@@ -25,7 +25,7 @@ def gaussians(count: int, device: torch.device, degree: int = 3) -> Gaussians:
 
 
 def camera(width: int, height: int, device: torch.device, cameras: int = 1) -> Camera:
-    """A batch of cameras that look along +z: the first at the origin, each further one 0.1 u to the side."""
+    """Return a batch of cameras that look along +z: the first at the origin, each further one 0.1 u to the side."""
     K = torch.tensor([[0.9 * width, 0, width / 2], [0, 0.9 * width, height / 2], [0, 0, 1]])
     viewmats = torch.eye(4).repeat(cameras, 1, 1)
     viewmats[:, 0, 3] = -0.1 * torch.arange(cameras)
@@ -33,14 +33,14 @@ def camera(width: int, height: int, device: torch.device, cameras: int = 1) -> C
 
 
 def image(width: int, height: int, device: torch.device, seed: int = 0) -> torch.Tensor:
-    """Random colours in [0, 1], shape [H, W, 3]."""
+    """Return random colours in [0, 1], shape [H, W, 3]."""
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed)).to(device)
 
 
 def garden_inputs(
     path: str, *, tiles: int = 1, sh_degree: int = 3, width: int = 648, height: int = 420, seed: int = 0, device="cuda"
 ) -> tuple[Gaussians, Camera]:
-    """Gaussians on the points of `test_garden.npz` and its three cameras.
+    """Return Gaussians on the points of `test_garden.npz`, and its three cameras.
 
     Points within 2 u of the origin (112k of them), repeated on a grid of ``tiles`` x ``tiles`` cells. Scales
     are uniform up to 0.02 u, rotations and opacities uniform, colours the points' own with small random higher degrees.

@@ -208,7 +208,7 @@ class Naive:
             wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
 
     def forward(self) -> torch.Tensor:
-        """The image, shape [C, H, W, 3]."""
+        """Return the image, shape [C, H, W, 3]."""
         outputs = [interop.view(self.rgb.view(-1, 3), wp.float32), *self.state]
         self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
@@ -222,7 +222,7 @@ class Naive:
         return int(counts.max())
 
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
-        """Gradient of the records for an upstream gradient, after `forward`; shape [C, N, 12]."""
+        """Return the gradient of the records for an upstream gradient, shape [C, N, 12]; call `forward` first."""
         self.v_projected.zero_()
         arrays = [interop.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
         self._launch(backward_kernel(*self.how), [*self.inputs, *self.state, *arrays])
@@ -252,7 +252,7 @@ def _binned(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, Tiles]:
 def rasterize(
     gaussians: Gaussians, camera: Camera, mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARANTEED, layers: int = 0
 ) -> torch.Tensor:
-    """Images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
+    """Return images [C, H, W, 3] of a batch of cameras over black: our projection and lists, the naive blending."""
     return _Blend.apply(*_binned(gaussians, camera), camera.width, camera.height, (mode, layers))
 
 

@@ -37,7 +37,7 @@ OPACITY = 0.9
 
 
 def needles(length: float, count: int) -> Inputs:
-    """Needles through the middle of the image as float32 parameters on the CPU; pose and intrinsics of one camera."""
+    """Return needles through the middle of the image (float32 parameters on the CPU), and pose and intrinsics of a camera."""
     focal = 1.2 * SIDE
     generator = torch.Generator().manual_seed(int(length))
     turn = math.pi * (torch.arange(count, dtype=torch.float64) + torch.rand(count, generator=generator)) / count
@@ -58,7 +58,7 @@ def needles(length: float, count: int) -> Inputs:
 
 
 def _only(inputs: Inputs, i: int) -> Inputs:
-    """One of the needles."""
+    """Return one of the needles."""
     return Inputs(*(t[i : i + 1] for t in inputs[:5]), *inputs[5:])
 
 
@@ -72,14 +72,14 @@ def _figures(errors: list[torch.Tensor] | torch.Tensor) -> dict[str, float]:
 
 
 def _record(inputs: Inputs, device: torch.device) -> torch.Tensor:
-    """Factors [N, 3] and means [N, 2] as the kernels store them, [N, 5]."""
+    """Return means [N, 2] and factors [N, 3] as the kernels store them, [N, 5]."""
     there = [t.detach().to(device) for t in inputs]
     projected, _ = project(*there[:5], there[5][None], there[6][None], width=SIDE, height=SIDE, degree=0, rule=FREE)
     return projected[0, :, :5]
 
 
 def _powers(record: torch.Tensor, dx: torch.Tensor, dy: torch.Tensor) -> dict[str, torch.Tensor]:
-    """Mahalanobis distance squared in both forms, in the type and on the device of the record; dx, dy [N, P]."""
+    """Return the squared Mahalanobis distance in both forms, in the type and on the device of the record; dx, dy [N, P]."""
     u11, u12, u22 = (record[:, k, None] for k in (2, 3, 4))
     e1, e2 = u11 * dx + u12 * dy, u22 * dy
     xx, xy, yy = u11 * u11, u11 * u12, u12 * u12 + u22 * u22
@@ -97,7 +97,7 @@ def _weight(power: torch.Tensor) -> torch.Tensor:
 
 
 def weight_errors(length: float, device: torch.device) -> dict[str, dict[str, float]]:
-    """Error of the weight at 40 places of each of 400 needles."""
+    """Return the error of the weight at 40 places of each of 400 needles."""
     inputs = needles(length, ANGLES)
     exact_projection = projected_of(inputs.to(torch.float64), _frame(), FREE)
     plain = projected_of(inputs.to(torch.float32), _frame(), FREE)
@@ -122,7 +122,7 @@ def weight_errors(length: float, device: torch.device) -> dict[str, dict[str, fl
 
 
 def _twin(inputs: Inputs, upstream: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Alpha [P] and the gradient of the projected mean [2] in the precision of the inputs; zero where nothing is drawn."""
+    """Return alpha [P] and the gradient of the projected mean [2], in the inputs' precision; zero if nothing is rendered."""
     projected = ProjectedGaussians(*(t.detach() for t in projected_of(inputs, _frame(), FREE)))
     if len(projected.ids) == 0:
         return torch.zeros_like(upstream), torch.zeros(2, dtype=torch.float64)
@@ -135,7 +135,7 @@ def _twin(inputs: Inputs, upstream: torch.Tensor) -> tuple[torch.Tensor, torch.T
 
 
 def image_errors(length: float, device: torch.device) -> tuple[dict, dict]:
-    """Error of alpha in images of one needle each, and relative error of the gradient of the projected mean."""
+    """Return the error of alpha in images of one needle each, and the relative error of the gradient of the projected mean."""
     inputs = needles(length, IMAGES)
     upstream = torch.randn(SIDE * SIDE, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     images: dict[str, list[torch.Tensor]] = {"factor": [], "conic": [], "plain": []}
@@ -161,7 +161,7 @@ def image_errors(length: float, device: torch.device) -> tuple[dict, dict]:
 
 
 def measure(device: torch.device, lengths=LENGTHS) -> list[dict]:
-    """One row a length."""
+    """Return a row for each length."""
     rows = []
     for length in lengths:
         image, gradient = image_errors(length, device)

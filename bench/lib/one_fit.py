@@ -1,4 +1,4 @@
-"""Fits and what is kept of them: ours through the public call or bare, and gsplat's."""
+"""Fits and their stored figures: ours, by the public call or without files, and gsplat's."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ PEER, PEER_POINTS = "gsplat", "gsplat-points"
 PEERS = (PEER, PEER_POINTS)
 """gsplat's default strategy from the points of our default's start, and from the points of the reconstruction."""
 PRUNED = "pruned/"
-"""Before a preset: the model is pruned after its fit by `KEEP_PSNR`."""
+"""Prefix of a preset: the model is pruned by `KEEP_PSNR` after its fit."""
 KEEP_PSNR = 0.1
 """Loss of training PSNR that pruning may cost [dB]."""
 PEER_STEPS = 7000
@@ -68,7 +68,7 @@ class Fit:
 
     @property
     def key(self) -> dict:
-        """What tells one result from another."""
+        """Values that tell one result from another."""
         return {k: getattr(self, k) for k in ("row", "preset", "seed", "left_out", "downscale")}
 
 
@@ -155,7 +155,7 @@ def plan(row: str, preset: str, seed: int, folder: str, place: tuple[str, int], 
 
 
 def measure(fit: Fit) -> dict:
-    """Fit, score, and return what is kept: scores, sizes, times, steps, and why the fit ended."""
+    """Fit, score, and return the figures to store: scores, sizes, times, steps, and why the fit ended."""
     scene = scene_at(fit.folder, fit.downscale)
     try:
         if is_peer(fit.preset):
@@ -170,7 +170,7 @@ def measure(fit: Fit) -> dict:
 
 
 def figures_of(m: dict) -> dict:
-    """Return what is kept of a fit's metrics; ``ended`` and ``shape`` where they tell it."""
+    """Return the figures to store of a fit's metrics; ``ended`` and ``shape`` if the metrics have them."""
     row = {"psnr": m["test"]["psnr"], "ssim": m["test"]["ssim"], "region": m["views"][0]["region"]}
     row |= {"gaussians": m["gaussians"], "bytes": m["complexity"]["bytes"], "steps": m["steps"], "resolved": m["preset"]}
     row |= {k: m["seconds"][k] for k in ("setup", "training")}

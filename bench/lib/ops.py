@@ -60,7 +60,7 @@ class Bench:
         return chosen
 
     def measure(self, op: str, module, point: Point, roof: dict | None) -> None:
-        """All programs and directions of an op at one point, in turn; ours alone if it does not work together."""
+        """Measure all programs and directions of an op at one point, in turn; only ours if they fail together."""
         sizes = point.sizes(module.AXES)
         chosen = self._chosen(op, module, point, sizes)
         ours = {task for task in chosen if task[0] == OURS}

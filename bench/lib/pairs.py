@@ -40,7 +40,7 @@ def count_drawn(
 
 
 def drawn_pairs(projected: torch.Tensor, tiles: Tiles, width: int, height: int, rule: Rule) -> int:
-    """Pairs blended into the images of records [C, N, 12]: alpha at or above the cut, pixel not yet finished."""
+    """Return the pairs blended into images of records [C, N, 12]: those of alpha at or above the cut in unfinished pixels."""
     background = projected.new_zeros(len(projected), 3)
     rgb = blend(projected.detach().requires_grad_(), tiles, background, width=width, height=height, rule=rule)[0]
     # one past the last instance each pixel blended: the only whole numbers by pixel that are kept

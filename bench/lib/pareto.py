@@ -51,7 +51,7 @@ class Panel:
 
 
 def front(points: Sequence[Point], upwards: bool = False) -> list[Point]:
-    """The points that no other beats: none costs as little or less and is as good or better, and one of both truly so."""
+    """Return the points that no other point beats: cheaper and at least as good, or better at no higher cost."""
     sign, kept = (-1.0 if upwards else 1.0), []
     for p in sorted(points, key=lambda p: (p.cost, sign * p.value)):
         if not kept or sign * p.value < sign * kept[-1].value:
@@ -144,7 +144,7 @@ def _panel(panel: Panel, left: float, top: float, colors: dict[str, str]) -> lis
 
 
 def chart(title: str, panels: Sequence[Panel], columns: int = 3) -> str:
-    """An SVG of panels in rows. Filled marks lie on the front, hollow ones do not; squares are presets."""
+    """Return an SVG of panels in rows. Filled marks lie on the front, hollow ones do not; squares are presets."""
     knobs = list(dict.fromkeys(p.knob for panel in panels for p in panel.points))
     colors = {k: PALETTE[i % len(PALETTE)] for i, k in enumerate(knobs)}
     wide, high = LEFT + PLOT_WIDTH + RIGHT, TOP + PLOT_HEIGHT + BOTTOM

@@ -25,14 +25,14 @@ PIXELS_AT_ONCE = 4096
 
 @functools.cache
 def _window(device: torch.device) -> torch.Tensor:
-    """The 11 x 11 Gaussian window with sigma 1.5 for three channels, shape [3, 1, 11, 11]."""
+    """Return the 11 x 11 Gaussian window with sigma 1.5 for three channels, shape [3, 1, 11, 11]."""
     line = torch.exp(-0.5 * (torch.arange(-5.0, 6.0) / 1.5) ** 2)
     line = line / line.sum()
     return torch.outer(line, line).expand(3, 1, 11, 11).contiguous().to(device)
 
 
 def torch_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Structural similarity as the trainers that followed Kerbl et al. 2023 write it; images and result [H, W, 3]."""
+    """Return structural similarity as trainers after Kerbl et al. 2023 compute it; images and result [H, W, 3]."""
     window = _window(image.device)
     a, b = (t.permute(2, 0, 1)[None] for t in (image, target))
     blur = functools.partial(F.conv2d, weight=window, padding=5, groups=3)
@@ -46,7 +46,7 @@ def torch_ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 def _projected(
     g: Gaussians, view: torch.Tensor, K: torch.Tensor, width: int, height: int, rule: Rule
 ) -> tuple[torch.Tensor, ...]:
-    """Means [px] [N, 2], inverse covariances [N, 2, 2], opacities [N], colours [N, 3] of what is visible, by depth."""
+    """Return means [px] [N, 2], inverse covariances [N, 2, 2], opacities [N], colours [N, 3] of visible Gaussians, by depth."""
     R, t = view[:3, :3], view[:3, 3]
     p = g.means @ R.T + t
     order = torch.argsort(p[:, 2])
@@ -66,7 +66,7 @@ def _projected(
 
 
 def _composite(rule, pixels, means, inverses, opacities, colors):
-    """Colours [P, 3] of pixel centres [P, 2], every Gaussian looked at for every pixel."""
+    """Return the colours [P, 3] of pixel centres [P, 2], with every Gaussian evaluated at every pixel."""
     dx, dy = pixels[:, :1] - means[:, 0], pixels[:, 1:] - means[:, 1]
     a, b, c = inverses[:, 0, 0], inverses[:, 0, 1], inverses[:, 1, 1]
     alpha = (opacities * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)).clamp(max=rule.alpha_max)
@@ -78,7 +78,7 @@ def _composite(rule, pixels, means, inverses, opacities, colors):
 
 
 def dense_rasterize(gaussians: Gaussians, camera: Camera, rule: Rule = RULES["exact"]) -> torch.Tensor:
-    """A rule without a square in plain torch, without tiles: images [C, H, W, 3] over black, for small N only."""
+    """Render a rule without a square in plain torch, without tiles: images [C, H, W, 3] over black, for small N only."""
     device, composite = gaussians.means.device, functools.partial(_composite, rule)
     y, x = torch.meshgrid(torch.arange(camera.height, device=device), torch.arange(camera.width, device=device), indexing="ij")
     centers = torch.stack([x, y], -1).reshape(-1, 2) + 0.5
@@ -91,7 +91,7 @@ def dense_rasterize(gaussians: Gaussians, camera: Camera, rule: Rule = RULES["ex
 
 
 def gsplat_rasterize(gaussians: Gaussians, camera: Camera, packed: bool = False) -> torch.Tensor:
-    """The same images by gsplat, activations applied outside as its interface asks."""
+    """Render the same images by gsplat; activations are applied outside, as its interface requires."""
     from gsplat import rasterization
 
     rgb, _, _ = rasterization(
@@ -102,12 +102,12 @@ def gsplat_rasterize(gaussians: Gaussians, camera: Camera, packed: bool = False)
 
 
 RASTERIZERS = {DENSE: dense_rasterize, NAIVE: naive.rasterize, GSPLAT: gsplat_rasterize}
-"""Peers that draw: Gaussians and a batch of cameras in, images [C, H, W, 3] out."""
+"""Peers that render: Gaussians and a batch of cameras in, images [C, H, W, 3] out."""
 
 
 @functools.cache
 def absent(device: torch.device) -> dict[str, str]:
-    """Peers that cannot draw an image and its gradient on a device, each with the reason."""
+    """Return the peers that cannot render an image and its gradient on a device, each with the reason."""
     reasons = {}
     for name, draw in RASTERIZERS.items():
         try:

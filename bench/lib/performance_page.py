@@ -7,7 +7,7 @@ import statistics
 from bench.lib import rasterizers_page, result_file
 from bench.lib.plot import Line, Panel, chart
 from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
-from bench.lib.rasterizers import ATOMIC, GSPLAT_PACKED, GSWARP
+from bench.lib.rasterizers import ATOMIC, GSPLAT_PACKED
 from bench.lib.tables import figure, markdown
 from bench.lib.timing import DISTURBED, OURS
 
@@ -23,7 +23,7 @@ WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
 FITS = {"fern_cpu2": "fern, 3 photographs of 504 x 378 px", "temple_cpu2": "temple, 12 photographs of 640 x 480 px"}
 """Results of whole commands, and the captures in words."""
-EARLIER = (OURS, ATOMIC, GSPLAT_PACKED, GSWARP)
+EARLIER = (OURS, ATOMIC, GSPLAT_PACKED)
 """Programs of the earlier run beside other rasterizers; all but the first are missing in the latest."""
 
 
@@ -157,7 +157,7 @@ def _lines(series: list[Series], name) -> tuple[Line, ...]:
 
 
 def charts(title: str, rows: list[dict]) -> dict[str, str]:
-    """Charts of one machine by the end of their names: over N, over pixels, and of the whole image and step."""
+    """Return the charts of one machine by the end of their names: over N, over pixels, and of the whole image and step."""
 
     def op_name(s: Series) -> str:
         return s.op if s.program == OURS else s.program
@@ -205,12 +205,13 @@ def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     sources, beside = _sources("ops", ops), next(iter(others.values()))
-    earlier = result_file.read(result_file.FOLDER / "older_rasterizers_h100.json")
+    earlier, gswarp = (result_file.read(result_file.FOLDER / f"{n}_h100.json") for n in ("older_rasterizers", "gswarp"))
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
         "ratios": rasterizers_page.ratios_table(beside),
         "earlier run": rasterizers_page.times_table(earlier, 3, EARLIER) + "\n" + result_file.source("older_rasterizers_h100"),
+        "gswarp": rasterizers_page.gpu_table(gswarp) + "\n" + result_file.source("gswarp_h100"),
         "many channels": rasterizers_page.times_table(beside, 32),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "buffers": rasterizers_page.buffers_table(beside),

@@ -1,4 +1,4 @@
-"""Fits whose events sample by one score each: the strategy of the study on importance, and what is kept of a fit."""
+"""Fits whose events sample by one score each: the strategy of the study on importance, and the figures of a fit."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ from warpgs.synthetic.demo import split_spec, write_demo
 OWN = "own"
 """Score of the settings."""
 LOG = "+log"
-"""After a score: all scores are compared with the gains."""
+"""Suffix of a score: all scores are compared with the gains."""
 LATER = 300
 """Steps after an event at which its Gaussians are judged, at least."""
 TOP = 0.02
-"""Highest fraction by a score whose mean gain is told."""
+"""Fraction of the candidates, those of the highest score, whose mean gain is reported."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Studied(ImportanceSampling):
     held: ClassVar[list] = []
     """Views that are left out, of the fit in this process."""
     told: ClassVar[list[dict[str, Any]]] = []
-    """What was logged."""
+    """Logged figures."""
 
     def __init__(self, context):
         """Begin with nothing logged."""

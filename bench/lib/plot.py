@@ -41,7 +41,7 @@ class Panel:
 
 
 def decades(values: Sequence[float]) -> tuple[int, int]:
-    """Exponents of ten below the smallest and above the largest value; at least one decade apart."""
+    """Return the exponents of ten below the smallest and above the largest value; at least one decade apart."""
     low, high = math.floor(math.log10(min(values)) + 1e-9), math.ceil(math.log10(max(values)) - 1e-9)
     return low, max(high, low + 1)
 
@@ -70,7 +70,7 @@ def _top(group: list[int], placed: list[float], gap: float) -> float:
 
 
 def number(value: float) -> str:
-    """A power of ten as people write it on axes."""
+    """Return a power of ten as written on axes, such as 10k."""
     for size, unit in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
         if value >= size:
             return f"{value / size:g}{unit}"
@@ -143,7 +143,7 @@ def _panel(panel: Panel, left: float, y_range: tuple[int, int], x_range: tuple[f
 
 
 def chart(title: str, panels: Sequence[Panel]) -> str:
-    """An SVG with a title and panels from left to right; those without lines are left out.
+    """Return an SVG with a title and panels from left to right; those without lines are left out.
 
     All panels have the same range of y, and those with the same label the same range of x.
     """

@@ -23,7 +23,7 @@ class Point:
     degree: int = 3
     """Spherical-harmonics degree, stored and evaluated."""
     cameras: int = 1
-    """Cameras drawn in one call."""
+    """Cameras rendered in one call."""
     threads: int = 0
     """CPU threads; 0 for all that torch was given."""
 
@@ -33,7 +33,7 @@ class Point:
         return self.width * self.height
 
     def sizes(self, axes: tuple[str, ...]) -> dict[str, int]:
-        """The fields that matter to an op, by their names in the results."""
+        """Return the fields that matter to an op, by their names in the results."""
         named = {}
         for axis in axes:
             if axis == "image":
@@ -52,11 +52,11 @@ DIAGONAL = (
     (100, 128, 128), (1_000, 256, 256), (10_000, 256, 256), (100_000, 504, 378), (1_000_000, 1920, 1080),
     (10_000_000, 3840, 2160),
 )  # fmt: skip
-"""Numbers of Gaussians with the images they are drawn into. The first is there for peers that manage no more."""
+"""Numbers of Gaussians with image sizes. The first is for peers that support no more."""
 
 
 def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Point]:
-    """All points for an op that depends on ``axes``, the lightest first, each once."""
+    """Return all points for an op that depends on ``axes``, the lightest first, each once."""
     if tiny:
         base, counts, images, diagonal = Point(200, 40, 30), (100, 200), ((24, 16), (40, 30)), ()
         degrees, cameras = (0, 3), (1, 2)
@@ -86,9 +86,9 @@ def load(p: Point) -> float:
 
 
 def growth(small: dict, large: dict) -> float | None:
-    """By what factor work grows from one row's sizes to another's if it is linear in the axis that grows most.
+    """Return the factor by which work grows from one row's sizes to another's, if it is linear in the axis that grows most.
 
-    None where ``large`` is smaller along any axis, so that nothing can be foretold.
+    None if ``large`` is smaller along any axis, because then nothing can be predicted.
     """
     ratios = [1.0]
     for name in ("N", "cameras"):
@@ -121,19 +121,19 @@ class Series:
 
 
 def tasks(rows: list[dict]) -> list[tuple[str, str, str]]:
-    """(op, program, direction) in the order of first appearance, all of an op together."""
+    """Return (op, program, direction) in the order of first appearance, all of an op together."""
     found = dict.fromkeys((r["op"], r["program"], r["direction"]) for r in rows)
     ops = list(dict.fromkeys(op for op, _, _ in found))
     return sorted(found, key=lambda task: ops.index(task[0]))
 
 
 def pixels(row: dict) -> int:
-    """Pixels of a row's image."""
+    """Return the number of pixels of a row's image."""
     return row["width"] * row["height"]
 
 
 def along(rows: list[dict], axis: str) -> list[Series]:
-    """For each task its series along ``N`` or ``pixels`` through the base point, else its longest; two points at least."""
+    """Return each task's series along ``N`` or ``pixels`` through the base point, else its longest; at least two points."""
     base = BASE.sizes(("count", "image", "degree", "cameras"))
     varying = ("N",) if axis == "N" else ("width", "height")
     found = []
@@ -153,7 +153,7 @@ def along(rows: list[dict], axis: str) -> list[Series]:
 
 
 def diagonal(rows: list[dict]) -> list[Series]:
-    """For each task that depends on both, its times where Gaussians and pixels grow together, over N."""
+    """Return, for each task that depends on both, its times over N where Gaussians and pixels grow together."""
     found = []
     for task in tasks(rows):
         points = {

@@ -1,4 +1,4 @@
-"""Fits in worker processes: several at a time on one device, none begun after a time limit, failures as results."""
+"""Fits in worker processes: several at a time on one device, none started after a time limit, failures as results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How far cameras are from those of another scene, after the similarity that brings both together."""
+"""Errors of cameras against those of another scene, after the similarity that aligns both."""
 
 from __future__ import annotations
 

@@ -32,10 +32,10 @@ def by_seed(rows: list[dict]) -> dict[tuple[str, str], dict[int, dict]]:
 
 
 def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Difference, list[str]]:
-    """Return the paired difference of the base to the best of the others, and who that was.
+    """Return the paired difference of the base to the best of the others, and the names of the best.
 
-    For each seed that all have, the rival is the preset of the best mean over the other seeds: picked on the seeds that are
-    compared it would owe part of its lead to luck. With seeds that some lack, a weaker one could stand for a missing best.
+    For each seed that all have, the rival is the preset of the best mean over the other seeds, which avoids winner's bias.
+    Seeds that some presets lack are not used, because the best preset could be missing there.
 
     Args:
         scores: PSNR by preset and seed [dB].

@@ -35,6 +35,15 @@ def times_table(result: dict, channels: int = 3, programs: tuple[str, ...] = ())
     return markdown(["Gaussians, image", "program", times[0], *rest, times[1], *rest, "MiB"], body, LEFT)
 
 
+def gpu_table(result: dict, channels: int = 3) -> str:
+    """Return GPU time by direction of each program that took ``channels``."""
+    body = [
+        [_size(row), who, *(figure(row["gpu_ms"][d][who]["median"]) for d in DIRECTIONS)]
+        for row in _of(result, channels) for who in row["peak_mib"]
+    ]  # fmt: skip
+    return markdown(["Gaussians, image", "program", *(f"{d} [ms]" for d in DIRECTIONS)], body, LEFT)
+
+
 def ratios_table(result: dict, channels: int = 3) -> str:
     """Return our times and memory over those of each other program, by size."""
     body = []

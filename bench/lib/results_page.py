@@ -203,7 +203,11 @@ def objects() -> str:
     one = {r["object"]: r for r in result["rows"] if r["preset"] == ONE_LAYER}
     two = {r["object"]: r for r in result["rows"] if r["preset"] == "default" and r["object"] in one}
     body = [[words, str(len(of)), *_object_cells(list(of.values()))] for words, of in (("two", two), ("one: `default`", one))]
-    return by_format + "\n" + table(["layers", "objects", *head], body) + source
+    layers = table(["layers", "objects", *head], body) + source
+    result, source = _result("objects_h100")
+    seeds = sorted(r["object"] for r in result["rows"])
+    now = [[f"{len(seeds)}, seeds {seeds[0]} to {seeds[-1]}", *_object_cells(result["rows"])]]
+    return "\n".join((by_format, layers, table(["`default`: objects", *head], now) + source))
 
 
 def _object_cells(rows: list[dict]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Bytes and operations that a stage needs at least, and what the machine could move and compute at best.
+"""Least bytes and operations of a stage, and the largest rates of the machine.
 
 How bytes are counted: every input read once and every output written once, in float32, as if caches were perfect; what a
 stage stores for its backward pass counts, scratch memory does not. Two exceptions, because no known method does without:
@@ -28,7 +28,7 @@ RECORD = 12
 
 @dataclass(frozen=True)
 class Cost:
-    """The least that a stage has to do."""
+    """Least work of a stage."""
 
     bytes: float
     """Moved between memory and processor."""
@@ -36,17 +36,17 @@ class Cost:
     """Float operations; a fused multiply-add is two."""
 
     def __add__(self, other: Cost) -> Cost:
-        """Both stages, one after the other."""
+        """Return the cost of both stages, one after the other."""
         return Cost(self.bytes + other.bytes, self.operations + other.operations)
 
 
 def _numbers(degree: int) -> int:
-    """Stored numbers of a Gaussian: mean 3, rotation 4, scales 3, opacity 1, coefficients."""
+    """Return the stored numbers of a Gaussian: mean 3, rotation 4, scales 3, opacity 1, coefficients."""
     return 11 + 3 * (degree + 1) ** 2
 
 
 def project(count: int, cameras: int, degree: int) -> tuple[Cost, Cost]:
-    """Forward and backward: all parameters in, records and tile counts out; the way back, records and gradients in.
+    """Return forward and backward cost: all parameters in, records and tile counts out; backward records and gradients in.
 
     Per camera and Gaussian about 300 operations for ellipse and tile count, backward 700; colours 6 per coefficient forward
     (multiply-add for three channels), 18 backward (gradient of the coefficient, dot product, direction).
@@ -59,7 +59,9 @@ def project(count: int, cameras: int, degree: int) -> tuple[Cost, Cost]:
 
 
 def tiles(count: int, cameras: int, instances: int, tiles_in_all: int) -> Cost:
-    """Records read twice; a sort of (32-bit depth, number) pairs; instances emitted; a sort of (tile, slot) pairs; ids out.
+    """Return the cost of two reads of the records, two sorts, instances emitted and ids out.
+
+    The sorts are of (32-bit depth, number) and of (tile, slot).
 
     Operations: 60 a Gaussian and 15 an instance for the ellipse's span in rows of tiles.
     """
@@ -72,7 +74,7 @@ def tiles(count: int, cameras: int, instances: int, tiles_in_all: int) -> Cost:
 
 
 def blend(count: int, cameras: int, pixels: int, instances: int, pairs: int) -> tuple[Cost, Cost]:
-    """Forward: record and id per instance in; colour, alpha, depth, weight, transmittance and end per pixel out.
+    """Return forward and backward cost: record and id per instance in; colour, alpha, depth, weight, transmittance and end out.
 
     36 operations a pair: offset 2, factor 4, exponent 4, exponential 10, alpha 3, transmittance and stop 3, weight 1, five
     sums 9. Backward reads record, id and slot, writes and sums ten gradients per instance, and reads nine numbers a pixel;
@@ -85,7 +87,7 @@ def blend(count: int, cameras: int, pixels: int, instances: int, pairs: int) -> 
 
 
 def ssim(pixels: int) -> tuple[Cost, Cost]:
-    """Forward: two images in; similarity and three partials out. Backward: five images and the gradient in, one out.
+    """Return forward cost, two images in, similarity and three partials out, and backward, five and the gradient in, one out.
 
     Per channel five sums forward and three backward run through 11 taps along rows and columns, 2 operations a tap;
     products and the formula add 40, backward 10.
@@ -95,42 +97,42 @@ def ssim(pixels: int) -> tuple[Cost, Cost]:
 
 
 def adam(numbers: int) -> Cost:
-    """Parameter, gradient and two moments in; parameter and moments out; 13 operations a number."""
+    """Return the cost of parameter, gradient and two moments in, parameter and moments out; 13 operations a number."""
     return Cost(7 * REAL * numbers, 13 * numbers)
 
 
 def dropout(count: int) -> Cost:
-    """A factor a Gaussian, from three rounds of an integer hash."""
+    """Return the cost of a factor a Gaussian, from three rounds of an integer hash."""
     return Cost(REAL * count, 20 * count)
 
 
 def camera_reach(count: int, cameras: int) -> Cost:
-    """A squared distance to each camera and the least of them, then a root and a logarithm, for each Gaussian."""
+    """Return the cost of squared distances to all cameras and their least, a root and a logarithm, for each Gaussian."""
     return Cost(REAL * (4 * count + 3 * cameras), count * (9 * cameras + 12))
 
 
 def opacity_decay(count: int) -> Cost:
-    """An exponential and two logarithms for each Gaussian."""
+    """Return the cost of an exponential and two logarithms for each Gaussian."""
     return Cost(2 * REAL * count, 30 * count)
 
 
 def pixel_size(count: int, cameras: int) -> Cost:
-    """Distance, depth and a quotient for each camera and the least of them, then a logarithm, for each Gaussian."""
+    """Return the cost of distance, depth and a quotient by camera, their least, and a logarithm, for each Gaussian."""
     return Cost(REAL * (4 * count + 9 * cameras), count * (20 * cameras + 10))
 
 
 def buffers(pixels: int) -> Cost:
-    """A photograph in and out."""
+    """Return the cost of a photograph in and out."""
     return Cost(6 * REAL * pixels, 0)
 
 
 def scanlines(pixels: int, planes: int) -> Cost:
-    """Costs in, and sums in and out, by each of four paths, 2 bytes each; 8 operations a path and plane."""
+    """Return the cost of four paths: each reads costs, reads and writes sums (2 bytes each); 8 operations a pixel and plane."""
     return Cost(4 * 6 * pixels * planes, 32 * pixels * planes)
 
 
 def knn(count: int) -> Cost:
-    """Positions in, distances out, a sort of 64-bit codes with 64-bit numbers; 32 distances to neighbours on the curve."""
+    """Return the cost of positions in, distances out, a sort of 64-bit codes and numbers, and 32 distances to neighbours."""
     return Cost(16 * count + 8 * 32 * count, 32 * 8 * count)
 
 
@@ -164,13 +166,13 @@ def chains(start: float, factor: float, steps: int) -> float: ...
 
 @wp.kernel(enable_backward=False)
 def multiply_add(begin: int, factor: float, steps: int, result: wp.array(dtype=float)):
-    """Eight independent chains of multiply-adds per thread, on a CPU each 16 lanes wide."""
+    """Compute eight independent chains of multiply-adds per thread, on a CPU each 16 lanes wide."""
     i = begin + wp.tid()
     result[i] = chains(float(i) * 1.0e-6, factor, steps)
 
 
 def _fastest(work: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Shortest time of several runs [s]: a ceiling is what the machine can do, not what it does on average."""
+    """Return the shortest time of several runs [s]: a ceiling is what the machine can do, not its average."""
     times = []
     for _ in range(repeats + 1):
         if device.type == "cuda":
@@ -184,7 +186,7 @@ def _fastest(work: Callable[[], object], device: torch.device, repeats: int) -> 
 
 
 def ceilings(device: torch.device, tiny: bool = False) -> dict:
-    """Two ceilings of the machine, measured: bytes a second by a triad a = b + s c, operations a second by multiply-adds.
+    """Measure two ceilings of the machine: bytes a second by a triad a = b + s c, operations a second by multiply-adds.
 
     The triad counts 12 bytes an element; what a CPU reads before it writes is not counted. Arrays are far larger than caches.
     """
@@ -208,7 +210,7 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
 
 
 def against_roof(cost: Cost, seconds: float, roof: dict) -> dict:
-    """The least time the two ceilings allow [ms], which of them binds, and the fraction of it that was reached."""
+    """Return the least time that the two ceilings allow [ms], the one that binds, and the fraction of it that was reached."""
     memory, compute = cost.bytes / roof["bytes_per_s"], cost.operations / roof["operations_per_s"]
     least = max(memory, compute)
     return {

@@ -64,7 +64,7 @@ def _numbers(count: int) -> np.ndarray:
 
 
 def function_stages() -> Iterator[Stage]:
-    """Yield what single functions of each library give for fixed numbers."""
+    """Yield the results of single functions of each library for fixed numbers."""
     import cv2
 
     x = _numbers(65_537)  # an odd number: the end of a vectorised loop is another loop
@@ -104,7 +104,7 @@ def function_stages() -> Iterator[Stage]:
 
 
 def scene_stages(scene: Scene, folder: Path) -> Iterator[Stage]:
-    """Yield the files of the demo, and what is read from them."""
+    """Yield the files of the demo, and the data read from them."""
     files = sorted(p for p in folder.rglob("*") if p.is_file())
     yield "demo photographs", digest(*(p.read_bytes() for p in files if p.suffix == ".png"))
     yield "demo cameras and points", digest(*(p.read_bytes() for p in files if p.suffix == ".txt"))
@@ -114,7 +114,7 @@ def scene_stages(scene: Scene, folder: Path) -> Iterator[Stage]:
 
 
 def prior_stages(train: list[View]) -> Iterator[Stage]:
-    """Yield what the classical priors are made from."""
+    """Yield the inputs of the classical priors."""
     matches = triangulate_matches(train)
     yield "triangulated matches", digest(matches.points, matches.colors)
     maps = classical_maps([v.image for v in train])

@@ -26,11 +26,11 @@ class Row:
     scene: str
     """Folder, relative to that of the data; ``demo`` is made."""
     split: str
-    """As in `warpgs fit --split`."""
+    """Split, as in `warpgs fit --split`."""
     downscale: int = 1
     """Factor by which both image sides shrink."""
     views: int = 8
-    """Training views, which foretell what a fit takes."""
+    """Number of training views, by which the time of a fit is predicted."""
 
 
 ROWS = {

@@ -1,4 +1,4 @@
-"""What `select_rule` gives on frozen scenes: the rule, its time beside `exact`, and its true error."""
+"""Results of `select_rule` on frozen scenes: the rule, its time beside `exact`, and its true error."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HAZE = (1.1, 1.9, 2.1, 3.9, 4.1)
 """Alphas of the layers of haze in 255ths: just above the cut of `exact`, and on either side of those of the faster rules."""
 BACKGROUND = torch.tensor([0.2, 0.5, 0.8])
 REFUSED = "none"
-"""In place of a rule where none keeps the limit."""
+"""Word for a limit that no rule keeps."""
 
 
 @dataclass(frozen=True)

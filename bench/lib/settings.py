@@ -1,4 +1,4 @@
-"""The settings of the rasterizer that speed and accuracy are weighed for, and the renderer of each."""
+"""Settings of the rasterizer for which speed and accuracy are compared, and the renderer of each."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PAIRS = ((0.25, 1e-3), (2.0, 1e-2), (4.0, 1e-2), (8.0, 1e-3))
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to draw."""
+    """One way to render."""
 
     name: str
     knob: str
@@ -37,7 +37,7 @@ class Setting:
     preset: bool = False
 
     def instances(self, gaussians: Gaussians, camera: Camera) -> int:
-        """(Gaussian, tile) instances of an image."""
+        """Return the number of (Gaussian, tile) instances of an image."""
         like, size = gaussians.means, {"width": camera.width, "height": camera.height}
         view, K = (torch.as_tensor(t, dtype=like.dtype, device=like.device)[None] for t in (camera.viewmat, camera.K))
         with torch.no_grad():
@@ -48,7 +48,7 @@ class Setting:
     def render(
         self, gaussians: Gaussians, camera: Camera, max_instances: int | None = None, capacity: int | None = None
     ) -> torch.Tensor:
-        """Colours, shape [H, W, 3]; bounds as in `RasterizeOptions`."""
+        """Return the colours, shape [H, W, 3]; bounds as in `RasterizeOptions`."""
         options = RasterizeOptions(
             rule=self.rule, tile_size=self.tile_size, sh_degree=self.degree, deterministic=self.deterministic,
             max_instances=max_instances, capacity=capacity,
@@ -57,14 +57,14 @@ class Setting:
 
 
 def cut_and_stop(cut: float, stop: float, name: str = "") -> Rule:
-    """`exact` with another alpha cut [1/255] and transmittance stop."""
+    """Return `exact` with another alpha cut [1/255] and transmittance stop."""
     return dataclasses.replace(
         EXACT, name=name or f"cut {cut:g}/255, stop {stop:g}", alpha_cut=cut / 255, transmittance_stop=stop
     )
 
 
 def settings(degree: int, cuda: bool) -> list[Setting]:
-    """Every knob by itself from `exact`, then pairs, then the presets, for a scene of that degree."""
+    """Return every setting changed alone from `exact`, then pairs, then the presets, for a scene of that degree."""
     made = [Setting("exact", "preset", preset=True)]
     made += [Setting(f"cut {c:g}/255", "alpha cut", cut_and_stop(c, 1e-4)) for c in CUTS]
     made += [Setting(f"stop {s:g}", "transmittance stop", cut_and_stop(1, s)) for s in STOPS]

@@ -43,7 +43,7 @@ class Task:
 
     @property
     def key(self) -> dict:
-        """What tells one result from another."""
+        """Values that tell one result from another."""
         names = ("split", "strategy", "rasterizer", "seed", "steps", "downscale")
         return {"scene": Path(self.folder).name} | {k: getattr(self, k) for k in names}
 

@@ -45,7 +45,7 @@ class Task:
     """forward, backward, both (one after the other) or step."""
     run: Callable[[], object]
     cost: Cost | None = None
-    """The least it has to do, where that is known."""
+    """Least bytes and operations of the task; None if unknown."""
     facts: dict = field(default_factory=dict)
     """Other entries of the row, such as the number of instances."""
 
@@ -56,7 +56,7 @@ def _drain(device: torch.device) -> None:
 
 
 def _timed(work: Callable[[], object], device: torch.device) -> tuple[float, float | None]:
-    """Wall time and, on CUDA, GPU time of one call [ms].
+    """Return wall time and, on CUDA, GPU time of one call [ms].
 
     Wall time runs from an idle device to an idle device. GPU time runs between two events around the call, so it leaves
     out the host's work before the first and after the last kernel, but not the gaps in between.
@@ -75,7 +75,10 @@ def _timed(work: Callable[[], object], device: torch.device) -> tuple[float, flo
 
 
 def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, whole: bool) -> float:
-    """Run until things settle; the shortest time of one call [ms]. Stops after the second call if that is above the limit."""
+    """Run work `WARM_UP` times, if whole at least for `WARM_UP_SECONDS`, and return the shortest time of a call [ms].
+
+    Stops after the second call if both took longer than the limit.
+    """
     begin, times = time.perf_counter(), []
     while len(times) < WARM_UP or (whole and time.perf_counter() - begin < WARM_UP_SECONDS):
         times.append(_timed(work, device)[0])
@@ -100,7 +103,7 @@ def measure_in_turn(
     repeats: int = REPEATS,
     limit_ms: float = math.inf,
 ) -> list[dict]:
-    """Median, quartiles and least of each work's wall time [ms], and on CUDA the median of its GPU time [ms].
+    """Return median, quartiles and minimum of each work's wall time [ms], and on CUDA the median of its GPU time [ms].
 
     A work that turns out in the warm-up to take longer than ``limit_ms`` is left there: its row has ``warm_up_ms`` only.
     ``others_cores`` says how many cores other programs kept busy meanwhile.
@@ -138,12 +141,12 @@ def measure_in_turn(
 
 
 def measure(work: Callable[[], object], device: torch.device, repeats: int = REPEATS) -> dict:
-    """The same for a single work."""
+    """Return the figures of `measure_in_turn` for a single work."""
     return measure_in_turn([work], device, repeats)[0]
 
 
 def peak_bytes(task: Task, device: torch.device) -> int:
-    """Device memory that one run takes above the loaded inputs, on CUDA [bytes].
+    """Return the device memory that one run takes above the loaded inputs, on CUDA [bytes].
 
     The sum of two figures. Torch's allocator keeps an exact high-water mark, which is reset before the run; the peers
     allocate nowhere else. Warp's pool serves the sorts, keeps their scratch memory for the next call and has no mark that
@@ -167,7 +170,7 @@ def peak_bytes(task: Task, device: torch.device) -> int:
 
 
 def recorded(work: Callable[[], object]) -> Callable[[], object]:
-    """Work as one CUDA graph, replayed: what it takes without the host. It must not look at the device."""
+    """Return the replay of a work as one CUDA graph, without time on the host. The work must not read from the device."""
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -189,7 +192,7 @@ def recorded(work: Callable[[], object]) -> Callable[[], object]:
 
 
 def backward_of(outputs: torch.Tensor, inputs: Sequence[torch.Tensor]) -> Callable[[], object]:
-    """Work that runs the backward pass of ``outputs`` for a fixed random upstream gradient."""
+    """Return the work that runs the backward pass of ``outputs`` for a fixed random upstream gradient."""
     upstream = torch.rand_like(outputs)
     return lambda: torch.autograd.grad(outputs, inputs, upstream, retain_graph=True)
 
@@ -202,7 +205,7 @@ def passes(
     costs: tuple[Cost | None, Cost | None] = (None, None),
     facts: dict | None = None,
 ) -> Iterator[Task]:
-    """The forward and backward tasks of a differentiable function, as far as they are wanted."""
+    """Yield the forward and backward tasks of a differentiable function, if they are wanted."""
     if wanted(program, "forward"):
         yield Task(program, "forward", forward, costs[0], facts or {})
     if wanted(program, "backward"):

@@ -1,4 +1,4 @@
-"""Time of a render and its gradients against their error to float64 without cut-offs, for every knob, on frozen scenes."""
+"""Time of a render and its gradients against their error to float64 without cut-offs, for every setting, on frozen scenes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warpgs.runtime.interop import set_threads
 from warpgs.scene import Camera, Gaussians
 
 VISIBLE = 0.5 / 255
-"""Half of what an 8-bit channel resolves."""
+"""Half a step of an 8-bit channel."""
 REFERENCE_INSTANCES = 8_000_000
 """Instances of the reference at a time: without a cut every Gaussian is in every tile."""
 LIMIT_MS = 2000.0
@@ -30,12 +30,12 @@ def _leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
 
 
 def _upstream(height: int, width: int) -> torch.Tensor:
-    """Gradient of the image that all are given, shape [H, W, 3], of either sign."""
+    """Return the gradient of the image, the same for all settings, of either sign, shape [H, W, 3]."""
     return torch.rand(height, width, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5
 
 
 def reference(scene: Frozen) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Colours and gradients in float64 with nothing left out."""
+    """Return colours and gradients in float64 without cut-offs."""
     g = _leaves(scene.gaussians, torch.float64)
     rgb = Setting("reference", "reference", UNCUT).render(g, scene.camera, REFERENCE_INSTANCES)
     gradients = torch.autograd.grad(rgb, list(g.tensors().values()), _upstream(*rgb.shape[:2]).to(rgb))
@@ -55,7 +55,7 @@ def image_errors(found: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:
 
 
 def gradient_errors(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor]) -> dict[str, float]:
-    """Relative L2 distance and cosine of each tensor's gradient, and the worst of either over the five."""
+    """Return relative L2 distance and cosine of each tensor's gradient, and the worst of either over the five."""
     row = {}
     for name, true in wanted.items():
         own, true = found[name].double().flatten(), true.flatten()
@@ -71,7 +71,10 @@ def gradient_errors(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tens
 
 
 def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor) -> list[Callable[[], object]]:
-    """An image, and an image with its gradients; on CUDA recorded, as fits take them: at these sizes the host is slower."""
+    """Return the work of an image, and that of an image with its gradients.
+
+    On CUDA both are graphs, as in fits, because the host is slower.
+    """
     inputs, cuda = list(leaves.tensors().values()), leaves.means.is_cuda
     bounds = {}
     if cuda:  # nothing that is recorded may look at the device or copy from the host
@@ -89,7 +92,7 @@ def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor
 
 
 def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = None) -> list[dict]:
-    """A row for each setting of one scene."""
+    """Return a row for each setting of one scene."""
     g, device = scene.gaussians, scene.gaussians.means.device
     wanted, wanted_gradients = reference(scene)
     upstream = _upstream(scene.camera.height, scene.camera.width).to(device, torch.float32)
@@ -128,9 +131,9 @@ def measure_scene(scene: Frozen, repeats: int, chosen: list[Setting] | None = No
 
 
 def times_in_turn(works: list[Callable[[], object]], device: torch.device, repeats: int) -> list[dict]:
-    """Median, quartiles and least of each work's time [ms], one repeat each in turn.
+    """Return median, quartiles and minimum of each work's time [ms], one repeat each in turn.
 
-    On CUDA wall time (bench.harness); on a CPU the processor time of one thread, which other programs disturb far less.
+    On CUDA wall time (`bench.lib.timing`); on a CPU the processor time of one thread, which other programs disturb far less.
     """
     if device.type == "cuda":
         return measure_in_turn(works, device, repeats, LIMIT_MS)
@@ -158,7 +161,7 @@ def times_in_turn(works: list[Callable[[], object]], device: torch.device, repea
 
 
 def sorting_share(scene: Frozen, repeats: int) -> dict:
-    """Time of sorting visible Gaussians by depth, at most what reusing the order could save [ms]."""
+    """Return the time of sorting visible Gaussians by depth [ms], an upper limit of what reusing the order could save."""
     g = scene.gaussians
     view, K = (
         torch.as_tensor(t, dtype=torch.float32, device=g.means.device)[None] for t in (scene.camera.viewmat, scene.camera.K)

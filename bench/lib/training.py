@@ -1,4 +1,4 @@
-"""The trainer as benches use it: no other module of the benches knows how a fit is set up and stepped."""
+"""The trainer for benches: no other module of the benches sets up or steps a fit."""
 
 from __future__ import annotations
 

@@ -110,7 +110,7 @@ def counts_of(g: Gaussians, camera: Camera) -> dict[str, int]:
 
 
 def peer_step(g: Gaussians, camera: Camera, target: torch.Tensor):
-    """Work: a training step in the manner of gsplat's trainer: coefficients in two tensors, its fused Adam, torch SSIM."""
+    """Return a training step in the manner of gsplat's trainer: coefficients in two tensors, its fused Adam, torch SSIM."""
     from gsplat import rasterization
     from gsplat.optimizers import SelectiveAdam
 

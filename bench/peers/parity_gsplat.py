@@ -37,7 +37,7 @@ class Case:
     ours: dict = field(default_factory=dict)
     gsplat: dict = field(default_factory=dict)
     differs: str = ""
-    """What the two define differently; such a case need not keep the limits."""
+    """Definition in which the two differ; such a case need not keep the limits."""
 
 
 CASES = (
@@ -67,7 +67,7 @@ def seen_by(camera: Camera, model: str) -> Camera:
 
 
 def compare(path: Path, case: Case, width: int, height: int, device: torch.device, peer=rasterizers.gsplat) -> dict:
-    """Differences of one case: the image's, and per parameter those of the gradient of a random projection."""
+    """Return the differences of one case: of the image, and by parameter of the gradient of a random projection."""
     g, cameras = garden_inputs(path, sh_degree=case.degree, width=width, height=height, device=device)
     camera = seen_by(first_camera(cameras), case.model)
     generator = torch.Generator().manual_seed(1)

@@ -1,4 +1,4 @@
-"""gsplat's two strategies on gsplat's rasterizer and on ours: held-out PSNR of the same training loop, over seeds.
+"""The two strategies of gsplat on its rasterizer and on ours: held-out PSNR of the same training loop, over seeds.
 
 Ours stands behind the adapter of `examples/09_gsplat_strategy.py`. Start, order of views and random numbers are those of the
 seed, so what differs is the rasterizer. gsplat's own sums are not repeatable: its spread over seeds is the yardstick. Needs

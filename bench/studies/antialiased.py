@@ -43,7 +43,7 @@ class Task:
 
     @property
     def key(self) -> dict:
-        """What tells one result from another."""
+        """Values that tell one result from another."""
         return {k: getattr(self, k) for k in ("filters", "split", "seed", "preset", "downscale")}
 
 

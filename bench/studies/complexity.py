@@ -1,4 +1,4 @@
-"""Bytes against PSNR: what is left of runs when they are pruned at growing losses of training PSNR, with a chart.
+"""Bytes against PSNR of runs that are pruned at growing losses of training PSNR, with a chart.
 
 RUN is a folder of `warpgs fit`, such as each scene's first seed of a study of `warpgs compare`. --out gets curve.json and
 curve.svg. Fits of fixed size, without harmonics and pruned beside each other over seeds: `bench.fits.presets --fixed`.

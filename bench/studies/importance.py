@@ -1,4 +1,4 @@
-"""Does it matter where fine Gaussians are placed? Fits whose events sample by one score each, at several budgets.
+"""Effect of the placement of fine Gaussians: fits whose events sample by one score each, at several budgets.
 
 An arm is SCORE/PRESET:SETTINGS, as in `bench.fits.presets`; a score is one of `bench.lib.importance_scores`, or ``own`` for the
 importance of the settings. Training views are left out in turn and scored; the oracles read them, no other score does. The

@@ -1,4 +1,4 @@
-"""What `select_rule` gives for limits of 1e-2, 1e-3 and 1e-4 on haze, needles, far and trained scenes, on a CPU.
+"""Results of `select_rule` for limits of 1e-2, 1e-3 and 1e-4 on haze, needles, far and trained scenes, on a CPU.
 
 The true error is the distance from `reference_image`, in float64 and without the kernels. Times are of images without
 gradients, in turn with `exact`. RUN is a fit, for the trained scene.

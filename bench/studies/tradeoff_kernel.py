@@ -21,7 +21,7 @@ WHAT = "time of a render and its gradients against their error, for every settin
 
 
 def chart(done: dict) -> str:
-    """Time of an image with its gradients against its mean error, a panel for each scene."""
+    """Return a chart of the time of an image with its gradients against its mean error, a panel for each scene."""
     panels = []
     what = "processor time of an image with gradients" if done["machine"]["device"] == "cpu" else "image with gradients"
     for name, scene in done["scenes"].items():

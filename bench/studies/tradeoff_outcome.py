@@ -34,7 +34,8 @@ TRIALS = {
     },
     "default": ("preset", "default"),
 }
-"""Knob and settings of each fit by name: every knob by itself from preset `quick`, then pairs, then presets."""
+"""Name of the changed setting, and the settings, of each fit by name: one setting changed from preset `quick`, then pairs, then
+presets."""
 KEPT = ("seconds", "setup", "cpu_seconds", "setup_cpu", "gaussians", "bytes", "steps", "psnr", "ssim")
 
 
@@ -79,7 +80,7 @@ def chart(done: dict) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run what the file lacks, seed by seed so that whatever else the machine does meets all alike; write, draw, print."""
+    """Run the missing fits, seed by seed, so that other load on the machine affects all alike; write, draw, print."""
     a = parse(
         __doc__, arguments, SCENE, need=("out",), split="llff:3", device="auto", downscale=1, seeds=[0, 1, 2], threads=0,
         only=list(TRIALS), plot=False, out=Path,

@@ -75,9 +75,10 @@ def test_confirmed_pixels_count_less():
 
 
 @pytest.mark.parametrize(
-    ("views", "alpha", "weight"), [(3, None, 1.0), (SMOOTH_VIEWS, None, 1.0), (SMOOTH_VIEWS + 1, None, 0.0), (3, 1.0, 0.0)]
+    ("views", "alpha", "weight"),
+    [(3, None, 1.0), (SMOOTH_VIEWS, None, 1.0), (SMOOTH_VIEWS + 1, None, 0.0), (3, 1.0, 0.5), (SMOOTH_VIEWS + 1, 1.0, 0.0)],
 )
-def test_few_opaque_views_have_the_term(views, alpha, weight):
+def test_few_views_have_the_term(views, alpha, weight):
     """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""
     train = [view_stub(alpha=alpha)] * views
     default = PRESETS["default"]

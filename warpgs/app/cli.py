@@ -1,4 +1,4 @@
-"""The command line: finds the command, runs it, and turns errors into sentences and exit codes."""
+"""The command line: finds the command, runs it, and reports errors in one line with an exit code."""
 
 import contextlib
 import importlib

@@ -1,4 +1,4 @@
-"""Report on this machine: parts that a fit needs, those that are missing, and how to get them."""
+"""Report on this machine: what a fit needs, what is missing, and how to install it."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ EXTRAS = {
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of an error, short enough for a table."""
+    """Return the first line of an error, short enough for a table."""
     text = str(error).strip().splitlines()
     return f"{type(error).__name__}: {text[0][:160]}" if text else type(error).__name__
 
@@ -163,7 +163,7 @@ def _processor() -> Iterable[Finding]:
 
 
 def _cuda() -> Iterable[Finding]:
-    """CUDA devices as torch and Warp see them; both must."""
+    """Check the CUDA devices; torch and Warp must both see them."""
     slower = "a fit runs on the CPU, slower"
     try:
         import torch
@@ -193,7 +193,7 @@ def _cuda() -> Iterable[Finding]:
 
 
 def _quiet_warp():
-    """Warp, initialised without its banner and warnings; the report covers them."""
+    """Return Warp, initialised without its banner and warnings; the report covers them."""
     import warp
 
     prepare_kernel_cache()
@@ -221,7 +221,7 @@ def _warp_cuda() -> Finding:
 
 
 def _size(folder: Path) -> int:
-    """Size of all files below a folder [bytes]."""
+    """Return the size of all files below a folder [bytes]."""
     size = 0
     for path in folder.rglob("*"):
         try:

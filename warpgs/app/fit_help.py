@@ -3,7 +3,7 @@
 from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 
 FLAGS = (
-    ("--out", "RUN", "", "run folder to fill; must not exist yet"),
+    ("--out", "RUN", "", "run folder to fill; new or empty"),
     ("--split", "SPEC", "", "views to hold out for scores; without it all train"),
     ("--preset", "NAME", DEFAULT_PRESET, "settings to start from: below, or a .toml file"),
     ("--steps", "N", "", "number of steps, one view each; default: by the preset"),

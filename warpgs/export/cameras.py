@@ -30,12 +30,12 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
 
     Args:
         path: cameras.json or transforms.json, in any folder, where an existing file is replaced; or a folder named sparse, as
-            COLMAP's text files in its folder 0, which must not be there yet.
+            COLMAP's text files in its folder 0; it must be new or empty.
         cameras: Cameras in file units, numpy arrays; cameras with lenses are written as pinholes of the same K, with a note.
 
     Raises:
         ResourceError: The folder or the disk does not take the file.
-        UsageError: The name has no known format, the folder exists, or a camera is orthographic.
+        UsageError: The name has no known format, the folder exists and is not empty, or a camera has no pinhole of the same K.
     """
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")

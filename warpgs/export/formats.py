@@ -86,7 +86,7 @@ def write_gaussians(
 
     Args:
         path: The file; an existing one is replaced.
-        gaussians: N >= 1 Gaussians, on any device.
+        gaussians: N Gaussians, on any device; at least one, except in a .ply file.
         normalization: Similarity from file to scene units; needed where ``units`` is scene.
         units: Units of ``gaussians``: scene, or file to write them unchanged.
         format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
@@ -94,8 +94,10 @@ def write_gaussians(
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
 
     Raises:
-        warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store.
+        warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store; there are no
+            Gaussians; or their spherical-harmonics degree is too high for the format.
         warpgs.errors.ResourceError: The file cannot be written.
+        TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
         warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
         ValueError: A tensor has the wrong shape.

@@ -29,9 +29,9 @@ from warpgs.scene import Gaussians, Normalization
 CHUNK_ROWS = 65536
 """Number of Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
 OPAQUE = 30.0
-"""Logit of an opacity that is 1 in float32, its negative that of an invisible one: it replaces infinity."""
+"""Logit that replaces infinity: its opacity is 1 in float32. Its negative replaces minus infinity."""
 FLAT = math.log(1e-37)
-"""Logarithm of an axis of length 0, the smallest in float32, instead of minus infinity."""
+"""Log scale that replaces minus infinity, an axis of length 0: float32 still holds its exponential."""
 
 _POSITION = ("x", "y", "z")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")

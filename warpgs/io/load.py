@@ -203,7 +203,7 @@ def _finished(
 
 
 def _check_views(root: Path, views: list[View]) -> None:
-    """Refuse names that are not unique, poses that are not rigid, and images and masks of another size than the camera."""
+    """Check that names are unique, poses rigid, and images and masks of the size of the camera."""
     seen: set[str] = set()
     for v in views:
         if v.name in seen:

@@ -103,7 +103,7 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
 
 @functools.cache
 def make_kernels(tile_size: int):
-    """Make the forward and contribution kernels for one tile size.
+    """Make the kernels that order tiles and find contributions, for one tile size.
 
     Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
     long for 32-bit sizes.

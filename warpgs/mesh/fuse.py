@@ -120,7 +120,7 @@ def fuse(
     Raises:
         DataError: No camera sees a surface, or none confirms what another sees.
         ResourceError: The grid does not fit into memory.
-        UsageError: There is no camera, one is orthographic, or an option is out of range.
+        UsageError: There is no camera, one has no pinhole of the same K, or an option is out of range.
     """
     if not cameras:
         raise UsageError("fuse needs at least one camera that sees the surfaces")

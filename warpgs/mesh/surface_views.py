@@ -48,12 +48,12 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
 
     Args:
         gaussians: N Gaussians in the units of the camera.
-        camera: Camera, arrays of numpy; for one with a lens, the pinhole of the same K stands.
+        camera: Camera, arrays of numpy; a lens is replaced by the pinhole of the same K.
         options: Settings of the rasterizer.
         depth: Depth that is taken, one of `DEPTHS`.
 
     Raises:
-        UsageError: The camera is orthographic, or the depth is unknown.
+        UsageError: The camera has no pinhole of the same K, or the depth is unknown.
     """
     if depth not in DEPTHS:
         raise UsageError(f"depth {depth!r} is not one of {', '.join(DEPTHS)}")
@@ -99,7 +99,7 @@ class SurfaceViews:
             purpose: Words for the line of progress.
 
         Raises:
-            UsageError: A camera is orthographic, or the depth is unknown.
+            UsageError: A camera has no pinhole of the same K, or the depth is unknown.
         """
         for i, camera in enumerate(self._cameras):
             self._stage(f"{purpose}: view {i + 1} of {len(self._cameras)}")

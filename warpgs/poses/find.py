@@ -91,7 +91,7 @@ def find_poses(
 
     Args:
         source: Folder of images, or a video file.
-        out: Scene folder to make; must not exist yet, or be empty.
+        out: Scene folder to make; new or empty.
         frames: Frames that are taken of a video.
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.

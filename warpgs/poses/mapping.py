@@ -76,7 +76,7 @@ class Mapping:
     error: float
     """Mean reprojection error of its points [px of the photograph]; 0 without a model."""
     method: str
-    """Mapper that the model is of, incremental or global."""
+    """Mapper that made the model: incremental or global."""
     version: str
     """Version of pycolmap."""
     kept_focal: bool | None = None

@@ -214,7 +214,7 @@ def write_matches(
         progress: Called with lines for the user.
 
     Returns:
-        The photographs that the network saw turned, since so they match others.
+        The photographs that the network saw rotated, because they match others that way.
     """
     found = []
     for i, image in enumerate(images):

@@ -99,7 +99,7 @@ def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str],
         path: The video file.
         folder: Folder to write into.
         count: Number of frames wanted; all where the video has fewer.
-        progress: Called with a line for the user now and then.
+        progress: Called with a line for the user at intervals.
 
     Returns:
         The number of frames that the video has.

@@ -111,7 +111,8 @@ def _triangulate(
 def triangulate_matches(views: list[View]) -> PointCloud:
     """Match SIFT features between pairs of views (Lowe 2004) and triangulate the matches that agree with the known poses.
 
-    Returns: N points [u] with the colours of their pixels in [0, 1]; none without matches.
+    Returns:
+        N points [u] with the colours of their pixels in [0, 1]; none without matches.
     """
     centers = [v.camera.center for v in views]
     pairs = sorted(itertools.combinations(range(len(views)), 2), key=lambda p: np.linalg.norm(centers[p[0]] - centers[p[1]]))

@@ -151,7 +151,7 @@ def check_photos(views: Sequence[View], progress: Callable[[str], object] = lamb
 
     Args:
         views: All views of the scene, those held out, too: at least one.
-        progress: Called now and then with a line for the user.
+        progress: Called at intervals with a line for the user.
 
     Returns:
         One check per view, in order.

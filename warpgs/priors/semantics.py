@@ -114,7 +114,7 @@ def network_semantics(network: Network, preprocessing: Preprocessing, image: np.
 def _fast_length(length: int) -> int:
     """Return the largest product of 2, 3 and 5 up to a length: Fourier transforms of others take up to ten times as long.
 
-    A length of the side of a reduced image, at least 1 [px].
+    ``length`` is the side of a reduced image, at least 1 [px].
     """
     while length > 1:
         rest = length

@@ -227,7 +227,8 @@ def view_priors(
         cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.
         tell: Called with a line for each view.
 
-    Returns: A prior per view, and notes on choices, assumptions and missing inputs.
+    Returns:
+        A prior per view, and notes on choices, assumptions and missing inputs.
 
     Raises:
         DataError: A model is invalid, or its output is not a map.

@@ -21,7 +21,8 @@ class ChunkedFrame:
     settings: RenderSettings
     """Settings of the whole render; its window is divided."""
     max_instances: int
-    """Most instances of a chunk. A single tile is never divided, so it may have up to one for each projected Gaussian."""
+    """Largest number of instances of a chunk. A single tile is never divided, so it may have one for each projected
+    Gaussian."""
     deterministic: bool = True
     """True to sum gradients in a fixed order."""
 

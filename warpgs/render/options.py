@@ -20,7 +20,7 @@ SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "ab
 """Options that are True or False."""
 
 WHOLE_NUMBERS = ("sh_degree", "tile_size", "heaviest", "memory_budget", "capacity", "max_instances")
-"""Options that are integers; None for the default, but of the tile size and the heaviest."""
+"""Options that are integers; all but ``tile_size`` and ``heaviest`` may be None."""
 
 
 def _is_whole(value: object) -> bool:
@@ -95,8 +95,9 @@ class RasterizeOptions:
     record: bool = True
     """True to replay repeated calls of a loop as CUDA graphs, with the same bits in half the time. It applies to calls with
     gradients in a fixed order and, in the main thread, to calls without gradients. It does not apply with colors, features,
-    opacity factors, contributions, median depth, heaviest, error bound and limits (docs/decisions/010-recorded-calls.md). Use
-    False if other threads wait for the whole device, as torch.cuda.synchronize does."""
+    opacity factors, contributions, median depth, heaviest, error bound, absgrad, pixels and limits
+    (docs/decisions/010-recorded-calls.md). Use False if other threads wait for the whole device, as torch.cuda.synchronize
+    does."""
 
     def __post_init__(self) -> None:
         """Check the types of switches and numbers; other ranges are checked in `rasterize`.

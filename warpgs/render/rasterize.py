@@ -284,7 +284,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
 
 
 def _refusing_gradients(render: Render) -> Render:
-    """Return the render with outputs that have no gradient such that a gradient through them is an error."""
+    """Return the render, where a gradient through outputs that have none is an error."""
     refusing: dict[str, Any] = {}
     for name in WITHOUT_GRADIENT:
         values, source = getattr(render, name), render.rgb if name == "error_bound" else render.projected

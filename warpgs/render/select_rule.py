@@ -29,7 +29,7 @@ def select_rule(
     """Return the fastest of the rules `fast`, `balanced` and `exact` that keeps a limit in every given view.
 
     Each view is rendered with `RasterizeOptions.error_bound`, so the limit covers cut-offs and float32, and holds only for
-    these Gaussians, cameras and options. The rendering takes a few times as long as one of these views in float64.
+    these Gaussians, cameras and options. Each view takes up to three renders in float32 and three in float64.
 
     Args:
         gaussians: The scene, N Gaussians.

@@ -68,7 +68,7 @@ class EventLog:
             raise self._failure(e) from e
 
     def flush(self) -> None:
-        """Have everything written kept by the disk, so that the log never lags behind a checkpoint.
+        """Sync everything written to the disk, so that the log never lags behind a checkpoint.
 
         Raises:
             ResourceError: The disk does not take it.

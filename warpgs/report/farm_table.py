@@ -25,7 +25,7 @@ MOST_RUNNING = 12
 
 @dataclass(frozen=True)
 class JobRow:
-    """A job as people see it."""
+    """A row of the table: one job."""
 
     name: str
     state: str

@@ -58,7 +58,7 @@ def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) 
 def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
     """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where nothing is seen.
 
-    Over ``background`` they show the image again, over another colour what the scene looks like before that.
+    Over ``background`` they give the image again; over another colour, the scene in front of that colour.
     """
     own = image - (1 - alpha[..., None]) * np.float32(background)
     colors = np.divide(own, alpha[..., None], out=np.zeros_like(own), where=alpha[..., None] > 0)

@@ -65,7 +65,7 @@ class _StatusLine:
                 self.display.update(self.task, total=total, completed=done, detail=detail)
 
     def clear(self) -> None:
-        """Take the line away."""
+        """Remove the line."""
         with self.lock:
             display, self.display, self.task, self.stage = self.display, None, None, ""
             if display is not None:
@@ -108,11 +108,11 @@ class Stages:
         self.live = (show is say and is_live()) if live is None else live
 
     def __enter__(self) -> Stages:
-        """Return this."""
+        """Return these stages."""
         return self
 
     def __exit__(self, *error) -> None:
-        """Take the line away."""
+        """Remove the line."""
         self.clear()
 
     def __call__(self, line: str) -> None:
@@ -183,7 +183,7 @@ class Progress:
             say(self._line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
-        """Show the numbers of one finished step; ``seconds`` that it took, None where that says nothing of those to come."""
+        """Show the numbers of one finished step; ``seconds`` that it took, None if later steps will take another time."""
         self.step, self.count, self.doing = step, count, ""
         self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
         self.seconds = self.seconds if seconds is None else _mean(self.seconds, seconds)

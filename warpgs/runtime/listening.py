@@ -150,7 +150,7 @@ class WebGuard:
     """Rules for requests to a web server of this machine: its secret path, its names, and the headers of its answers."""
 
     def __init__(self) -> None:
-        """Draw a token, which is valid until the process ends."""
+        """Choose a random token, which is valid until the process ends."""
         self.token = secrets.token_urlsafe(TOKEN_BYTES)
 
     def address(self, port: int) -> str:

@@ -114,7 +114,7 @@ class CarefulStream:
 
 
 def say_lost(name: str, error: BaseException) -> None:
-    """Print on stderr that the command continues without stdout; of a lost stderr nothing can be said."""
+    """Print on stderr that the command continues without stdout; a lost stderr cannot be reported."""
     if name == "stdout":
         _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command continues without it")
 

@@ -59,7 +59,7 @@ class RankWatch:
         self.rank, self.count, self.store = rank, count, store
         self.here = machine()
         self.leaving = threading.Event()
-        """Set once this process ends in good order."""
+        """Set once this process ends normally."""
         self._own = own
         self._seen: dict[int, tuple[str, float]] = {}
         self._beat(0)
@@ -103,7 +103,7 @@ class RankWatch:
                 os._exit(ResourceError.exit_code)
 
     def is_lost(self, rank: int) -> bool:
-        """Return whether a process has ended without a word, or has been silent for too long."""
+        """Return whether a process has ended without a message, or has given no sign of life for too long."""
         if not self._own.check([f"beat/{rank}"]):
             return False  # it has not started yet
         found, now = self._own.get(f"beat/{rank}").decode(), time.monotonic()
@@ -116,7 +116,7 @@ class RankWatch:
         return gone and not self._own.check([f"left/{rank}"])
 
     def fail(self, line: str) -> None:
-        """Print why all end, unless another process has, or this one ends in good order behind the first."""
+        """Print why all ranks end, unless another one has printed it, or this one ends normally after the first."""
         if self.leaving.is_set() and self.rank != 0:
             return
         self.leaving.set()
@@ -134,7 +134,7 @@ class RankWatch:
         time.sleep(seconds + 2 * BEAT_SECONDS)
 
     def leave(self) -> None:
-        """Tell the others that this process ends in good order; all but the first wait for the first to do so."""
+        """Tell the others that this process ends normally; all but the first wait for the first to do so."""
         try:
             self.store.set(f"left/{self.rank}", "")
             if self.rank != 0:

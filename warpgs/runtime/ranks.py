@@ -1,8 +1,8 @@
 """Processes that fit one scene together: their identity, their exchange, and their end when one is lost.
 
 They are started by torchrun, or with the variables that it sets: RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT.
-Numbers go by NCCL between GPUs and by gloo between CPUs. Neither reports a lost process in time (a kernel of NCCL waits for
-ever), so each process watches the others through a store that all are connected to.
+Numbers go by NCCL between GPUs and by gloo between CPUs. Neither reports a lost process in time (a kernel of NCCL waits
+forever), so each process watches the others through a store that all are connected to.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Ranks:
         """End all exchange, once all processes have done the same steps."""
 
     def leave(self) -> None:
-        """End in good order; all but the first wait for the first to do so."""
+        """End normally; all but the first wait for the first to do so."""
 
 
 ALONE = Ranks()
@@ -99,7 +99,7 @@ class Group(Ranks):
 
     @contextlib.contextmanager
     def _watched(self) -> Iterator[None]:
-        """On a failed exchange, let the watch end this process with an error that names the lost rank."""
+        """Let the watch end this process, with an error that names the lost rank, if an exchange fails."""
         try:
             yield
         except RuntimeError as e:
@@ -117,7 +117,7 @@ class Group(Ranks):
             dist.destroy_process_group()
 
     def leave(self):
-        """End in good order."""
+        """End normally."""
         self.watch.leave()
 
 
@@ -230,7 +230,10 @@ def _stay_home(address: str) -> str | None:
 
 
 def last_words(line: str, code: int) -> int:
-    """Print why this process ends, and return its exit code; of several the first to fail says it, and this one ends here."""
+    """Print why this process ends, and return its exit code.
+
+    In a group of processes, only the first to fail prints, and this call ends the process instead of returning.
+    """
     if _joined is None:
         if place_or_first()[0] == 0:
             say(line, error=True)

@@ -78,7 +78,7 @@ def interrupting_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[Callable[[], bool]]:
-    """Note the first signal, so that the body can end in good order; a second one raises KeyboardInterrupt in it.
+    """Note the first signal, so that the body can end normally; a second one raises KeyboardInterrupt in it.
 
     Gives a function that returns whether a signal came.
     """

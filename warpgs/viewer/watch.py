@@ -107,7 +107,7 @@ def _update(window: Window, path: Path, device: str) -> None:
 
 
 class LiveView:
-    """A viewer of a fit in this process: it draws the latest state in a thread of its own, and the fit never waits for it."""
+    """A viewer of a fit in this process: a thread of its own shows the latest state, and the fit never waits for it."""
 
     def __init__(self, server: viser.ViserServer, title: str, folder: Path):
         """Begin without a state."""
@@ -133,7 +133,7 @@ class LiveView:
         return self._shown.wait(seconds)
 
     def close(self) -> None:
-        """Draw no more."""
+        """Stop showing states."""
         self._open = False
         self._wake.set()
         self._thread.join(timeout=10)

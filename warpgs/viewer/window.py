@@ -38,7 +38,7 @@ class Window:
     """Shows a model to all browsers that are connected; a later model of a fit replaces it."""
 
     def __init__(self, server: viser.ViserServer, content: Content, maps: bool = True):
-        """Draw a model.
+        """Show a model.
 
         Args:
             server: The server, without anything in its scene.

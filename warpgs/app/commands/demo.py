@@ -21,7 +21,7 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Demo:
         folder: tyro.conf.Positional[Path]
-        """Folder to write; must not exist yet."""
+        """Folder to write; new or empty."""
         views: int = 24
         """Number of photographs."""
         width: int = 320

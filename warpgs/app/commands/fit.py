@@ -40,7 +40,7 @@ def _request_type() -> type:
     @dataclass(frozen=True, kw_only=True)
     class Request:
         out: Path
-        """Run folder to fill; must not exist yet."""
+        """Run folder to fill; new or empty."""
         device: str = "auto"
         """auto, cpu or cuda."""
         threads: int = 0

@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
         photographs: tyro.conf.Positional[Path]
         """Folder of photographs, or a video file."""
         out: Path
-        """Scene folder to write; must not exist yet."""
+        """Scene folder to write; new or empty."""
         frames: int = FRAMES
         """Frames to take from a video, evenly spaced and sharp."""
         threads: int = 0

@@ -37,7 +37,7 @@ def _show(arguments: list[str], about: str) -> int:
         out: Path
         """Folder for PNG sheets, one for each training view."""
         split: str | None = None
-        """As for `warpgs fit`."""
+        """Split, as for `warpgs fit`."""
         downscale: int | None = None
         """Factor by which both image sides shrink; it removes the default limit of --max-side."""
         max_side: int | None = None

@@ -10,7 +10,7 @@ from warpgs.pipeline.farm.job import FarmJob
 
 @dataclass(frozen=True)
 class Event:
-    """News of a job."""
+    """A change of the state of a job."""
 
     name: str
     """Name of the job."""
@@ -37,4 +37,4 @@ class Engine(Protocol):
         """Return new events; waits up to this time."""
 
     def close(self) -> None:
-        """End all that runs. A fit saves its state where it can, and is continued by the next farm."""
+        """Stop all jobs. A fit saves its state if it can, and the next farm continues it."""

@@ -1,4 +1,4 @@
-"""Runs of a study or a farm: each is kept where it is finished and the same, continued where it is half done, else fitted."""
+"""Runs of a study or a farm: keep a finished run with the same settings, continue an interrupted one, else fit."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, spl
 
 
 def _set_aside(folder: Path) -> Path:
-    """Move a run that cannot be used out of the way; no result is deleted.
+    """Rename the folder of a run that cannot be used; no result is deleted.
 
     Raises:
         ResourceError: Another process writes there, or the folder cannot be moved.

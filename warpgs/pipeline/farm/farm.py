@@ -44,7 +44,7 @@ class JobStatus:
 
     @property
     def ended(self) -> bool:
-        """True where nothing more will come of it."""
+        """True if the job is done or has failed."""
         return self.state in ("done", "failed")
 
 
@@ -102,7 +102,7 @@ class _Farm:
         return self.all
 
     def _pause(self, waiting: deque[JobStatus]) -> Iterator[Event]:
-        """Wait for another farm, where all that is left is in its hands."""
+        """Wait a while if all jobs that are left are locked by other farms."""
         if waiting:
             time.sleep(self.poll)
         return iter(())
@@ -121,7 +121,7 @@ class _Farm:
                 self.engine.start(status.job)
 
     def _claim(self, status: JobStatus) -> bool:
-        """Lock the folder of a job; return False where another farm holds it; end one that has been finished meanwhile."""
+        """Lock the folder of a job; return False if another farm holds it; end the job if it was finished meanwhile."""
         if status.job.name not in self.held:
             with contextlib.ExitStack() as stack:
                 try:
@@ -178,7 +178,7 @@ class _Farm:
         self._release(status)
 
     def _release(self, status: JobStatus) -> None:
-        """Let others have the folder of a job."""
+        """Release the lock of the folder of a job."""
         lock = self.held.pop(status.job.name, None)
         if lock is not None:
             lock.close()

@@ -23,7 +23,7 @@ COLUMNS = (
 
 
 def row_of(status: JobStatus) -> JobRow:
-    """Return a job as people see it."""
+    """Return the row of a job in tables."""
     record = status.record
     if record is None:
         took = time.monotonic() - status.began if status.state == "running" else 0.0

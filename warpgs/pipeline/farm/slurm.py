@@ -47,7 +47,7 @@ class _Queued:
 
     slurm_id: str
     number: int
-    """Its files in the private folder are named by it."""
+    """Number in the names of its files in the private folder."""
     missed: int = 0
     """Calls of squeue that did not list it."""
 

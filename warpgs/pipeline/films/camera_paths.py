@@ -34,7 +34,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
         turned: True if the photograph is rotated by a quarter turn, so that width and height are swapped.
 
     Raises:
-        UsageError: The camera is orthographic.
+        UsageError: The camera has no pinhole of the same K, such as an orthographic one.
     """
     camera = pinhole_of(camera)
     K, width, height = camera.K, camera.width, camera.height
@@ -89,7 +89,7 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
 
 
 def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
-    """Return poses on a circle about the rig's centre, or turning round in it; there and back where a circle is too far.
+    """Return poses on a circle about the rig's centre, or looking around from it; a swing there and back without full coverage.
 
     Args:
         rig: The rig.

@@ -1,4 +1,4 @@
-"""Tours: camera paths through the training views, in an order that makes sense."""
+"""Tours: camera paths through the training views, in the order of their names or from neighbour to neighbour."""
 
 from __future__ import annotations
 

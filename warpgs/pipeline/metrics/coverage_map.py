@@ -79,7 +79,7 @@ def depth_views(
         The views in the order of the cameras, on the device of the Gaussians.
 
     Raises:
-        UsageError: A camera is orthographic. (A lens is replaced by the pinhole of the same K.)
+        UsageError: A camera has no pinhole of the same K, such as an orthographic one.
     """
     pixels = sum(c.width * c.height for c in cameras)
     factor = min(1.0, (max_pixels / max(1, pixels)) ** 0.5)
@@ -114,7 +114,7 @@ def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
         other: The other view.
 
     Raises:
-        UsageError: A camera is not a pinhole.
+        UsageError: ``camera`` is not a pinhole.
     """
     check_pinhole(camera)
     u, v, z = _seen_from(depth, camera, other.camera)
@@ -176,7 +176,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
         The coverage, on the device of ``depth``.
 
     Raises:
-        UsageError: A camera is not a pinhole.
+        UsageError: ``camera`` is not a pinhole.
     """
     counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
     least = torch.full_like(depth, torch.inf)
@@ -199,7 +199,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
         empty: Whether pixels without a surface count, as at the median depth of the others.
 
     Raises:
-        UsageError: A camera is orthographic.
+        UsageError: A photograph has no pinhole of the same K, such as an orthographic one.
     """
     small = _resized(camera, min(1.0, GRID / max(camera.width, camera.height)))
     rows, columns = (

@@ -155,7 +155,8 @@ def score_by_coverage(
         ``depth_differences`` and ``photo_psnr``: the table of `photo_errors`; ``tolerance``; ``summary``, a sentence.
 
     Raises:
-        UsageError: A camera is orthographic. Views of lenses are scored as a pinhole would show them.
+        UsageError: A camera has no pinhole of the same K, such as an orthographic one. Views of lenses are scored as a pinhole
+            would show them.
     """
     tell("checking coverage")
     train, test = ([pinhole_view(v) for v in views] for views in (train, test))

@@ -34,7 +34,7 @@ class Lpips:
     """SHA-256 of the file that the weights came from, hexadecimal."""
 
     def _features(self, images: torch.Tensor) -> Iterator[torch.Tensor]:
-        """Compared activations of images [2, 3, H, W], each of unit length along its channels."""
+        """Yield the compared activations of images [2, 3, H, W], each of unit length along its channels."""
         x = images
         for layer in self.net.layers:
             if layer[0] == "conv":

@@ -95,7 +95,7 @@ HEADS = {
 
 
 def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
-    """The tensors of a .pth file by name, and the file's SHA-256."""
+    """Return the tensors of a .pth file by name, and the file's SHA-256."""
     try:
         file = open_input(path)
     except FileNotFoundError as e:

@@ -1,4 +1,4 @@
-"""Smaller models for the same images: neighbours merged, the dispensable removed, degrees lowered, while a test accepts it."""
+"""Smaller models for the same images: merge neighbours, remove Gaussians, lower degrees, as long as a test accepts it."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians]
 def merge_neighbours(
     gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
 ) -> Gaussians:
-    """Merge pairs, cheapest first, in rounds: again and again while it is worthwhile; return the smaller set.
+    """Merge pairs, cheapest first, in rounds while these are worthwhile; return the smaller set.
 
     Args:
         gaussians: The set.

@@ -186,7 +186,7 @@ def extrapolates(config: InitConfig, views: list[View]) -> bool:
 
 
 def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
-    """Refuse a start from points where the scene has none that the training views saw.
+    """Check that a start from points has points that the training views saw.
 
     Raises:
         DataError: There are none, and ``config`` needs them.

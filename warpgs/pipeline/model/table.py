@@ -81,7 +81,7 @@ class Table:
         self.columns |= {n: torch.full((self.count,), c.fill, dtype=c.dtype, device=self.device) for n, c in columns.items()}
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return self.count
 
     @staticmethod

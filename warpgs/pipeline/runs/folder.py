@@ -298,6 +298,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
     Raises:
         DataError: The folder is not a run folder, another version of warpgs wrote it, or its checkpoint is incomplete.
         ResourceError: The device is missing.
+        UsageError: The name of the device is unknown.
     """
     folder = Path(folder)
     where, _ = choose_device(device)

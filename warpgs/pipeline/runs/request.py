@@ -146,7 +146,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
         spec: As in `warpgs fit --split`; None for all to fit.
 
     Returns:
-        The split, and notes for the user: the choice made, masks and held-out views that make scores mean less.
+        The split, and notes for the user: the choice made, and masks and held-out views for which scores are less reliable.
 
     Raises:
         DataError: A view that is named is missing.

@@ -77,7 +77,7 @@ def rule_report_of(
 
     Returns:
         ``max``, ``mean`` and ``psnr`` [dB] (None where infinite) of the error of colours in [0, 1] over all parts; ``views``
-        by name with their windows; ``render_ms`` and, where the rule is another, ``exact_ms`` of one whole view; ``rule``;
+        by name with their windows; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``;
         and ``summary``, all of it in words.
     """
     generator = np.random.default_rng(seed)

@@ -87,7 +87,7 @@ def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, 
 
 
 def _places(request: StudyRequest, device: str) -> list[Place]:
-    """Read the scenes of a study; DataError where one holds out no view."""
+    """Read the scenes of a study; DataError if one has no held-out view."""
     places = []
     for asked in request.scenes:
         wanted = asked.with_scale(device)

@@ -20,23 +20,23 @@ class Sample:
     """Mean and spread of repeated measurements."""
 
     mean: float
-    """Arithmetic mean; NaN of none."""
+    """Arithmetic mean; NaN without measurements."""
     sd: float
-    """Standard deviation with n - 1 in the denominator; NaN of fewer than two."""
+    """Standard deviation with n - 1 in the denominator; NaN with fewer than two measurements."""
     count: int
     """Number of measurements."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean of paired differences and the interval that holds its true value, were the differences normal."""
+    """Mean of paired differences, and an interval for its true value, for normally distributed differences."""
 
     mean: float
-    """Mean difference; NaN of no pair."""
+    """Mean difference; NaN without pairs."""
     low: float
-    """Lower end of the interval; NaN of fewer than two pairs."""
+    """Lower end of the interval; NaN with fewer than two pairs."""
     high: float
-    """Upper end of the interval; NaN of fewer than two pairs."""
+    """Upper end of the interval; NaN with fewer than two pairs."""
     count: int
     """Number of pairs."""
 

@@ -71,7 +71,7 @@ class BatchSteps:
         self.slots = StepBuffers(buffers.device, 1, len(tree.slots))
         """Settings and results of this process's slots."""
         self.told_to_stop = False
-        """Whether this process was asked to stop; the next step tells all others."""
+        """True if this process was asked to stop; the next step tells all others."""
         self.sums: SlotSums | None = None
         """Sums over slots, of the sizes of the last step."""
         self._graphs = self._updates = None

@@ -48,7 +48,7 @@ class FitConfig:
     seed: int = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
-    """Cut-offs of the rasterizer: exact, balanced, fast, gsplat or inria."""
+    """Cut-offs of the rasterizer: exact, balanced, fast, gsplat-1.6, gsplat-1.5 or inria."""
     antialiased: bool = False
     """Antialiased model, for renders at other sizes than the photos (Mip-Splatting, Yu et al. 2024). Gaussians smaller than a
     pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run

@@ -17,10 +17,11 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 FLOOR = (2 / 255) ** 2
-"""Mean squared error that is added to every block's: errors below two levels of an 8-bit photograph count as none."""
+"""Mean squared error that is added to that of every block, so that errors below two levels of an 8-bit photograph hardly
+count."""
 SIDES = 16, 32
-"""Least and largest side of a block [px]; between them a sixteenth of the image's shorter side. In images of which an
-eighth is less than the least, it is that eighth."""
+"""Bounds of the side of a block [px]: a sixteenth of the image's shorter side, within these bounds, but never more than an
+eighth."""
 MIN_BLOCKS = 12
 """Smallest number of blocks over all views for a significant gain."""
 MAX_FRACTION = 0.1
@@ -37,7 +38,7 @@ class Blocks:
     """Row and column of the first pixel of each, int64 on the CPU, shape [B, 2]; no two overlap."""
 
     def __len__(self) -> int:
-        """Number of squares."""
+        """Return the number of squares."""
         return len(self.corners)
 
     def pixels(self, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
@@ -122,7 +123,7 @@ class Gain:
     """Gain of a change on the left-out blocks."""
 
     mean: float
-    """Mean over blocks of the fall of their error [dB]."""
+    """Mean drop of the error of a block [dB]."""
     noise: float
     """Standard error of that mean [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
     error may be larger."""

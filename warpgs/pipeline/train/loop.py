@@ -23,7 +23,7 @@ def run(
     stopped: Callable[[], bool],
     restore: Callable[[Trainer], bool] = lambda _: False,
 ) -> None:
-    """Take all remaining steps, reporting each and saving now and then and at the end.
+    """Take all remaining steps; report each, and save at intervals and at the end.
 
     A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
     set of Gaussians was being changed; not so in one of several processes, which would be alone in that step.

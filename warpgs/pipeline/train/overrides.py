@@ -40,7 +40,7 @@ def keyword(name: str) -> str:
 
 
 def flag(name: str) -> str:
-    """Return the flag of a setting without its dashes in front: ``init.sh-every`` of ``init.sh_every``."""
+    """Return the flag of a setting without its dashes in front: ``init.random-count`` of ``init.random_count``."""
     return name.replace("_", "-")
 
 

@@ -59,7 +59,7 @@ class Presets(Mapping[str, "FitConfig"]):
             about: A line about it for the help.
 
         Raises:
-            UsageError: One of ours has that name, or no flag could name it.
+            UsageError: A built-in preset has that name, or no flag could name it.
         """
         if name in self._files or ":" in name or name.endswith(SUFFIX) or not name.strip():
             raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without colon that warpgs does not use")

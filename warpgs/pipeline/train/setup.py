@@ -62,7 +62,8 @@ def prepare(
     Raises:
         DataError: There is nothing to start from.
         UsageError: A view's camera cannot be rendered: its model is missing, or it has other coefficients. A given map is of
-            another size or not finite. Also if the start or the strategy compares views, and a camera is not a pinhole.
+            another size or not finite. Also if the start or the strategy compares views, and a camera has no pinhole of the
+            same K.
     """
     for view in train:
         check_camera(view.camera)
@@ -125,7 +126,7 @@ def _unused_networks(config: FitConfig) -> list[str]:
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
-    """Refuse settings that compare views with each other where a camera has no pinhole of the same K."""
+    """Check that every camera has a pinhole of the same K if the settings compare views with each other."""
     others = sorted({v.camera.model for v in train} - {*CENTRAL})
     if others and (config.init.source != "points" or samples(config)):
         raise UsageError(
@@ -150,9 +151,9 @@ def terms_of(config: FitConfig, cutout: bool = False, depth: bool = False, norma
 
     Args:
         config: Settings.
-        cutout: Its images have an alpha channel.
-        depth: Depth is given of a view.
-        normals: Normals are given of a view.
+        cutout: True if a view has an alpha channel.
+        depth: True if a view has given depth.
+        normals: True if a view has given normals.
     """
     return (*built_in_terms(config.loss, cutout, depth, normals), *config.loss_terms)
 

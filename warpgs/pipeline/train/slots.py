@@ -141,7 +141,7 @@ class SlotSums:
         self.tree, self.shapes, self.device = tree, [tuple(s) for s in shapes], device
         sizes = [-(-torch.Size(s).numel() // ALIGNMENT) * ALIGNMENT for s in self.shapes]
         self.starts = [sum(sizes[:i]) for i in range(len(sizes))]
-        """Where each tensor begins in a sum."""
+        """Start of each tensor in a sum."""
         unit = ALIGNMENT * tree.ranks.count
         self.rows = torch.zeros(tree.rows, -(-sum(sizes) // unit) * unit, device=device)
         """The sums, shape [R, L]."""

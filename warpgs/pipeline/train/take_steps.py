@@ -78,7 +78,10 @@ class StepTaker:
                 step(self.learned, stacks[kind], self.buffers, plan, render)
 
     def agreed(self, stopped: bool) -> bool:
-        """Return whether to end after the last step, as all processes do: one that was told to is heard in its next step."""
+        """Return whether to end after the last step, the same in all processes.
+
+        A request to one process reaches the others in its next step.
+        """
         if self.batched is None or self.ranks.count == 1:
             return stopped
         self.batched.told_to_stop = stopped

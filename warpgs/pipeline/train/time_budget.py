@@ -25,7 +25,7 @@ STEP, SETUP = 1.6, 11.0
 a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px. On CUDA, where
 steps are captured and probes are not, a step takes less, so that the prediction is an upper limit."""
 MIN_STEPS = 100
-"""Fewest steps chosen: with fewer nothing is seen. The most are those of a fit without a budget (`steps_by_views`)."""
+"""Fewest steps chosen: fewer give no usable scene. The most are `steps_by_views`."""
 
 
 def probe_seconds(width: int, height: int, device: torch.device) -> float:
@@ -67,7 +67,8 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
         views: Training views.
         device: Device of the fit.
 
-    Returns: The configuration with its steps, and a note on the choice.
+    Returns:
+        The configuration with its steps, and a note on the choice.
 
     Raises:
         UsageError: The budget is not a positive number, or too short for the shortest fit.

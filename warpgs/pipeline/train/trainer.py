@@ -99,7 +99,7 @@ class Trainer:
         self.order: list[int] = []
         """Views that are still to come before any comes again, the next one last."""
         self.extrapolated = made.start.extrapolated > 0
-        """Whether the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
+        """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
         self._make_parts(train, made.start, scene_extent(cameras, cloud))
         self.layout: Layout
         views, self.disparities = prepared_views(train, made, config, self.terms, device)

@@ -89,8 +89,8 @@ class TrainingView:
 def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of the view of a step.
 
-    On CUDA image, mask, opacity and disparity are copied from the stacks. Views with an alpha channel are composited over the
-    background of the step.
+    On CUDA image, mask, opacity and one map of a loss term that reads depth are copied from the stacks. Views with an alpha
+    channel are composited over the background of the step.
     """
     copies = (3 + sizes.masked + sizes.cutout + sizes.depth) * sizes.cuda
     return dict.fromkeys(STEP, FLOAT * sizes.pixels * (copies + 6 * sizes.cutout))

@@ -51,9 +51,9 @@ def built_in_terms(
 
     Args:
         config: Weights.
-        cutout: Its images have an alpha channel.
+        cutout: True if a view has an alpha channel.
         depth: True if a view has given depth.
-        normals: Normals are given of a view.
+        normals: True if a view has given normals.
     """
     terms: list[LossTerm] = [Photometric(config.ssim_weight)]
     if cutout and config.alpha_weight > 0:

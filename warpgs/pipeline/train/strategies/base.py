@@ -147,6 +147,6 @@ class Strategy:
 
 
 STRATEGIES: Registry[Strategy] = Registry("strategy", Strategy, __package__)
-"""Strategies by name; the modules of this folder are ours."""
+"""Strategies by name; those in the modules of this folder are built in."""
 register = STRATEGIES.register
 find_strategy = STRATEGIES.find

@@ -16,7 +16,7 @@ from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
 
 @register("clone_split")
 class CloneSplit(Strategy):
-    """Cloning and splitting by the gradient of projected means, pruning of the transparent and the huge; the default."""
+    """Cloning and splitting by the gradient of projected means, pruning of transparent and huge Gaussians."""
 
     STATE = staticmethod(schema.fields(GradientGrowth.STATE))
 

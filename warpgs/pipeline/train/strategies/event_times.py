@@ -10,11 +10,11 @@ class EventTimes:
     """Events at equal distances, in steps done."""
 
     after: int
-    """The first event comes after this."""
+    """Steps after which the first event comes."""
     every: int
     """Steps between two events, which are at multiples of this."""
     until: int
-    """No event comes after this."""
+    """Last step with an event."""
 
     @staticmethod
     def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:

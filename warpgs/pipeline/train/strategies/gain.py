@@ -48,7 +48,7 @@ def residual_of(view: TrainingView, rgb: torch.Tensor, depth: torch.Tensor, foot
 def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residual]) -> torch.Tensor:
     """Return the gain of Gaussians: half the slope at which their opacity lowers the squared error of all views, shape [S].
 
-    A Gaussian of colour c, opacity o and footprint w makes of a colour C in front of it C + o w (c - C). The squared error to
+    A Gaussian of colour c, opacity o and footprint w in front of a colour C changes it to C + o w (c - C). The squared error to
     I falls by 2 o sum w (I - C) . (c - C) to first order: c times the blurred residual, less the blurred (I - C) . C. It
     counts in every view in which the point is not hidden.
 

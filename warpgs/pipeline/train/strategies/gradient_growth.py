@@ -26,7 +26,7 @@ class DensityConfig:
     """Thresholds and times of densification."""
 
     start: int = 500
-    """First step after which Gaussians are added and removed."""
+    """Steps before Gaussians are added and removed; a quarter of the fit if that is less."""
     every: int = 100
     """Steps between these events."""
     stop_fraction: float = 0.5
@@ -95,7 +95,7 @@ def refine(
     growing: torch.Tensor | None = None,
     protected: torch.Tensor | None = None,
 ) -> DensityUpdate:
-    """Clone small Gaussians and split large ones where the gradient of the mean is large; prune the transparent and the huge.
+    """Clone small Gaussians and split large ones where the gradient of the mean is large; prune transparent and huge ones.
 
     Args:
         gaussians: The current set, N rows.

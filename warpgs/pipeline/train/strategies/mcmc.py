@@ -38,7 +38,7 @@ class MCMCConfig:
     """Settings of strategy mcmc; the defaults are the paper's."""
 
     start: int = 500
-    """First step after which Gaussians are relocated and added."""
+    """Steps before Gaussians are relocated and added; a quarter of the fit if that is less."""
     every: int = 100
     """Steps between these events."""
     stop_fraction: float = 0.83

@@ -131,7 +131,7 @@ def fine_gaussians(
         Rows of the five tensors of `Gaussians`, shape [S, ...] each.
 
     Raises:
-        UsageError: The camera is not a pinhole.
+        UsageError: The camera model is only supported by the kernels.
     """
     rows, columns = at.unbind(1)
     depths = depth[rows, columns]

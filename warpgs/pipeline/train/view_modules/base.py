@@ -139,7 +139,7 @@ class ViewModule:
 
 
 VIEW_MODULES = Registry("view module", ViewModule, __package__)
-"""View modules by name; the modules of this folder are ours."""
+"""View modules by name; those in the modules of this folder are built in."""
 register = VIEW_MODULES.register
 
 
