@@ -136,6 +136,50 @@ def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys)
     assert not first.is_lost(2)
 
 
+@pytest.fixture
+def unwatched(monkeypatch):
+    """Watches without a thread, and no time passes; returns the times [s] that they would have slept."""
+    slept = []
+    monkeypatch.setattr(rank_watch.time, "sleep", slept.append)
+    monkeypatch.setattr(rank_watch.threading.Thread, "start", lambda self: None)
+    return slept
+
+
+def test_the_first_rank_keeps_the_store_until_all_have_read_the_error(unwatched, monkeypatch):
+    """Another rank has printed why all end. Without the store, a third one would print that rank 0 is gone."""
+    monkeypatch.setattr(rank_watch, "BEAT_SECONDS", 0.001)
+    monkeypatch.setattr(rank_watch.os, "_exit", sys.exit)
+    store = Store(spoke=1)
+    for rank, waits in ((0, [3 * 0.001]), (1, [])):
+        unwatched.clear()
+        with pytest.raises(SystemExit):
+            rank_watch.RankWatch(rank, 3, store, store)._watch()
+        assert unwatched == waits
+
+
+def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, monkeypatch, capsys):
+    """Its process, rank 0, was killed, and no rank can ask the others; rank 3 is on another machine."""
+    store, gone = Store(), subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    watches = [rank_watch.RankWatch(rank, 4, store, store) for rank in range(4)]
+    store.set("beat/0", f"1|{gone.pid}|{watches[0].here}")
+    store.set("beat/3", f"1|{os.getpid()}|another machine")
+    watches[3].here = "another machine"
+    for watch in watches[1:]:
+        for other in range(4):
+            watch.is_lost(other)
+
+    def broken(*_):
+        raise RuntimeError("Connection reset by peer")
+
+    monkeypatch.setattr(Store, "add", broken)
+    for watch, printed in zip(watches[1:], (1, 0, 1), strict=True):
+        unwatched.clear()
+        watch.fail("warpgs: rank 0 is gone")
+        assert len(capsys.readouterr().err.splitlines()) == printed
+        assert len(unwatched) == printed  # it stays while the others look for it
+
+
 def test_a_machine_has_a_name_on_every_system(monkeypatch):
     """Where there is no /proc it is that of the computer."""
 
