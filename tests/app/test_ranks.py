@@ -12,6 +12,7 @@ import pytest
 from tests.app import rank_that_dies
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
+from warpgs.pipeline.runs.fit import fit
 from warpgs.report import progress
 from warpgs.runtime import rank_watch, ranks
 from warpgs.runtime.listening import is_loopback, loopback_interface
@@ -178,6 +179,48 @@ def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, m
         watch.fail("warpgs: rank 0 is gone")
         assert len(capsys.readouterr().err.splitlines()) == printed
         assert len(unwatched) == printed  # it stays while the others look for it
+
+
+def test_all_ranks_read_the_texts_of_all(unwatched):
+    store = Store()
+    watches = [rank_watch.RankWatch(rank, 3, store, store) for rank in range(3)]
+    for rank in (1, 2):
+        store.set(f"text/{rank}", f"of {rank}")
+    assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
+
+
+class Two(ranks.Ranks):
+    """The first of two ranks; the other has changed one entry."""
+
+    count = 2
+
+    def __init__(self, changed: str):
+        self.changed = changed
+
+    def texts(self, own: str) -> list[str]:
+        return [own, json.dumps(json.loads(own) | {self.changed: "of the other"})]
+
+
+@pytest.mark.parametrize(
+    "changed", ["another version of warpgs", "another scene", "another split", "other settings", "another checkpoint"]
+)
+def test_ranks_that_do_not_fit_the_same_are_refused(tmp_path, changed):
+    """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    with pytest.raises(UsageError, match=f"rank 1 has {changed} than rank 0: "):
+        fit(tmp_path / "scene", out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_the_error_of_a_rank_is_printed_whole(monkeypatch):
+    """Signals are ignored meanwhile: torchrun sends SIGTERM to all once one has ended."""
+    handlers = []
+    watch = type("Watch", (), {"fail": lambda self, line: handlers.append(signal.getsignal(signal.SIGTERM))})()
+    monkeypatch.setattr(ranks, "_joined", ranks.Group(0, 2, "gloo", watch))
+    monkeypatch.setattr(ranks.os, "_exit", sys.exit)
+    with pytest.raises(SystemExit):
+        ranks.last_words("warpgs: no", 2)
+    assert handlers == [signal.SIG_IGN]
 
 
 def test_a_machine_has_a_name_on_every_system(monkeypatch):

@@ -83,6 +83,14 @@ class RankWatch:
                 )
             time.sleep(0.05)
 
+    def texts(self, own: str) -> list[str]:
+        """Return the text that each process gives here, once all have; the thread ends this process if one is lost."""
+        names = [f"text/{r}" for r in range(self.count)]
+        self.store.set(names[self.rank], own)
+        while not self.store.check(names):
+            time.sleep(0.05)
+        return [self.store.get(name).decode() for name in names]
+
     def _watch(self) -> None:
         """Give signs of life and look for those of the others, until this process ends."""
         number = 0
