@@ -12,6 +12,7 @@ import pytest
 from tests.app import rank_that_dies
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
+from warpgs.pipeline.runs.fit import fit
 from warpgs.report import progress
 from warpgs.runtime import rank_watch, ranks
 from warpgs.runtime.listening import is_loopback, loopback_interface
@@ -134,6 +135,92 @@ def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys)
     assert capsys.readouterr().err.splitlines() == ["warpgs: rank 2 is gone"]
     store.set("left/2", "")
     assert not first.is_lost(2)
+
+
+@pytest.fixture
+def unwatched(monkeypatch):
+    """Watches without a thread, and no time passes; returns the times [s] that they would have slept."""
+    slept = []
+    monkeypatch.setattr(rank_watch.time, "sleep", slept.append)
+    monkeypatch.setattr(rank_watch.threading.Thread, "start", lambda self: None)
+    return slept
+
+
+def test_the_first_rank_keeps_the_store_until_all_have_read_the_error(unwatched, monkeypatch):
+    """Another rank has printed why all end. Without the store, a third one would print that rank 0 is gone."""
+    monkeypatch.setattr(rank_watch, "BEAT_SECONDS", 0.001)
+    monkeypatch.setattr(rank_watch.os, "_exit", sys.exit)
+    store = Store(spoke=1)
+    for rank, waits in ((0, [3 * 0.001]), (1, [])):
+        unwatched.clear()
+        with pytest.raises(SystemExit):
+            rank_watch.RankWatch(rank, 3, store, store)._watch()
+        assert unwatched == waits
+
+
+def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, monkeypatch, capsys):
+    """Its process, rank 0, was killed, and no rank can ask the others; rank 3 is on another machine."""
+    store, gone = Store(), subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    watches = [rank_watch.RankWatch(rank, 4, store, store) for rank in range(4)]
+    store.set("beat/0", f"1|{gone.pid}|{watches[0].here}")
+    store.set("beat/3", f"1|{os.getpid()}|another machine")
+    watches[3].here = "another machine"
+    for watch in watches[1:]:
+        for other in range(4):
+            watch.is_lost(other)
+
+    def broken(*_):
+        raise RuntimeError("Connection reset by peer")
+
+    monkeypatch.setattr(Store, "add", broken)
+    for watch, printed in zip(watches[1:], (1, 0, 1), strict=True):
+        unwatched.clear()
+        watch.fail("warpgs: rank 0 is gone")
+        assert len(capsys.readouterr().err.splitlines()) == printed
+        assert len(unwatched) == printed  # it stays while the others look for it
+
+
+def test_all_ranks_read_the_texts_of_all(unwatched):
+    store = Store()
+    watches = [rank_watch.RankWatch(rank, 3, store, store) for rank in range(3)]
+    for rank in (1, 2):
+        store.set(f"text/{rank}", f"of {rank}")
+    assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
+
+
+class Two(ranks.Ranks):
+    """The first of two ranks; the other has changed one entry."""
+
+    count = 2
+
+    def __init__(self, changed: str):
+        self.changed = changed
+
+    def texts(self, own: str) -> list[str]:
+        return [own, json.dumps(json.loads(own) | {self.changed: "of the other"})]
+
+
+@pytest.mark.parametrize(
+    "changed", ["another version of warpgs", "another scene", "another split", "other settings", "another checkpoint"]
+)
+def test_ranks_that_do_not_fit_the_same_are_refused(tmp_path, changed):
+    """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""
+    write_demo(tmp_path / "scene", views=8, width=48, height=36)
+    with pytest.raises(UsageError, match=f"rank 1 has {changed} than rank 0: "):
+        fit(tmp_path / "scene", out=tmp_path / "run", device="cpu", steps=1, batch=2, ranks=Two(changed), verbose=False)
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_the_error_of_a_rank_is_printed_whole(monkeypatch):
+    """Signals are ignored meanwhile: torchrun sends SIGTERM to all once one has ended."""
+    handlers = []
+    watch = type("Watch", (), {"fail": lambda self, line: handlers.append(signal.getsignal(signal.SIGTERM))})()
+    monkeypatch.setattr(ranks, "_joined", ranks.Group(0, 2, "gloo", watch))
+    monkeypatch.setattr(ranks.os, "_exit", sys.exit)
+    with pytest.raises(SystemExit):
+        ranks.last_words("warpgs: no", 2)
+    assert handlers == [signal.SIG_IGN]
 
 
 def test_a_machine_has_a_name_on_every_system(monkeypatch):

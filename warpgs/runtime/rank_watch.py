@@ -83,6 +83,14 @@ class RankWatch:
                 )
             time.sleep(0.05)
 
+    def texts(self, own: str) -> list[str]:
+        """Return the text that each process gives here, once all have; the thread ends this process if one is lost."""
+        names = [f"text/{r}" for r in range(self.count)]
+        self.store.set(names[self.rank], own)
+        while not self.store.check(names):
+            time.sleep(0.05)
+        return [self.store.get(name).decode() for name in names]
+
     def _watch(self) -> None:
         """Give signs of life and look for those of the others, until this process ends."""
         number = 0
@@ -91,6 +99,7 @@ class RankWatch:
             try:
                 self._beat(number)
                 if self._own.check(["spoke"]):  # another rank has reported the error
+                    self._keep_store()
                     os._exit(ResourceError.exit_code)
                 lost = next((r for r in range(self.count) if r != self.rank and self.is_lost(r)), None)
             except RuntimeError:  # the store is gone, and with it the process that held it
@@ -121,13 +130,24 @@ class RankWatch:
             return
         self.leaving.set()
         try:
-            first = self.store.add("spoke", 1) == 1
-        except RuntimeError:  # no other process can be asked
-            first = True
+            first, gone = self.store.add("spoke", 1) == 1, False
+        except RuntimeError:  # the store is gone: no other process can be asked
+            first = gone = self._is_lowest_here()
         if first:
             say(line, error=True)
+        if gone and self.rank != 0:
+            time.sleep(3 * BEAT_SECONDS)  # the others on this machine do not report it while they see this process
+        self._keep_store()
+
+    def _keep_store(self) -> None:
+        """Wait, as rank 0, until the others have read that the fit ends: the store may end with this process."""
         if self.rank == 0:
-            time.sleep(3 * BEAT_SECONDS)  # the store, through which the other ranks learn of it, may end with this process
+            time.sleep(3 * BEAT_SECONDS)
+
+    def _is_lowest_here(self) -> bool:
+        """Return whether no rank below this one still runs on this machine."""
+        below = (self._seen[r][0].split("|", 2) for r in range(self.rank) if r in self._seen)
+        return all(there != self.here or is_gone(int(process)) for _, process, there in below)
 
     def settle(self, seconds: float) -> None:
         """Wait at most so long [s] for the thread to end this process, which it does once the lost rank is known."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from warpgs.errors import ResourceError, UsageError
 from warpgs.runtime.listening import listening_at, loopback_interface, loopback_of, loopback_socket, say_what_is_open
 from warpgs.runtime.rank_watch import LOST_SECONDS, RankWatch
+from warpgs.runtime.stop_signals import ignored_signals
 from warpgs.runtime.terminal import say
 
 if TYPE_CHECKING:
@@ -59,6 +60,10 @@ class Ranks:
             ResourceError: A process is gone.
         """
         found.copy_(own)
+
+    def texts(self, own: str) -> list[str]:
+        """Return the text that each process gives here, in the order of ranks; all call this once."""
+        return [own]
 
     def part(self) -> None:
         """End all exchange, once all processes have done the same steps."""
@@ -108,6 +113,11 @@ class Group(Ranks):
                 f"rank {self.rank} of {self.count} cannot exchange numbers with the others ({str(e).splitlines()[0][:200]}); "
                 "--resume continues from the last checkpoint"
             ) from e
+
+    def texts(self, own):
+        """Return the text that each process gives here."""
+        with self._watched():
+            return self.watch.texts(own)
 
     def part(self):
         """End all exchange."""
@@ -238,7 +248,8 @@ def last_words(line: str, code: int) -> int:
         if place_or_first()[0] == 0:
             say(line, error=True)
         return code
-    _joined.watch.fail(line)
+    with ignored_signals():  # torchrun ends the others once one has ended
+        _joined.watch.fail(line)
     sys.stdout.flush()
     os._exit(code)  # a broken group may wait for ever
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from pathlib import Path
+from typing import Any
 
 from warpgs.errors import UsageError
 from warpgs.pipeline.runs.request import SceneRequest
@@ -42,6 +45,34 @@ def check_batched(
         raise UsageError(
             f"--time-budget measures the speed of one process, and {ranks.count} would choose different steps: give --steps"
         )
+
+
+def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
+    """Check that all processes fit the same scene with the same settings: each takes its own part of the same steps.
+
+    Args:
+        record: Record of the run, as this process has it.
+        step: Step of the checkpoint to continue from; None without one.
+        ranks: The processes.
+
+    Raises:
+        UsageError: One of them differs from the first, in every process.
+    """
+    if ranks.count == 1:
+        return
+    parts = {
+        "another version of warpgs": (record["versions"]["warpgs"], "install the same version everywhere"),
+        "another scene": (record["fingerprint"], "give all ranks the same files and options for reading"),
+        "another split": ([record["train"], record["test"]], "give all ranks the same --split"),
+        "other settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
+        "another checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
+    }
+    own = {name: hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest() for name, (value, _) in parts.items()}
+    first, *others = map(json.loads, ranks.texts(json.dumps(own)))
+    for rank, other in enumerate(others, 1):
+        for name, (_, fix) in parts.items():
+            if other.get(name) != first.get(name):
+                raise UsageError(f"rank {rank} has {name} than rank 0: {fix}")
 
 
 def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:

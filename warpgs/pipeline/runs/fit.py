@@ -22,7 +22,7 @@ from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
 from warpgs.pipeline.model.compress import drop_unused_sh
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.model.scale_limits import shape_figures, shape_summary
-from warpgs.pipeline.runs.batched import batched_notes, check_batched
+from warpgs.pipeline.runs.batched import batched_notes, check_batched, check_equal
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
 from warpgs.pipeline.runs.coverage_report import coverage_of_run
 from warpgs.pipeline.runs.fit_steps import model_fields, take_steps, tell
@@ -233,6 +233,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
             check_checkpoint(state[1], stored, resumed)
+    check_equal(record, None if state is None else state[1].get("step"), job.ranks)
     c = job.config
     with background_warmup(c, job.device) as ready:
         if job.other_models:
