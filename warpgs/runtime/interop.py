@@ -348,8 +348,9 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
 
     working: list[Future[None]] = []
     try:
-        for _ in range(min(threads, chunks)):
-            working.append(_pool(threads, os.getpid()).submit(run))
+        for _ in range(min(threads, chunks) - 1):
+            working.append(_pool(threads - 1, os.getpid()).submit(run))
+        run()  # here, too: each hand-over costs processor time
         for work in working:
             work.result()
     except BaseException:  # on an interrupt, too, since the caller frees memory that the threads use
