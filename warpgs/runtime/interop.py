@@ -44,7 +44,7 @@ FEW_THREADS = 4
 """Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
 
 SERIAL_WORK = 20_000
-"""Work (items times cost) below which a launch stays on the calling thread: a hand-over costs about 50 us."""
+"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. Ranges take half of it or more."""
 
 MAX_SIZE = 2**31 - 1
 """Largest number of entries of an axis, and of items of a launch: Warp numbers them in signed 32 bits."""
@@ -292,8 +292,7 @@ _OF_THREAD = _OfThread()
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
 
-    On a CPU the items are cut into ranges over torch's number of threads. That is safe and repeatable because every
-    kernel here writes to memory that its item alone owns.
+    On a CPU, torch's number of threads share ranges of the items. This repeats, since an item writes to memory of its own.
 
     Args:
         kernel: Warp kernel whose item number is ``begin + wp.tid()``.
@@ -333,13 +332,13 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         first.launch()
         return
     warn_if_spinning()
-    chunks = min(count, threads * (CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2))
+    each = CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2
+    chunks = min(count, threads * each, max(threads, 2 * count * cost // SERIAL_WORK))
     left = iter(range(chunks))  # each thread processes the next range after finishing one
 
     def run() -> None:
         # a recorded launch of its own for each thread, which shares the packed arrays
-        bounds = type(first.bounds)((count,))
-        begin = type(first.params[1])(0)
+        bounds, begin = type(first.bounds)((count,)), type(first.params[1])(0)
         command = wp.Launch(kernel, first.device, hooks=first.hooks, params=[bounds, begin, *first.params[2:]], bounds=bounds)
         for i in left:
             begin.value, end = count * i // chunks, count * (i + 1) // chunks
@@ -348,8 +347,9 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
 
     working: list[Future[None]] = []
     try:
-        for _ in range(min(threads, chunks)):
-            working.append(_pool(threads, os.getpid()).submit(run))
+        for _ in range(min(threads, chunks) - 1):
+            working.append(_pool(threads - 1, os.getpid()).submit(run))
+        run()  # here, too: each hand-over costs processor time
         for work in working:
             work.result()
     except BaseException:  # on an interrupt, too, since the caller frees memory that the threads use
