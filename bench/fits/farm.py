@@ -32,6 +32,7 @@ from warpgs.pipeline.farm.run import EngineRequest, make_engine
 from warpgs.pipeline.runs.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.runtime.processor import usable_cores
 from warpgs.synthetic.demo import split_spec, write_demo
 
 VIEWS, WIDTH, HEIGHT = 8, 126, 94
@@ -160,8 +161,11 @@ def pack(scene: SceneRequest, config: FitConfig, out: Path, slots: list[Slot], f
     finally:
         engine.close()
     took = [s.seconds for s in statuses if s.state == "done"]
+    failures = [s.record.message if s.record else s.state for s in statuses if s.state != "done"]
+    if failures:
+        print(f"{len(failures)} of {count} fits failed, the first: {failures[0]}", file=sys.stderr)
     return {
-        "fits": len(took), "failed": count - len(took), "seconds": seconds, "fits_per_hour": 3600 * len(took) / seconds,
+        "fits": len(took), "failed": len(failures), "seconds": seconds, "fits_per_hour": 3600 * len(took) / seconds,
         "mean_seconds_of_a_fit": sum(took) / max(1, len(took)),
         "mean_psnr": sum(s.record.psnr or 0 for s in statuses if s.record) / count,
     }  # fmt: skip
@@ -177,7 +181,7 @@ def packing(a: Namespace, work: Path) -> Iterator[dict]:
     there, best, alone = torch.cuda.device_count(), 0, {}
 
     def measure(gpus: int, per_gpu: int) -> dict:
-        threads = max(1, torch.get_num_threads() // (gpus * per_gpu))
+        threads = max(1, usable_cores() // (gpus * per_gpu))
         slots = [Slot("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
         out = work / f"{gpus}x{per_gpu}"
         out.mkdir()

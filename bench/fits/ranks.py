@@ -2,10 +2,11 @@
 
 CASE is horns or garden. horns: PATH is a scene folder, split every:8, fitted from 112,000 random points; the set of Gaussians
 changes in the first half of the steps. garden: PATH is test_garden.npz; 2.8 million Gaussians on its points, 1920 x 1080 px, 8
-views, no growth. Started by `torchrun --nproc-per-node N -m bench.fits.ranks`. The time of a step is that of the last third,
-each step waited for. A row is put into --out, in place of one of the same case, batch, steps and ranks; `same_model` says
-whether all rows of a case have one SHA-256 of parameters, moments and statistics. Time in collectives is that of the first
-rank, between events around them: it has in it the wait for slower ranks.
+views, no growth. Started by `torchrun --nproc-per-node N -m bench.fits.ranks`. Steps are taken in series of 10, as a fit does;
+the time of a step is the median over the series in the last half. A row is put into --out, in place of one of the same case,
+batch, steps and ranks; `same_model` says whether all rows of a case have one SHA-256 of parameters, moments and statistics.
+Time in collectives is that of the first rank, between events around them: it has in it the wait for slower ranks, and part
+overlaps with the update.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.inputs import garden_inputs
 from bench.lib.same_bits import digest
-from bench.lib.training import Trainer, make_trainer, one_step, set_gaussians, state_tensors
+from bench.lib.training import Trainer, make_trainer, set_gaussians, state_tensors
 from warpgs import load_scene
 from warpgs.io.splits import split_views
 from warpgs.pipeline.model.init import InitConfig
@@ -35,6 +36,8 @@ from warpgs.render.rasterize import rasterize
 from warpgs.runtime.ranks import Ranks, join
 from warpgs.scene import Camera, PointCloud, View
 
+SERIES = 10
+"""Steps between two times that are read."""
 WHAT = "steps of several views on several GPUs: time, time in collectives, memory, and the SHA-256 of the model"
 POINTS = 112_000
 """Random points at the start of horns, as many as a fit of it has Gaussians."""
@@ -121,17 +124,18 @@ def measured(trainer: Trainer, ranks: Ranks, steps: int) -> dict:
         clocked(ranks, clock)
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
-    for number in range(steps):
-        began = time.perf_counter()
-        one_step(trainer)
+    while trainer.step < steps:
+        began, before = time.perf_counter(), trainer.step
+        while trainer.step < min(before + SERIES, steps):
+            trainer.advance(min(before + SERIES, steps) - trainer.step)
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        spent = 1000 * (time.perf_counter() - began)
-        exchanged = clock.total()
-        if number >= steps - max(1, steps // 3):
+        taken = trainer.step - before
+        spent, exchanged = 1000 * (time.perf_counter() - began) / taken, clock.total() / taken
+        if before >= steps // 2 or trainer.step == steps:
             times.append(spent)
             exchanges.append(exchanged)
-    row = {"gaussians": len(trainer.table), "step_ms": round(statistics.median(times), 3), "timed_steps": len(times)}
+    row = {"gaussians": len(trainer.table), "step_ms": round(statistics.median(times), 3), "timed_series": len(times)}
     row |= {"least_step_ms": round(min(times), 3), "collectives_ms": round(statistics.median(exchanges), 3)}
     if device.type == "cuda":
         row["peak_torch_bytes"] = torch.cuda.max_memory_allocated(device)
@@ -157,7 +161,7 @@ def keep(path: Path | None, device: torch.device, row: dict) -> list[dict]:
 def main(arguments: list[str] | None = None) -> int:
     """Measure one case on the ranks that there are; return 1 where rows of a case are of different models."""
     a = parse(
-        __doc__, arguments, {"case": ("horns", "garden"), "path": str}, batch=8, steps=60, tiles=5, width=1920, height=1080,
+        __doc__, arguments, {"case": ("horns", "garden"), "path": str}, batch=8, steps=120, tiles=5, width=1920, height=1080,
         device="auto", out=Path,
     )  # fmt: skip
     ranks = join(a.device)

@@ -7,16 +7,18 @@ import pytest
 import torch
 
 from tests.pipeline.test_importance_sampling import CONFIG as METHOD
+from tests.pipeline.test_slots import by_threads
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError
 from warpgs.kernels.adam import scheduled_lrs
 from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.batch import BatchSteps
+from warpgs.pipeline.train.batch import BatchSteps, steps_at_once
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.slots import Tree
+from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.runtime.ranks import ALONE
@@ -32,9 +34,9 @@ def advanced(fit: Trainer, until: int) -> Trainer:
     return fit
 
 
-def same_bits(a: Trainer, b: Trainer) -> bool:
+def same_bits(a: Trainer, b: Trainer, but: tuple[str, ...] = ()) -> bool:
     mine, theirs = a.state()[0], b.state()[0]
-    return all(torch.equal(mine[n], theirs[n]) for n in mine)
+    return all(torch.equal(mine[n], theirs[n]) for n in mine if n not in but)
 
 
 def test_a_batch_of_one_view_is_a_step_of_one_view():
@@ -91,6 +93,52 @@ def test_a_loss_that_is_no_number_names_its_view_and_harms_nothing():
     order = list(reversed(fit.order))
     assert found.value.view == 1 and order[found.value.slot] == 1 and sorted(order) == [0, 1, 2] and fit.step == 0
     assert all(torch.equal(before[n], t) for n, t in fit.state()[0].items() if n in before)
+
+
+def in_series(fit: Trainer) -> Trainer:
+    """Have a fit take several steps before it reads their results, as on CUDA, but without graphs."""
+    fit.layout = dataclasses.replace(fit.layout, graphs=1)
+    fit.buffers = StepBuffers(CPU, fit.buffers.lr_rows.shape[1], MAX_STEPS)
+    fit.taker.batched = BatchSteps(fit.learned, fit.buffers, fit.context.render_options(), fit.taker.batched.tree)
+    return fit
+
+
+def test_several_steps_at_once_are_those_one_by_one():
+    """With dropout and growth: a series ends before a change of the set, and has the bits of single steps."""
+    density = DensityConfig(start=2, every=7, gradient=1e-5, reset_every=14)
+    config = dataclasses.replace(PLAIN, batch=5, dropout=0.3, density=density)
+    one, many = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(2))
+    taken = []
+    while many.step < 20:
+        taken.append(len(in_series(many).advance(100)))
+    losses = [fit.buffers.history.isfinite().all() for fit in (one, many)]
+    assert max(taken) == 7 and len(many.table) > 61 and all(losses) and same_bits(advanced(one, 20), many)
+    assert [steps_at_once(b, n) for b, n in ((1, 500), (8, 500), (8, 3), (200, 500))] == [100, 12, 3, 1]
+
+
+def test_a_loss_that_is_no_number_ends_a_series_before_its_step():
+    """The photograph without numbers is in step 3 of 10: two steps are taken, and the views of the others come again."""
+    views = photos(9)
+    views[4] = View("bad", views[4].camera, np.full_like(views[4].image, np.nan))
+    config = dataclasses.replace(PLAIN, batch=2, steps=10)
+    one, many = (Trainer(views, seeds(), config, CPU) for _ in range(2))
+    for fit in (one, in_series(many)):
+        fit.order = [8, 7, 6, 4, 5, 3, 2, 1, 0]
+    with pytest.raises(NotFiniteError, match="became nan at step 3") as found:
+        many.advance(100)
+    assert found.value.view == 4 and found.value.slot == 1 and many.step == 2
+    assert many.order[-5:] == [8, 7, 6, 4, 5] and same_bits(advanced(one, 2), many, ("generator",))
+
+
+def test_ranks_that_update_by_pieces_have_the_bits_of_one(monkeypatch):
+    """The coefficients arrive in several pieces, each of which is updated by itself; the set of Gaussians grows meanwhile."""
+    monkeypatch.setattr("warpgs.pipeline.train.slots.PIECE_BYTES", 4000)
+    density = DensityConfig(start=2, every=4, gradient=1e-5, reset_every=8)
+    config = dataclasses.replace(PLAIN, steps=10, batch=5, dropout=0.3, sh_degree=2, density=density)
+    alone = advanced(Trainer(photos(3), seeds(61), config, CPU), 10)
+    for count in (2, 3):
+        fits = by_threads(lambda ranks: advanced(Trainer(photos(3), seeds(61), config, CPU, ranks=ranks), 10), count)
+        assert len(fits[0].taker.batched.sums.pieces) > 1 and all(same_bits(alone, fit) for fit in fits)
 
 
 def test_a_batch_costs_memory_and_on_a_cpu_steps():

@@ -1,6 +1,7 @@
 """Sums over slots: one order for any number of processes."""
 
 import threading
+from collections.abc import Callable
 
 import pytest
 import torch
@@ -32,9 +33,9 @@ class Thread(Ranks):
         found.copy_(torch.cat(self._put(own)))
 
 
-def summed(slots: list[list[torch.Tensor]], ranks: Ranks) -> list[torch.Tensor]:
+def summed(slots: list[list[torch.Tensor]], ranks: Ranks, means: int = 0) -> list[torch.Tensor]:
     """The sums of the tensors of slots, as one process gets them."""
-    sums = SlotSums(Tree(len(slots), ranks), SHAPES, torch.device("cpu"))
+    sums = SlotSums(Tree(len(slots), ranks), [tuple(t.shape) for t in slots[0]], torch.device("cpu"), means=means, large=1)
 
     def add(slot, parts, adds):
         for part, value in zip(parts, slots[slot], strict=True):
@@ -43,14 +44,14 @@ def summed(slots: list[list[torch.Tensor]], ranks: Ranks) -> list[torch.Tensor]:
     return [part.clone() for part in sums.add_up(add)]
 
 
-def by_threads(slots: list[list[torch.Tensor]], count: int) -> list[list[torch.Tensor]]:
-    """What each of several processes gets."""
+def by_threads(work: Callable[[Ranks], object], count: int) -> list:
+    """What each of several processes gets from its work."""
     desk, barrier, found = [None] * count, threading.Barrier(count), [None] * count
 
-    def work(rank: int) -> None:
-        found[rank] = summed(slots, Thread(rank, count, desk, barrier))
+    def run(rank: int) -> None:
+        found[rank] = work(Thread(rank, count, desk, barrier))
 
-    threads = [threading.Thread(target=work, args=(rank,)) for rank in range(count)]
+    threads = [threading.Thread(target=run, args=(rank,)) for rank in range(count)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -68,7 +69,22 @@ def test_any_number_of_processes_gets_the_same_bits(batch):
         exact = torch.stack(values).double()
         assert ((part - exact.sum(0)).abs() <= 2**-23 * batch.bit_length() * exact.abs().sum(0)).all()
     for count in range(2, min(batch, 6) + 1):
-        for found in by_threads(slots, count):
+        for found in by_threads(lambda ranks: summed(slots, ranks), count):
+            assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
+
+
+def test_a_large_tensor_arrives_in_pieces_and_means_are_sums_over_slots(monkeypatch):
+    """Each piece holds runs of its rows; a tensor that becomes a mean is divided by the slots, and no other."""
+    monkeypatch.setattr("warpgs.pipeline.train.slots.PIECE_BYTES", 2000)
+    random = torch.Generator().manual_seed(0)
+    slots = [[torch.randn(s, generator=random) for s in ((7, 3), (501, 4), (5,))] for _ in range(6)]
+    alone, sums = summed(slots, ALONE, means=2), summed(slots, ALONE)
+    assert all(torch.equal(a, b * (1 / 6 if k < 2 else 1)) for k, (a, b) in enumerate(zip(alone, sums, strict=True)))
+    tree = Tree(6, Thread(0, 3, [], threading.Barrier(1)))
+    pieces = SlotSums(tree, [t.shape for t in slots[0]], torch.device("cpu"), large=1).pieces
+    assert len(pieces) == 4 and [i for p in pieces for i in range(501)[p]] == list(range(501))
+    for count in (2, 3):
+        for found in by_threads(lambda ranks: summed(slots, ranks, means=2), count):
             assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
 
 

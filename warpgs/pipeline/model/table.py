@@ -130,21 +130,26 @@ class Table:
 
     @torch.no_grad()
     def adam_step(
-        self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor, factors: torch.Tensor | None = None
-    ) -> None:
-        """Update all parameters, unless ``skip`` [1] is not 0.
+        self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor,
+        factors: torch.Tensor | None = None, rows: slice = slice(None),
+    ) -> None:  # fmt: skip
+        """Update parameters, unless ``skip`` [1] is not 0.
 
         Args:
-            gradients: Gradient of each parameter, in the order of the table.
+            gradients: Gradients of all or some parameters by name.
             lrs: A row of `lr_row`, float32, shape [3 P].
             skip: 0, or the reason for skipping the step, int32, shape [1].
             factors: Fraction of its step that each mean takes, shape [N]; None for 1. It scales the step, because Adam's step
-                does not depend on the scale of the gradient.
+                does not depend on the scale of the gradient. All rows are updated then.
+            rows: Rows to update.
         """
         before = None if factors is None else self.params["means"].detach().clone()
-        for i, (name, gradient) in enumerate(gradients.items()):
-            state = (self.params[name].detach(), gradient, self.exp_avg[name], self.exp_avg_sq[name])
-            adam_scheduled(*state, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0, betas=self.betas)
+        for i, name in enumerate(self.params):
+            if name not in gradients:
+                continue
+            state = (self.params[name].detach(), gradients[name], self.exp_avg[name], self.exp_avg_sq[name])
+            of_rows = (t[rows] for t in state)
+            adam_scheduled(*of_rows, lrs[3 * i : 3 * i + 3], skip, head=3 if name == "sh" else 0, betas=self.betas)
         if factors is not None:
             means = self.params["means"].detach()
             means.copy_(torch.where(factors[:, None] == 1, means, before + factors[:, None] * (means - before)))

@@ -1,25 +1,29 @@
 """Steps of several views: each view has a slot for its gradients; these are averaged in a fixed order, for one update.
 
-Slots are spread over the processes of a fit. Every process does the remaining work of a step, with the same bits.
+Slots are spread over the processes of a fit. Every process does the remaining work of a step, with the same bits. On CUDA
+several steps are taken before their results are read, so that Python prepares a step while the device works on the one before.
 """
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 
-from warpgs.kernels.step_buffers import NOT_FINITE, end_step
+from warpgs.kernels.step_buffers import end_step
 from warpgs.pipeline.train.slots import SlotSums, Tree
 from warpgs.pipeline.train.step import (
+    MAX_STEPS,
     Learned,
     StepBuffers,
     StepGraphs,
     StepPlan,
     ViewGradients,
+    descend,
     eager_renderer,
-    update,
+    settle,
     view_gradients,
 )
 from warpgs.pipeline.train.views import Kind, ViewStack
@@ -31,28 +35,65 @@ STOP, FLAGS = 2, 3
 first of the slots' reasons to stop the step."""
 
 
-def update_by_sums(
-    learned: Learned, plan: StepPlan, parts: list[torch.Tensor], names: Sequence[str], buffers: StepBuffers, batch: int
-) -> None:
-    """Update all parameters and columns by sums over slots; nothing changes where a slot stops the step.
+def steps_at_once(batch: int, limit: int) -> int:
+    """Return how many steps of ``batch`` views are taken before their results are read, at most ``limit``."""
+    return min(limit, max(1, MAX_STEPS // batch))
 
-    Args:
-        learned: Tables and strategy that the step changes.
-        plan: Choices that the step is made of.
-        parts: Sums of gradients, of statistics, and of the slots' reasons to stop, in their shapes [...]; the first become
-            means.
-        names: Names of the statistics.
-        buffers: Settings of the step, and its result.
-        batch: Number of slots B.
-    """
-    said, split = parts[-1], len(parts) - 1 - len(names)
-    for gradient in parts[:split]:
-        gradient.mul_(1 / batch)
-    buffers.stop.copy_(said[FLAGS:].max())
-    going = end_step(said[0] / batch, said[1] / batch, buffers.counter, buffers.stop, buffers.history)
-    statistics = {n: torch.where(going, t, 0) for n, t in zip(names, parts[split:-1], strict=True)}
-    found = ViewGradients(parts[:split], statistics, buffers.lr_rows[0], buffers.setting_rows[0], going)
-    update(learned, plan, found, buffers.stop)
+
+class SumUpdate:
+    """The update of a step by sums over its slots, in parts: one for each piece that processes exchange."""
+
+    def __init__(
+        self, learned: Learned, plan: StepPlan, buffers: StepBuffers, sums: SlotSums, names: Sequence[str], large: str,
+        said: torch.Tensor,
+    ):  # fmt: skip
+        """Keep what the update is made of.
+
+        Args:
+            learned: Tables and strategy that the step changes.
+            plan: Choices that the step is made of.
+            buffers: Settings of the steps, and their results.
+            sums: Means of gradients, sums of statistics, and of what the slots say.
+            names: Names of the statistics.
+            large: Parameter that is exchanged in pieces.
+            said: What the slots said in the last step, or in the one that a slot stopped, [`FLAGS` + B]; the update sets it.
+        """
+        self.learned, self.plan, self.buffers, self.sums, self.names, self.large = learned, plan, buffers, sums, names, large
+        self.said = said
+        parts = sums.parts()
+        self.gradients, self.statistics = parts[: -1 - len(names)], parts[-1 - len(names) : -1]
+        self.lrs, self.settings = torch.zeros_like(buffers.lr_rows[0]), torch.zeros_like(buffers.setting_rows[0])
+        self.going = torch.zeros(1, dtype=torch.bool, device=buffers.device)
+
+    def parts(self) -> list[Callable[[], None]]:
+        """Return functions to call in turn, as the pieces arrive."""
+        names, pieces = list(self.learned.table.params), self.sums.pieces
+        if not pieces:
+            return [functools.partial(self._part, names, first=True, last=True)]
+        small = [n for n in names if n != self.large]
+        rows = [functools.partial(self._part, [self.large], piece, last=piece is pieces[-1]) for piece in pieces]
+        return [functools.partial(self._part, small, first=True), *rows]
+
+    @torch.no_grad()
+    def _part(self, names: list[str], rows: slice = slice(None), *, first: bool = False, last: bool = False) -> None:
+        """Update parameters; nothing changes from the step on that a slot stops."""
+        if first:
+            self._begin()
+        found = ViewGradients(self.gradients, {}, self.lrs, self.settings, self.going)
+        descend(self.learned, self.plan, found, self.buffers.stop, names, rows)
+        if last:
+            counted = zip(self.names, self.statistics, strict=True)
+            settle(self.learned, self.plan, replace(found, statistics={n: torch.where(self.going, t, 0) for n, t in counted}))
+
+    def _begin(self) -> None:
+        """Look whether a slot stops the step, count the step if not, and load its settings."""
+        b = self.buffers
+        self.said.copy_(torch.where(b.stop == 0, self.sums.parts()[-1], self.said))
+        b.stop.copy_(torch.maximum(b.stop, self.said[FLAGS:].max().int()))
+        self.lrs.copy_(b.lr_rows.index_select(0, b.counter)[0])
+        self.settings.copy_(b.setting_rows.index_select(0, b.counter)[0])
+        loss, mse = self.said[:STOP] / self.sums.tree.batch
+        self.going.copy_(end_step(loss, mse, b.counter, b.stop, b.history))
 
 
 class BatchSteps:
@@ -68,8 +109,10 @@ class BatchSteps:
             tree: The slots and their order.
         """
         self.learned, self.buffers, self.tree, self.options = learned, buffers, tree, options
-        self.slots = StepBuffers(buffers.device, 1, len(tree.slots))
-        """Settings and results of this process's slots."""
+        self.slots = StepBuffers(buffers.device, 1, len(tree.slots) * steps_at_once(tree.batch, MAX_STEPS))
+        """Settings and results of this process's slots, step by step."""
+        self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device)
+        """Sums of what the slots said in the last step, or in the one that a slot stopped."""
         self.told_to_stop = False
         """True if this process was asked to stop; the next step tells all others."""
         self.sums: SlotSums | None = None
@@ -78,7 +121,7 @@ class BatchSteps:
         if buffers.device.type == "cuda":
             self._graphs = StepGraphs(learned, self.slots, options, view_gradients)
             self._updates = StepGraphs(learned, buffers, options)
-        self._update: tuple[StepPlan, CapturedGraph] | None = None
+        self._update: tuple[SumUpdate, list[Callable[[], object]]] | None = None
 
     def clear(self) -> None:
         """Drop all graphs, because the tensors that they refer to have changed."""
@@ -90,13 +133,13 @@ class BatchSteps:
         self, places: Sequence[tuple[Kind, int]], settings: Sequence[tuple[float, ...]], stacks: Mapping[Kind, ViewStack],
         plan: StepPlan, max_instances: int | None, *, captured: bool,
     ) -> None:  # fmt: skip
-        """Take the step of `buffers`, with its learning rates and settings.
+        """Take the steps of `buffers`, with their learning rates and settings.
 
         Args:
-            places: Kind and row of the view of each slot, of all processes.
+            places: Kind and row of the view of each slot, of all processes, step by step.
             settings: Settings of each slot, as `StepBuffers` takes them.
             stacks: Views by kind.
-            plan: Choices that the step is made of.
+            plan: Choices that the steps are made of.
             max_instances: Instances that a view may have at a time; None for no limit.
             captured: Whether CUDA graphs are used.
 
@@ -104,24 +147,28 @@ class BatchSteps:
             OverLimitError: The capacity of a graph would be above ``max_instances``; nothing was changed.
             ResourceError: The instances would not fit into memory, or another process is gone.
         """
-        own = self.tree.slots
-        self.slots.load([places[s][1] for s in own], [[1.0]] * len(own), [settings[s] for s in own])
-        works = self._works([places[s][0] for s in own], stacks, plan, max_instances, captured)
+        slots, batch = self.tree.slots, self.tree.batch
+        own = [i for i in range(len(places)) if i % batch in slots]
+        self.slots.load([places[i][1] for i in own], [[1.0]] * len(own), [settings[i] for i in own])
+        works = self._works([places[i][0] for i in own], stacks, plan, max_instances, captured)
+        update: list[Callable[[], object]] = []
+        for begin in range(0, len(own), len(slots)):  # a step each
+            first = [self._found(begin, works)]  # the strategy's statistics determine the sums
+            update = update or self._prepared(first[0], plan, captured)
 
-        def found_in(slot: int) -> ViewGradients:
-            self.slots.counter.fill_(slot - own.start)
-            self.slots.stop.zero_()
-            return works[slot - own.start]()
+            def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
+                place = begin + slot - slots.start  # noqa: B023
+                found = first.pop() if first else self._found(place, works)  # noqa: B023
+                self._add(slot, place, found, parts, adds)
 
-        first = [found_in(own.start)]  # the strategy's statistics determine the sums
-        finish = self._finish(first[0], plan, captured)
+            assert self.sums is not None
+            self.sums.add_up(add, update)
 
-        def add(slot: int, parts: list[torch.Tensor], adds: bool) -> None:
-            self._add(slot, first.pop() if first else found_in(slot), parts, adds)
-
-        assert self.sums is not None
-        self.sums.add_up(add)
-        finish()
+    def _found(self, place: int, works: Sequence[Callable[[], ViewGradients]]) -> ViewGradients:
+        """Return what a view contributes: ``place`` counts the own slots of all steps."""
+        self.slots.counter.fill_(place)
+        self.slots.stop.zero_()
+        return works[place]()
 
     def _works(
         self, kinds: list[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, captured: bool
@@ -133,40 +180,38 @@ class BatchSteps:
         return [functools.partial(view_gradients, self.learned, stacks[k], self.slots, plan, render) for k in kinds]
 
     @torch.no_grad()
-    def _add(self, slot: int, found: ViewGradients, parts: list[torch.Tensor], adds: bool) -> None:
-        """Add what a slot contributes to the parts of a sum, or overwrite them by it."""
-        said, place = parts[-1], slot - self.tree.slots.start
+    def _add(self, slot: int, place: int, found: ViewGradients, parts: list[torch.Tensor], adds: bool) -> None:
+        """Add what a slot contributes to the parts of a sum, or overwrite them by it; ``place`` is that of `_found`."""
+        said = parts[-1]
         if not adds:
             said.zero_()
         for part, value in zip(parts[:-1], (*found.gradients, *found.statistics.values()), strict=True):
             part.add_(value) if adds else part.copy_(value)
         said[:STOP] += self.slots.history[place]
         said[FLAGS + slot : FLAGS + slot + 1].copy_(self.slots.stop)
-        if self.told_to_stop and place == 0:
+        if self.told_to_stop and slot == self.tree.slots.start:
             said[STOP : STOP + 1].fill_(1.0)
 
-    def _finish(self, first: ViewGradients, plan: StepPlan, captured: bool) -> Callable[[], object]:
-        """Return the function that updates by the sums, which are of what ``first`` contributes."""
-        tensors = (*first.gradients, *first.statistics.values())
+    def _prepared(self, first: ViewGradients, plan: StepPlan, captured: bool) -> list[Callable[[], object]]:
+        """Return the functions that update by the sums, which are of what ``first`` contributes."""
+        table, tensors = self.learned.table, (*first.gradients, *first.statistics.values())
         shapes = [*(tuple(t.shape) for t in tensors), (FLAGS + self.tree.batch,)]
+        large = max(table.params, key=lambda n: table.params[n].numel())
         if self.sums is None or self.sums.shapes != shapes:
             self.sums = self._update = None
-            self.sums = SlotSums(self.tree, shapes, self.buffers.device)
-        parts = self.sums.parts()
-        work = functools.partial(
-            update_by_sums, self.learned, plan, parts, tuple(first.statistics), self.buffers, self.tree.batch
-        )
-        if not captured or self._updates is None:
-            return work
-        if self._update is None or self._update[0] != plan:
-            parts[-1].fill_(NOT_FINITE)  # runs before a capture change nothing
-            self._update = (plan, self._updates.capture(work))
-        return self._update[1].replay
+            place = list(table.params).index(large)
+            self.sums = SlotSums(self.tree, shapes, self.buffers.device, means=len(first.gradients), large=place)
+        if self._update is None or self._update[0].plan != plan:
+            update = SumUpdate(self.learned, plan, self.buffers, self.sums, tuple(first.statistics), large, self.said)
+            parts: list[Callable[[], object]] = list(update.parts())
+            if captured and self._updates is not None:
+                parts = [self._updates.capture(part).replay for part in parts]
+            self._update = (update, parts)
+        return self._update[1]
 
     def result(self) -> tuple[int, bool]:
-        """Return the first slot that stopped the step, 0 where none did, and whether a process was told to stop."""
-        assert self.sums is not None
-        said = self.sums.parts()[-1].tolist()
+        """Return the first slot that stopped the steps, 0 where none did, and whether a process was told to stop."""
+        said = self.said.tolist()
         return said.index(max(said[FLAGS:]), FLAGS) - FLAGS, said[STOP] > 0
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import torch
 
@@ -21,8 +22,8 @@ Node = tuple[int, int]
 """Slots of a subtree: the first, and the one behind the last."""
 ALIGNMENT = 16
 """Alignment of the parts of a sum, in floats: Adam reads four at a time."""
-
-
+PIECE_BYTES = 2**27
+"""Size of a piece of a sum that processes exchange: its transfer takes many times as long as the start of an exchange."""
 MAX_RENDERS = 2**24
 """Number of renders that a fit must stay below: it is a float32, from which each takes its random numbers."""
 
@@ -128,34 +129,56 @@ class Tree:
 
 
 class SlotSums:
-    """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum."""
+    """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum.
 
-    def __init__(self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device):
+    Processes exchange a large tensor in pieces, so that the update by one piece overlaps with the exchange of the next: first
+    all other tensors, then runs of its rows.
+    """
+
+    def __init__(self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device, *, means: int = 0, large: int = 0):
         """Allocate.
 
         Args:
             tree: The tree.
             shapes: Shape of each tensor.
             device: Where sums are kept.
+            means: Number of tensors, the first ones, whose sums become means over the slots.
+            large: Number of the tensor that is exchanged in pieces if it is large.
         """
         self.tree, self.shapes, self.device = tree, [tuple(s) for s in shapes], device
-        sizes = [-(-torch.Size(s).numel() // ALIGNMENT) * ALIGNMENT for s in self.shapes]
-        self.starts = [sum(sizes[:i]) for i in range(len(sizes))]
-        """Start of each tensor in a sum."""
-        unit = ALIGNMENT * tree.ranks.count
-        self.rows = torch.zeros(tree.rows, -(-sum(sizes) // unit) * unit, device=device)
+        counts, unit = [torch.Size(s).numel() for s in self.shapes], ALIGNMENT * tree.ranks.count
+        order = [*(k for k in range(len(counts)) if k != large), large]
+        ends = accumulate(-(-counts[k] // ALIGNMENT) * ALIGNMENT for k in order)
+        starts = dict(zip(order, [0, *ends], strict=False))
+        starts[large] = -(-starts[large] // unit) * unit
+        self.starts = [starts[k] for k in range(len(counts))]
+        """Start of each tensor in a sum; the large one is the last."""
+        self.rows = torch.zeros(tree.rows, starts[large] + -(-counts[large] // unit) * unit, device=device)
         """The sums, shape [R, L]."""
+        self.means = [(self.starts[k], self.starts[k] + counts[k]) for k in range(means)]
+        """Numbers of a sum that become means: the first of each tensor, and the one behind the last."""
+        count = self.shapes[large][0]
+        pieces = 1 if tree.ranks.count == 1 else max(1, round(counts[large] * self.rows.element_size() / PIECE_BYTES))
+        step = -(-count // (pieces * unit)) * unit
+        self.pieces = [slice(first, min(first + step, count)) for first in range(0, count, step)] if pieces > 1 else []
+        """Rows of the large tensor in all pieces but the first; none where one piece holds everything."""
+        inner = [starts[large] + piece.start * (counts[large] // count) for piece in self.pieces]
+        self._bounds = [0, *inner, self.rows.shape[1]]
+        self._side = torch.cuda.Stream(device) if device.type == "cuda" and tree.ranks.count > 1 else None
 
     def parts(self, row: int = 0) -> list[torch.Tensor]:
         """Return the tensors of a sum, parts of its memory, in their shapes [...]."""
         sized = zip(self.starts, self.shapes, strict=True)
         return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
 
-    def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
+    def add_up(
+        self, slot: Callable[[int, list[torch.Tensor], bool], None], arrived: Sequence[Callable[[], object]] = ()
+    ) -> list[torch.Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
 
         Args:
             slot: Function of a slot, the tensors of a sum, and whether it adds to them; else it overwrites them.
+            arrived: Functions that are called in turn: the first once the first piece is complete, and so on.
 
         Raises:
             ResourceError: Another process is gone.
@@ -163,8 +186,20 @@ class SlotSums:
         own = self.tree.nodes[self.tree.ranks.rank]
         for row, node in enumerate(own):
             self._add_node(node, row, slot)
-        if self.tree.ranks.count > 1:
-            self._exchange()
+        if self.tree.ranks.count == 1:
+            self._average(0, self.rows[0])
+            for work in arrived:
+                work()
+            return self.parts()
+        if self._side is not None:
+            self._side.wait_stream(torch.cuda.current_stream(self.device))
+        for k, (first, end) in enumerate(pairwise(self._bounds)):
+            with torch.cuda.stream(self._side):  # does nothing for None
+                self._exchange(first, end)
+            if self._side is not None:
+                torch.cuda.current_stream(self.device).wait_stream(self._side)
+            if arrived:
+                arrived[k]()
         return self.parts()
 
     def _add_node(self, node: Node, row: int, slot: Callable[[int, list[torch.Tensor], bool], None]) -> None:
@@ -180,11 +215,18 @@ class SlotSums:
             self._add_node(right, row + 1, slot)
             self.rows[row].add_(self.rows[row + 1])
 
-    def _exchange(self) -> None:
-        """Finish the tree: each process adds one slice of the numbers over all processes, and sends it to all."""
+    def _average(self, start: int, sums: torch.Tensor) -> None:
+        """Divide by the number of slots what becomes a mean among sums [S], which begin at ``start`` in a sum."""
+        for first, end in self.means:
+            sums[max(0, first - start) : max(0, end - start)].mul_(1 / self.tree.batch)
+
+    def _exchange(self, first: int, end: int) -> None:
+        """Finish the tree for a piece: each process adds one slice of it over all processes, and sends it to all."""
         tree, ranks = self.tree, self.tree.ranks
         count, width = ranks.count, tree.width
-        sent = self.rows[:width].view(width, count, -1).transpose(0, 1).contiguous()
+        sent = self.rows[:width, first:end].view(width, count, -1).transpose(0, 1).contiguous()
         received = ranks.to_each(sent)
         known = {node: received[r, k] for r, nodes in enumerate(tree.nodes) for k, node in enumerate(nodes)}
-        ranks.gather(finished((0, tree.batch), known), self.rows[0])
+        own = finished((0, tree.batch), known)
+        self._average(first + ranks.rank * len(own), own)
+        ranks.gather(own, self.rows[0, first:end])

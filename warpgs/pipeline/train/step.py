@@ -286,12 +286,39 @@ def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views:
 @torch.no_grad()
 def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor) -> None:
     """Update all parameters and columns; nothing changes where ``stop`` [1] is not 0, int32."""
+    descend(learned, plan, found, stop, list(learned.table.params))
+    settle(learned, plan, found)
+
+
+@torch.no_grad()
+def descend(
+    learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor, names: list[str], rows: slice = slice(None)
+) -> None:
+    """Update parameters by Adam; nothing changes where ``stop`` [1] is not 0, int32.
+
+    Args:
+        learned: Tables that the step changes.
+        plan: Choices that the step is made of.
+        found: Gradients and learning rates.
+        stop: Not 0 to change nothing, int32, shape [1].
+        names: Parameters of the Gaussians. With the means come the parameters of view modules.
+        rows: Gaussians to update.
+    """
+    table, views = learned.table, learned.views.table
+    split = 3 * len(table.params)
+    own, of_views = dict(zip(table.params, found.gradients)), found.gradients[len(table.params) :]
+    factors = learned.strategy.lr_factors(plan.phase) if "means" in names else None
+    table.adam_step({n: own[n] for n in names}, found.lrs[:split], stop, factors, rows)
+    if "means" in names:
+        views.adam_step(dict(zip(views.params, of_views)), found.lrs[split:], stop)
+
+
+@torch.no_grad()
+def settle(learned: Learned, plan: StepPlan, found: ViewGradients) -> None:
+    """Do what follows Adam: opacity decay, the strategy's own changes, limits, statistics."""
     table, strategy = learned.table, learned.strategy
-    count, split = len(table.params), 3 * len(table.params)
-    own, of_views = dict(zip(table.params, found.gradients)), found.gradients[count:]
-    table.adam_step(own, found.lrs[:split], stop, strategy.lr_factors(plan.phase))
-    learned.views.table.adam_step(dict(zip(learned.views.table.params, of_views)), found.lrs[split:], stop)
-    used = own["logit_opacities"] != 0 if plan.spares_unused else None
+    gradient = found.gradients[list(table.params).index("logit_opacities")]
+    used = gradient != 0 if plan.spares_unused else None
     decay_opacities(table.params["logit_opacities"].detach(), plan.opacity_decay, found.going, used)
     strategy.after_step(plan.phase, found.settings, found.going)
     plan.limits.hold(table.params, learned.cameras, found.going)

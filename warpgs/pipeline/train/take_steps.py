@@ -39,7 +39,7 @@ class StepTaker:
 
     @property
     def stopped_slot(self) -> int:
-        """First slot that stopped the last step; 0 where none did, and in steps of one view."""
+        """First slot that stopped the last steps; 0 where none did, and in steps of one view."""
         return 0 if self.batched is None else self.batched.result()[0]
 
     def clear(self) -> None:
@@ -55,8 +55,8 @@ class StepTaker:
         """Take the steps whose learning rates and settings the buffers hold.
 
         Args:
-            places: Kind and row of the view of each step, or of each slot of the one step of several views.
-            settings: Returns the settings of each slot.
+            places: Kind and row of the view of each step, or of each slot of each step of several views.
+            settings: Returns the settings of each slot, step by step.
             stacks: Views by kind.
             plan: Choices that the steps are made of.
             max_instances: Instances that a view may have at a time; None for no limit.
@@ -80,7 +80,7 @@ class StepTaker:
     def agreed(self, stopped: bool) -> bool:
         """Return whether to end after the last step, the same in all processes.
 
-        A request to one process reaches the others in its next step.
+        A request to one process reaches the others with its next steps.
         """
         if self.batched is None or self.ranks.count == 1:
             return stopped

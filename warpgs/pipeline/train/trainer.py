@@ -18,13 +18,14 @@ from warpgs.pipeline.model.init import Start, initial_gaussians, scene_extent
 from warpgs.pipeline.model.scale_limits import TrainingCameras, scene_radius
 from warpgs.pipeline.model.table import Table
 from warpgs.pipeline.train.background import random_shift
+from warpgs.pipeline.train.batch import steps_at_once
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.context import StrategyContext
 from warpgs.pipeline.train.learned_views import LearnedViews
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
-from warpgs.pipeline.train.step import CAPACITY_FACTOR, MAX_STEPS, Learned, OverLimitError, StepBuffers, StepPlan
+from warpgs.pipeline.train.step import CAPACITY_FACTOR, Learned, OverLimitError, StepBuffers, StepPlan
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.stored_state import check_state
@@ -235,12 +236,9 @@ class Trainer:
         """Take steps as `advance` does."""
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
-        if self.layout.graphs and self.taker.batched is None:
-            while (
-                count < min(limit, MAX_STEPS, self.steps - self.step)
-                and self.plan_of(first + count) == plan
-                and not self.is_due(first + count - 1)
-            ):
+        if self.layout.graphs:
+            most = min(steps_at_once(self.batch, limit), self.steps - self.step)
+            while count < most and self.plan_of(first + count) == plan and not self.is_due(first + count - 1):
                 count += 1
         chosen = [self.next_view() for _ in range(count * self.batch)]
         places = [self.places[i + plan.half_size * len(self.views)] for i in chosen]
@@ -249,7 +247,7 @@ class Trainer:
             [row for _, row in places[:count]], [self._lr_row(s) for s in steps], [self.settings(s) for s in steps]
         )
         self.chosen = chosen
-        if not self._take(places, plan):
+        if not self._take(places, steps, plan):
             self.order += reversed(chosen)
             return self._advance(1)
         self.chosen = None
@@ -259,7 +257,7 @@ class Trainer:
         if stop == NOT_FINITE:
             error = NotFiniteError(f"the loss became {history[done][0]} at step {self.step + 1}")
             error.slot = self.taker.stopped_slot
-            error.view = chosen[done + error.slot]
+            error.view = chosen[done * self.batch + error.slot]
             raise error
         if stop:
             self.taker.clear()  # they are captured again with more capacity
@@ -273,11 +271,11 @@ class Trainer:
             for k, (loss, mse) in enumerate(history[:done])
         ]
 
-    def _take(self, places: list[tuple[Kind, int]], plan: StepPlan) -> bool:
+    def _take(self, places: list[tuple[Kind, int]], steps: range, plan: StepPlan) -> bool:
         """Take steps with views at these places; return False, and take none, where graphs would need too much memory."""
         try:
             self.taker.take(
-                places, lambda: [self.settings(self.step + 1, slot) for slot in range(self.batch)],
+                places, lambda: [self.settings(step, slot) for step in steps for slot in range(self.batch)],
                 self.stacks, plan, self.context.max_instances, captured=self.layout.graphs > 0,
             )  # fmt: skip
         except OverLimitError as e:
