@@ -13,7 +13,7 @@ from warpgs.errors import NotFiniteError
 from warpgs.kernels.adam import scheduled_lrs
 from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.batch import BatchSteps, steps_at_once
+from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
@@ -113,7 +113,6 @@ def test_several_steps_at_once_are_those_one_by_one():
         taken.append(len(in_series(many).advance(100)))
     losses = [fit.buffers.history.isfinite().all() for fit in (one, many)]
     assert max(taken) == 7 and len(many.table) > 61 and all(losses) and same_bits(advanced(one, 20), many)
-    assert [steps_at_once(b, n) for b, n in ((1, 500), (8, 500), (8, 3), (200, 500))] == [100, 12, 3, 1]
 
 
 def test_a_loss_that_is_no_number_ends_a_series_before_its_step():
@@ -130,15 +129,15 @@ def test_a_loss_that_is_no_number_ends_a_series_before_its_step():
     assert many.order[-5:] == [8, 7, 6, 4, 5] and same_bits(advanced(one, 2), many, ("generator",))
 
 
-def test_ranks_that_update_by_pieces_have_the_bits_of_one(monkeypatch):
-    """The coefficients arrive in several pieces, each of which is updated by itself; the set of Gaussians grows meanwhile."""
-    monkeypatch.setattr("warpgs.pipeline.train.slots.PIECE_BYTES", 4000)
+def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
+    """Each updates rows of its own, and a few rows are left over; the set of Gaussians grows meanwhile."""
+    monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 4000)
     density = DensityConfig(start=2, every=4, gradient=1e-5, reset_every=8)
     config = dataclasses.replace(PLAIN, steps=10, batch=5, dropout=0.3, sh_degree=2, density=density)
     alone = advanced(Trainer(photos(3), seeds(61), config, CPU), 10)
     for count in (2, 3):
         fits = by_threads(lambda ranks: advanced(Trainer(photos(3), seeds(61), config, CPU, ranks=ranks), 10), count)
-        assert len(fits[0].taker.batched.sums.pieces) > 1 and all(same_bits(alone, fit) for fit in fits)
+        assert 0 < fits[0].taker.batched.sums.divided < len(alone.table) and all(same_bits(alone, fit) for fit in fits)
 
 
 def test_a_batch_costs_memory_and_on_a_cpu_steps():

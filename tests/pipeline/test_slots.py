@@ -41,7 +41,12 @@ def summed(slots: list[list[torch.Tensor]], ranks: Ranks, means: int = 0) -> lis
         for part, value in zip(parts, slots[slot], strict=True):
             part.add_(value) if adds else part.copy_(value)
 
-    return [part.clone() for part in sums.add_up(add)]
+    parts = sums.add_up(add)
+    if sums.divided:
+        assert sums.divided + 16 * ranks.count > len(parts[1])
+        sums.sum_own_rows()
+        sums.share(parts[1])
+    return [part.clone() for part in parts]
 
 
 def by_threads(work: Callable[[Ranks], object], count: int) -> list:
@@ -73,16 +78,13 @@ def test_any_number_of_processes_gets_the_same_bits(batch):
             assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))
 
 
-def test_a_large_tensor_arrives_in_pieces_and_means_are_sums_over_slots(monkeypatch):
-    """Each piece holds runs of its rows; a tensor that becomes a mean is divided by the slots, and no other."""
-    monkeypatch.setattr("warpgs.pipeline.train.slots.PIECE_BYTES", 2000)
+def test_rows_of_a_large_tensor_are_divided_and_means_are_sums_over_slots(monkeypatch):
+    """Each process has the sums of its own rows; a tensor that becomes a mean is divided by the slots, and no other."""
     random = torch.Generator().manual_seed(0)
     slots = [[torch.randn(s, generator=random) for s in ((7, 3), (501, 4), (5,))] for _ in range(6)]
     alone, sums = summed(slots, ALONE, means=2), summed(slots, ALONE)
     assert all(torch.equal(a, b * (1 / 6 if k < 2 else 1)) for k, (a, b) in enumerate(zip(alone, sums, strict=True)))
-    tree = Tree(6, Thread(0, 3, [], threading.Barrier(1)))
-    pieces = SlotSums(tree, [t.shape for t in slots[0]], torch.device("cpu"), large=1).pieces
-    assert len(pieces) == 4 and [i for p in pieces for i in range(501)[p]] == list(range(501))
+    monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 501 * 16)
     for count in (2, 3):
         for found in by_threads(lambda ranks: summed(slots, ranks, means=2), count):
             assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))

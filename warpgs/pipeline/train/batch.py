@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 
 import torch
 
@@ -35,13 +34,8 @@ STOP, FLAGS = 2, 3
 first of the slots' reasons to stop the step."""
 
 
-def steps_at_once(batch: int, limit: int) -> int:
-    """Return how many steps of ``batch`` views are taken before their results are read, at most ``limit``."""
-    return min(limit, max(1, MAX_STEPS // batch))
-
-
 class SumUpdate:
-    """The update of a step by sums over its slots, in parts: one for each piece that processes exchange."""
+    """The update of a step by sums over its slots."""
 
     def __init__(
         self, learned: Learned, plan: StepPlan, buffers: StepBuffers, sums: SlotSums, names: Sequence[str], large: str,
@@ -55,36 +49,43 @@ class SumUpdate:
             buffers: Settings of the steps, and their results.
             sums: Means of gradients, sums of statistics, and of what the slots say.
             names: Names of the statistics.
-            large: Parameter that is exchanged in pieces.
+            large: Parameter whose rows the sums may divide among processes.
             said: What the slots said in the last step, or in the one that a slot stopped, [`FLAGS` + B]; the update sets it.
         """
-        self.learned, self.plan, self.buffers, self.sums, self.names, self.large = learned, plan, buffers, sums, names, large
-        self.said = said
+        self.learned, self.plan, self.buffers, self.sums, self.large, self.said = learned, plan, buffers, sums, large, said
         parts = sums.parts()
-        self.gradients, self.statistics = parts[: -1 - len(names)], parts[-1 - len(names) : -1]
+        self.gradients, self.statistics = parts[: -1 - len(names)], dict(zip(names, parts[-1 - len(names) : -1], strict=True))
         self.lrs, self.settings = torch.zeros_like(buffers.lr_rows[0]), torch.zeros_like(buffers.setting_rows[0])
         self.going = torch.zeros(1, dtype=torch.bool, device=buffers.device)
 
-    def parts(self) -> list[Callable[[], None]]:
-        """Return functions to call in turn, as the pieces arrive."""
-        names, pieces = list(self.learned.table.params), self.sums.pieces
-        if not pieces:
-            return [functools.partial(self._part, names, first=True, last=True)]
-        small = [n for n in names if n != self.large]
-        rows = [functools.partial(self._part, [self.large], piece, last=piece is pieces[-1]) for piece in pieces]
-        return [functools.partial(self._part, small, first=True), *rows]
+    def functions(self, captured: Callable[[Callable[[], object]], Callable[[], object]]) -> list[Callable[[], object]]:
+        """Return functions that update, to call in turn; ``captured`` returns a function in the form to call it in."""
+        names = list(self.learned.table.params)
+        if not self.sums.divided:
+            return [captured(functools.partial(self._whole, names))]
+        coefficients, sums = self.learned.table.params[self.large].detach(), self.sums
+        return [
+            captured(functools.partial(self._common, [n for n in names if n != self.large])),
+            sums.sum_own_rows,
+            captured(functools.partial(self._descend, [self.large], sums.own_rows)),
+            functools.partial(sums.share, coefficients),
+            captured(self._settle),
+        ]
 
     @torch.no_grad()
-    def _part(self, names: list[str], rows: slice = slice(None), *, first: bool = False, last: bool = False) -> None:
-        """Update parameters; nothing changes from the step on that a slot stops."""
-        if first:
-            self._begin()
-        found = ViewGradients(self.gradients, {}, self.lrs, self.settings, self.going)
-        descend(self.learned, self.plan, found, self.buffers.stop, names, rows)
-        if last:
-            counted = zip(self.names, self.statistics, strict=True)
-            settle(self.learned, self.plan, replace(found, statistics={n: torch.where(self.going, t, 0) for n, t in counted}))
+    def _whole(self, names: list[str]) -> None:
+        self._begin()
+        self._descend(names)
+        self._settle()
 
+    @torch.no_grad()
+    def _common(self, names: list[str]) -> None:
+        """Update what every process updates: all rows of these parameters, and of the large one those that are not divided."""
+        self._begin()
+        self._descend(names)
+        self._descend([self.large], slice(self.sums.divided, None))
+
+    @torch.no_grad()
     def _begin(self) -> None:
         """Look whether a slot stops the step, count the step if not, and load its settings."""
         b = self.buffers
@@ -94,6 +95,21 @@ class SumUpdate:
         self.settings.copy_(b.setting_rows.index_select(0, b.counter)[0])
         loss, mse = self.said[:STOP] / self.sums.tree.batch
         self.going.copy_(end_step(loss, mse, b.counter, b.stop, b.history))
+
+    def _descend(self, names: list[str], rows: slice = slice(None)) -> None:
+        found = ViewGradients(self.gradients, {}, self.lrs, self.settings, self.going)
+        descend(self.learned, self.plan, found, self.buffers.stop, names, rows)
+
+    @torch.no_grad()
+    def _settle(self) -> None:
+        statistics = {n: torch.where(self.going, t, 0) for n, t in self.statistics.items()}
+        settle(self.learned, self.plan, ViewGradients(self.gradients, statistics, self.lrs, self.settings, self.going))
+
+    def complete(self) -> None:
+        """Give all processes the moments of divided rows, which only the one that updates them has."""
+        if self.sums.divided:
+            for moments in (self.learned.table.exp_avg, self.learned.table.exp_avg_sq):
+                self.sums.share(moments[self.large])
 
 
 class BatchSteps:
@@ -109,7 +125,7 @@ class BatchSteps:
             tree: The slots and their order.
         """
         self.learned, self.buffers, self.tree, self.options = learned, buffers, tree, options
-        self.slots = StepBuffers(buffers.device, 1, len(tree.slots) * steps_at_once(tree.batch, MAX_STEPS))
+        self.slots = StepBuffers(buffers.device, 1, MAX_STEPS * len(tree.slots))
         """Settings and results of this process's slots, step by step."""
         self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device)
         """Sums of what the slots said in the last step, or in the one that a slot stopped."""
@@ -162,7 +178,11 @@ class BatchSteps:
                 self._add(slot, place, found, parts, adds)
 
             assert self.sums is not None
-            self.sums.add_up(add, update)
+            self.sums.add_up(add)
+            for work in update:
+                work()
+        assert self._update is not None
+        self._update[0].complete()
 
     def _found(self, place: int, works: Sequence[Callable[[], ViewGradients]]) -> ViewGradients:
         """Return what a view contributes: ``place`` counts the own slots of all steps."""
@@ -202,11 +222,14 @@ class BatchSteps:
             place = list(table.params).index(large)
             self.sums = SlotSums(self.tree, shapes, self.buffers.device, means=len(first.gradients), large=place)
         if self._update is None or self._update[0].plan != plan:
-            update = SumUpdate(self.learned, plan, self.buffers, self.sums, tuple(first.statistics), large, self.said)
-            parts: list[Callable[[], object]] = list(update.parts())
-            if captured and self._updates is not None:
-                parts = [self._updates.capture(part).replay for part in parts]
-            self._update = (update, parts)
+            update, graphs = (
+                SumUpdate(self.learned, plan, self.buffers, self.sums, tuple(first.statistics), large, self.said),
+                self._updates,
+            )
+            if captured and graphs is not None:
+                self._update = (update, update.functions(lambda work: graphs.capture(work).replay))
+            else:
+                self._update = (update, update.functions(lambda work: work))
         return self._update[1]
 
     def result(self) -> tuple[int, bool]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
+from itertools import accumulate
 
 import torch
 
@@ -22,8 +22,11 @@ Node = tuple[int, int]
 """Slots of a subtree: the first, and the one behind the last."""
 ALIGNMENT = 16
 """Alignment of the parts of a sum, in floats: Adam reads four at a time."""
-PIECE_BYTES = 2**27
-"""Size of a piece of a sum that processes exchange: its transfer takes many times as long as the start of an exchange."""
+FLOAT_BYTES = 4
+"""Bytes of a number."""
+DIVIDED_BYTES = 2**26
+"""Size of a tensor from which its rows are divided among processes: smaller ones are updated faster than two more exchanges
+begin."""
 MAX_RENDERS = 2**24
 """Number of renders that a fit must stay below: it is a float32, from which each takes its random numbers."""
 
@@ -131,11 +134,13 @@ class Tree:
 class SlotSums:
     """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum.
 
-    Processes exchange a large tensor in pieces, so that the update by one piece overlaps with the exchange of the next: first
-    all other tensors, then runs of its rows.
+    The rows of a large tensor may be divided among processes: each gets the sums of its own rows, updates by these, and sends
+    what it has updated instead of sums.
     """
 
-    def __init__(self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device, *, means: int = 0, large: int = 0):
+    def __init__(
+        self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device, *, means: int = 0, large: int | None = None
+    ):
         """Allocate.
 
         Args:
@@ -143,42 +148,44 @@ class SlotSums:
             shapes: Shape of each tensor.
             device: Where sums are kept.
             means: Number of tensors, the first ones, whose sums become means over the slots.
-            large: Number of the tensor that is exchanged in pieces if it is large.
+            large: Number of the tensor whose rows are divided if it has at least `DIVIDED_BYTES`; None for no such tensor.
         """
-        self.tree, self.shapes, self.device = tree, [tuple(s) for s in shapes], device
+        self.tree, self.shapes = tree, [tuple(s) for s in shapes]
         counts, unit = [torch.Size(s).numel() for s in self.shapes], ALIGNMENT * tree.ranks.count
-        order = [*(k for k in range(len(counts)) if k != large), large]
-        ends = accumulate(-(-counts[k] // ALIGNMENT) * ALIGNMENT for k in order)
-        starts = dict(zip(order, [0, *ends], strict=False))
-        starts[large] = -(-starts[large] // unit) * unit
+        order = sorted(range(len(counts)), key=lambda k: k != large)
+        ends = list(accumulate(-(-counts[k] // ALIGNMENT) * ALIGNMENT for k in order))
+        starts = dict(zip(order, [0, *ends[:-1]], strict=True))
         self.starts = [starts[k] for k in range(len(counts))]
-        """Start of each tensor in a sum; the large one is the last."""
-        self.rows = torch.zeros(tree.rows, starts[large] + -(-counts[large] // unit) * unit, device=device)
+        """Start of each tensor in a sum; the large one is the first."""
+        self.divided = 0
+        """Rows of the large tensor that are divided, from the first; the few others are treated as all other tensors."""
+        self._width = 1
+        if large is not None and tree.ranks.count > 1 and FLOAT_BYTES * counts[large] >= DIVIDED_BYTES:
+            rows = self.shapes[large][0]
+            self.divided, self._width = rows // unit * unit, counts[large] // rows
+        self.rows = torch.zeros(tree.rows, -(-ends[-1] // unit) * unit, device=device)
         """The sums, shape [R, L]."""
         self.means = [(self.starts[k], self.starts[k] + counts[k]) for k in range(means)]
         """Numbers of a sum that become means: the first of each tensor, and the one behind the last."""
-        count = self.shapes[large][0]
-        pieces = 1 if tree.ranks.count == 1 else max(1, round(counts[large] * self.rows.element_size() / PIECE_BYTES))
-        step = -(-count // (pieces * unit)) * unit
-        self.pieces = [slice(first, min(first + step, count)) for first in range(0, count, step)] if pieces > 1 else []
-        """Rows of the large tensor in all pieces but the first; none where one piece holds everything."""
-        inner = [starts[large] + piece.start * (counts[large] // count) for piece in self.pieces]
-        self._bounds = [0, *inner, self.rows.shape[1]]
-        self._side = torch.cuda.Stream(device) if device.type == "cuda" and tree.ranks.count > 1 else None
+
+    @property
+    def own_rows(self) -> slice:
+        """Rows of the large tensor that this process sums and updates."""
+        each = self.divided // self.tree.ranks.count
+        return slice(self.tree.ranks.rank * each, (self.tree.ranks.rank + 1) * each)
 
     def parts(self, row: int = 0) -> list[torch.Tensor]:
         """Return the tensors of a sum, parts of its memory, in their shapes [...]."""
         sized = zip(self.starts, self.shapes, strict=True)
         return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
 
-    def add_up(
-        self, slot: Callable[[int, list[torch.Tensor], bool], None], arrived: Sequence[Callable[[], object]] = ()
-    ) -> list[torch.Tensor]:
+    def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
+
+        Divided rows hold the sum of this process's slots then, until `sum_own_rows`.
 
         Args:
             slot: Function of a slot, the tensors of a sum, and whether it adds to them; else it overwrites them.
-            arrived: Functions that are called in turn: the first once the first piece is complete, and so on.
 
         Raises:
             ResourceError: Another process is gone.
@@ -188,19 +195,21 @@ class SlotSums:
             self._add_node(node, row, slot)
         if self.tree.ranks.count == 1:
             self._average(0, self.rows[0])
-            for work in arrived:
-                work()
-            return self.parts()
-        if self._side is not None:
-            self._side.wait_stream(torch.cuda.current_stream(self.device))
-        for k, (first, end) in enumerate(pairwise(self._bounds)):
-            with torch.cuda.stream(self._side):  # does nothing for None
-                self._exchange(first, end)
-            if self._side is not None:
-                torch.cuda.current_stream(self.device).wait_stream(self._side)
-            if arrived:
-                arrived[k]()
+        else:
+            place = slice(self.divided * self._width, self.rows.shape[1])
+            self.tree.ranks.gather(self._own_sums(place), self.rows[0, place])
         return self.parts()
+
+    def sum_own_rows(self) -> None:
+        """Put sums over the slots of all processes into this process's rows of the large tensor."""
+        own = self.own_rows
+        sums = self._own_sums(slice(0, self.divided * self._width))
+        self.rows[0, own.start * self._width : own.stop * self._width] = sums
+
+    def share(self, tensor: torch.Tensor) -> None:
+        """Send this process's rows of a tensor [N, ...], contiguous and of the shape of the large one, to all others."""
+        divided = tensor[: self.divided].view(-1)
+        self.tree.ranks.gather(tensor[self.own_rows].view(-1), divided)
 
     def _add_node(self, node: Node, row: int, slot: Callable[[int, list[torch.Tensor], bool], None]) -> None:
         """Add the slots of a node into a row, with those behind it as scratch."""
@@ -215,18 +224,17 @@ class SlotSums:
             self._add_node(right, row + 1, slot)
             self.rows[row].add_(self.rows[row + 1])
 
+    def _own_sums(self, place: slice) -> torch.Tensor:
+        """Finish the tree for this process's slice of a part of the numbers; processes have slices of equal size, [S]."""
+        tree, ranks = self.tree, self.tree.ranks
+        sent = self.rows[: tree.width, place].view(tree.width, ranks.count, -1).transpose(0, 1).contiguous()
+        received = ranks.to_each(sent)
+        known = {node: received[r, k] for r, nodes in enumerate(tree.nodes) for k, node in enumerate(nodes)}
+        own = finished((0, tree.batch), known)
+        self._average(place.start + ranks.rank * len(own), own)
+        return own
+
     def _average(self, start: int, sums: torch.Tensor) -> None:
         """Divide by the number of slots what becomes a mean among sums [S], which begin at ``start`` in a sum."""
         for first, end in self.means:
             sums[max(0, first - start) : max(0, end - start)].mul_(1 / self.tree.batch)
-
-    def _exchange(self, first: int, end: int) -> None:
-        """Finish the tree for a piece: each process adds one slice of it over all processes, and sends it to all."""
-        tree, ranks = self.tree, self.tree.ranks
-        count, width = ranks.count, tree.width
-        sent = self.rows[:width, first:end].view(width, count, -1).transpose(0, 1).contiguous()
-        received = ranks.to_each(sent)
-        known = {node: received[r, k] for r, nodes in enumerate(tree.nodes) for k, node in enumerate(nodes)}
-        own = finished((0, tree.batch), known)
-        self._average(first + ranks.rank * len(own), own)
-        ranks.gather(own, self.rows[0, first:end])
