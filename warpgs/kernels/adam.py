@@ -213,7 +213,7 @@ def adam_step(
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
         raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
     if step < 1:
-        raise ValueError(f"step counts from 1, not {step}")
+        raise ValueError(f"step must be at least 1, not {step}")
     if param.numel() == 0:
         return
     lrs = scheduled_lrs(lr, step, betas, head_lr)
