@@ -25,7 +25,7 @@ def check_units(units: str) -> None:
     """Check that ``units`` names one of the two systems.
 
     Raises:
-        UsageError: It does not.
+        UsageError: ``units`` is not one of `UNITS`.
     """
     if units not in UNITS:
         raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")

@@ -62,7 +62,7 @@ def check_pinhole(camera: Camera) -> None:
     """Check that a camera is a pinhole, for code that assumes that straight lines stay straight.
 
     Raises:
-        UsageError: It is not.
+        UsageError: The camera has another model.
     """
     if camera.model != "pinhole":
         raise UsageError(

@@ -198,7 +198,7 @@ def patched_pose(tmp_path, **changes):
         ({"_1": "0", "_2": "0", "_3": "0", "_4": "0"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
         ({"_1": "1e308"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
         ({"_2": "x"}, r"images.txt, line 4: cannot be understood \(could not convert"),
-        ({"_8": "9"}, r"'photo1.png': names camera 9, which cameras.txt does not have"),
+        ({"_8": "9"}, r"'photo1.png': camera 9 is missing from cameras.txt"),
         ({"_0": "1"}, r"images.txt, line 4: number 1 is given twice"),
         ({"_5": "1e100"}, r"image 'photo1.png': its camera centre .* is beyond 1e\+12 units"),
         ({"_9": "photo0.png"}, r"the image 'photo0.png' is listed twice"),

@@ -67,5 +67,5 @@ def test_empty_and_bad_input():
         adam_step(a, torch.zeros(3, 3), a.clone(), a.clone(), lr=0.1, step=1)
     with pytest.raises(ValueError, match="contiguous"):
         adam_step(torch.zeros(3, 4).T, a, a.clone(), a.clone(), lr=0.1, step=1)
-    with pytest.raises(ValueError, match="step counts from 1"):
+    with pytest.raises(ValueError, match="step must be at least 1"):
         adam_step(a, a.clone(), a.clone(), a.clone(), lr=0.1, step=0)

@@ -67,5 +67,5 @@ def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
     with pytest.raises(ResourceError, match=r"2\.0 GiB of memory on cpu, where 1\.9 GiB are free; give a larger --voxel"):
         check_memory(plan, CPU)
     monkeypatch.setattr(grid, "available_bytes", lambda _: 10**15)
-    with pytest.raises(ResourceError, match="kernels can number"):
+    with pytest.raises(ResourceError, match="kernels can index"):
         check_memory(GridPlan((0, 0, 0), 1.0, (1300, 1300, 1300), 1.0), CPU)

@@ -228,7 +228,7 @@ def test_a_failed_run_is_left_out_of_its_pairs_and_named(finished, tmp_path, mon
     run_study(request)
     text = (request.out / "table.md").read_text()
     assert states(request) == ["kept", "kept", "kept", "failed"]
-    assert "b b lacks still seed 1" in text and "no luck" in text
+    assert "b b: no result for still seed 1" in text and "no luck" in text
     figures, gaps = cells(text)
     assert figures[3][-1] == "1" and gaps[2][-1] == "1" and "[" not in gaps[2][1]
     shutil.rmtree(run_folder(request, "still", "b b", 0))

@@ -4,7 +4,7 @@ from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 
 FLAGS = (
     ("--out", "RUN", "", "run folder to fill; new or empty"),
-    ("--split", "SPEC", "", "views to hold out for scores; without it all train"),
+    ("--split", "SPEC", "", "views to hold out for scores; default: none"),
     ("--preset", "NAME", DEFAULT_PRESET, "settings to start from: below, or a .toml file"),
     ("--steps", "N", "", "number of steps, one view each; default: by the preset"),
     ("--device", "NAME", "auto", "auto, cpu or cuda"),

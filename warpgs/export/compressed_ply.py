@@ -171,7 +171,8 @@ def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.nd
     dtype = np.dtype(element.properties)
     end = start + element.count * dtype.itemsize
     if end > len(data):
-        raise malformed(path, f"truncated: {element.count} rows of {element.name[:40]!r} end at byte {end}, it has {len(data)}")
+        rows = f"{element.count} rows of {element.name[:40]!r}"
+        raise malformed(path, f"truncated: {rows} end at byte {end}, but the file has {len(data)} bytes")
     return np.frombuffer(data, dtype, element.count, start), end
 
 

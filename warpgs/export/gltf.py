@@ -194,7 +194,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
             raise malformed(path, "its header is truncated")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
         if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
-            raise malformed(path, f"its header announces {total} bytes, it has {len(data)}")
+            raise malformed(path, f"its header announces {total} bytes, but the file has {len(data)}")
         text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)

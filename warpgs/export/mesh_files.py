@@ -24,7 +24,7 @@ def check_suffix(path: str | os.PathLike[str]) -> None:
     """Check that a mesh can be written to such a file.
 
     Raises:
-        UsageError: It cannot.
+        UsageError: The suffix is not one of `SUFFIXES`.
     """
     suffix = Path(path).suffix
     if suffix.lower() not in SUFFIXES:

@@ -107,7 +107,7 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     for pose in sorted(colmap.read_poses(model / f"images.{kind}").values(), key=lambda p: p.name):
         where = f"{model}, image {pose.name!r}"
         if pose.camera_id not in lenses:
-            raise DataError(f"{where}: names camera {pose.camera_id}, which cameras.{kind} does not have. Write both again")
+            raise DataError(f"{where}: camera {pose.camera_id} is missing from cameras.{kind}; export the cameras again")
         viewmat = np.eye(4)
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation

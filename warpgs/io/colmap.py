@@ -371,7 +371,7 @@ def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pos
     for pose in sorted(poses.values(), key=lambda p: p.name):
         where = f"{file}, image {pose.name!r}"
         if pose.camera_id not in lenses:
-            raise DataError(f"{where}: names camera {pose.camera_id}, which cameras.{kind} does not have; write both again")
+            raise DataError(f"{where}: camera {pose.camera_id} is missing from cameras.{kind}; export the cameras again")
         viewmat = np.eye(4)
         viewmat[:3, :3] = quat_rotation(pose.quat, where)
         viewmat[:3, 3] = pose.translation

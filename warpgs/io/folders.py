@@ -110,7 +110,8 @@ class SceneFolder:
         Args:
             path: The image file.
             lens: Its intrinsics, or a function that returns them for width and height [px].
-            downscale: Factor by which both sides shrink, if a folder such as `images_4` leaves another factor than the user's.
+            downscale: Factor by which both sides shrink: 1 for images of a folder such as `images_4`, which have been resized
+                already. None for the factor that the user gave.
             mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`.
             background: Colour in [0, 1] behind transparent pixels.
             named: Maps that the scene names for it.

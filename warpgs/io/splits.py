@@ -124,7 +124,7 @@ def check_spec(spec: str) -> None:
     """Check that the specification of a split can be understood, before a scene is there.
 
     Raises:
-        UsageError: It cannot, or leaves nothing to train.
+        UsageError: The specification is unknown or malformed, or leaves nothing to train.
     """
     if "=" in spec:
         _named(spec)

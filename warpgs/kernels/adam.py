@@ -44,12 +44,12 @@ def make_functions(real):
 
 @functools.cache
 def make_kernel(real, split: bool, lanes: int):
-    """Make the update kernel; a task updates a segment of the flat parameter, some lanes at a time.
+    """Make the update kernel; each task updates a segment of the flat parameter, ``lanes`` elements at a time.
 
     Args:
         real: wp.float32 or wp.float64.
         split: True where the head of each row has a learning rate of its own, which costs some arithmetic.
-        lanes: Elements at a time.
+        lanes: Number of elements that are updated at a time.
     """
     values = wp.types.vector(lanes, real)
     f = make_functions(real)
@@ -213,7 +213,7 @@ def adam_step(
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
         raise ValueError("param, exp_avg and exp_avg_sq are updated in place and must be contiguous")
     if step < 1:
-        raise ValueError(f"step counts from 1, not {step}")
+        raise ValueError(f"step must be at least 1, not {step}")
     if param.numel() == 0:
         return
     lrs = scheduled_lrs(lr, step, betas, head_lr)

@@ -268,7 +268,7 @@ def check_slots(tiles: Tiles) -> None:
     """Check that the instances have slots.
 
     Raises:
-        ValueError: They have none.
+        ValueError: The instances have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
         raise ValueError("tiles have no slots, which gradients and contributions need: make them by bin_tiles(slotted=True)")

@@ -189,8 +189,8 @@ def project(
         rule: Cut-offs.
         tile_size: Side of a tile [px].
         opacity_factors: Factors of the opacities, at least 0, shape [N]; None for 1. Not differentiable.
-        window: Left, top, width and height [px] of the part of the image to render, from a tile's corner on; None for all.
-            Gaussians that touch no tile in it are culled.
+        window: Left, top, width and height [px] of the part of the image to render; left and top are multiples of
+            ``tile_size``. None for the whole image. Gaussians that touch no tile of this part are culled.
         camera_model: Name of the camera model (`warpgs.kernels.cameras`).
         distortion: Coefficients of the camera model, shape [C, P]; None for a model without. Not differentiable.
 

@@ -24,7 +24,7 @@ def difference_bytes(sizes: StepSizes) -> int:
 
 @functools.cache
 def make_kernels(real):
-    """Make the kernels for float64 on CUDA, a task per element: vertical passes write to memory, with zeros on both sides."""
+    """Make the kernels for float64 on CUDA, one thread per element; vertical passes write rows padded with zeros."""
     f = make_functions(real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module=f"warpgs.kernels.ssim.{real.__name__}")
 

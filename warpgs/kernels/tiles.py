@@ -105,13 +105,13 @@ def _checked_counts(projected: torch.Tensor, tile_counts: torch.Tensor) -> torch
 
 
 def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int:
-    """Return the number of tiles of all images; ResourceError where there are more than can be numbered."""
+    """Return the number of tiles of all images; ResourceError where there are more than kernels can index."""
     columns, rows = grid(width, height, tile_size)
     tiles = cameras * columns * rows
     if tiles > interop.MAX_SIZE:
         raise ResourceError(
             f"{cameras:,} images of {width} x {height} px have {tiles:,} tiles of {tile_size} px, beyond the "
-            f"{interop.MAX_SIZE:,} that can be numbered; render fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each"
         )
     return tiles
 
@@ -127,7 +127,7 @@ def step_bytes(sizes: StepSizes) -> Needs:
 
 
 def _check_total(total: int, visible: int, device: torch.device, tiles: int, budget_bytes: int | None) -> None:
-    """Raise ResourceError where the instances exceed the budget, or what kernels can number."""
+    """Raise ResourceError where the instances exceed the budget, or the number that kernels can index."""
     needed = total * BYTES_PER_INSTANCE
     # a query of the free memory takes at least 0.1 ms; small requests, below a twentieth of the memory, skip it
     countable = total <= MAX_INSTANCES

@@ -227,7 +227,7 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
         pixel_weights: Weight of each pixel, at least 0, shape [H, W]; 0 where nothing is known.
 
     Raises:
-        ResourceError: The grid has more points than kernels can number.
+        ResourceError: The grid has more points than kernels can index.
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera is not a pinhole.
         ValueError: A shape or device disagrees.

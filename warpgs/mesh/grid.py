@@ -103,7 +103,7 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     """Return how much memory a grid takes, as text, before it is allocated.
 
     Raises:
-        ResourceError: The device or the machine has less to spare, or kernels cannot number the points.
+        ResourceError: The device or the machine has less to spare, or the points are more than kernels can index.
     """
     cpu = torch.device("cpu")
     needs = {device: plan.points * GRID_BYTES}
@@ -111,7 +111,7 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     sizes = " x ".join(map(str, plan.shape))
     remedy = "give a larger --voxel or a smaller --resolution"
     if plan.points > MAX_SIZE:
-        raise ResourceError(f"a grid of {sizes} points is beyond the {MAX_SIZE:,} that kernels can number; {remedy}")
+        raise ResourceError(f"a grid of {sizes} points is beyond the {MAX_SIZE:,} that kernels can index; {remedy}")
     for where, needed in needs.items():
         free = available_bytes(where)
         if needed > 0.8 * free:

@@ -97,7 +97,7 @@ def check_installed() -> None:
     """Check that pycolmap is installed.
 
     Raises:
-        UsageError: It is not.
+        UsageError: pycolmap is not installed.
     """
     if importlib.util.find_spec("pycolmap") is None:
         raise UsageError("finding poses needs pycolmap, which is not installed; `pip install 'warpgs[poses]'`")

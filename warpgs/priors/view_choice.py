@@ -96,10 +96,10 @@ def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: i
 
 
 def spread_views(sight: Sight, most: int) -> list[int]:
-    """Return at most that many views, ascending, that together cover most of the area of all views.
+    """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible.
 
-    One by one the view is taken by which the views' best overlap with any view taken grows most: the greedy choice for a
-    submodular sum, at least 1 - 1/e of the best (Nemhauser et al. 1978).
+    Each step adds the view that most increases the sum, over all views, of the largest overlap with a chosen view. This greedy
+    choice for a submodular sum reaches at least 1 - 1/e of the optimum (Nemhauser et al. 1978).
     """
     count = len(sight.overlap)
     if count <= most:

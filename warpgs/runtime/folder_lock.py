@@ -82,7 +82,7 @@ def check_file_path(path: Path) -> None:
     """Check that a path can be that of a file to write, before the work: that it is no folder, and not too long.
 
     Raises:
-        UsageError: It cannot.
+        UsageError: The path is a folder, or too long.
     """
     try:
         is_folder = stat.S_ISDIR(path.lstat().st_mode)

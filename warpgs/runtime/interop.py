@@ -51,10 +51,10 @@ MAX_SIZE = 2**31 - 1
 
 
 def _check_size(size: int) -> None:
-    """Raise ResourceError where kernels cannot number so many entries."""
+    """Raise ResourceError where kernels cannot index so many entries."""
     if size > MAX_SIZE:
         raise ResourceError(
-            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can number; use fewer Gaussians or "
+            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can index; use fewer Gaussians or "
             "coefficients, smaller images, or fewer cameras at once"
         )
 
@@ -303,7 +303,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         block_dim: CUDA threads per block.
 
     Raises:
-        ResourceError: There are more items, or entries along an axis, than 32 bits can number.
+        ResourceError: There are more items, or entries along an axis, than 32-bit integers can index.
     """
     if count == 0:
         return

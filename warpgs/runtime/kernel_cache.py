@@ -57,7 +57,7 @@ def choose_kernel_cache(configured: str | None = None) -> KernelCache:
         configured: What ``warp.config.kernel_cache_dir`` is: set by the user's program, or by Warp once started.
 
     Raises:
-        ResourceError: Neither can be written.
+        ResourceError: Neither the usual nor the private folder can be written.
     """
     folder, refused = _usual(configured)
     if folder is not None:

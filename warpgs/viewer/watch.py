@@ -41,7 +41,7 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
 
     Raises:
-        DataError: It is neither.
+        DataError: The path is neither a run folder nor a file of Gaussians.
         ResourceError: viser or the device is missing.
         UsageError: The port is taken.
     """

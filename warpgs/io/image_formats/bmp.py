@@ -35,7 +35,7 @@ def check(data: bytes) -> None:
     """Check that the file holds all rows.
 
     Raises:
-        ValueError: It does not, or they are compressed.
+        ValueError: A row is missing, or the rows are compressed.
     """
     width, height, bits, stored, start = _header(data)
     if stored != RAW and stored not in MASKED:

@@ -98,7 +98,7 @@ def check(data: bytes) -> None:
     """Check all checksums, and the number of pixels against the header.
 
     Raises:
-        ValueError: They are not, or a checksum does not match.
+        ValueError: A checksum or the number of pixels does not match.
     """
     width, height, depth, color, interlaced = _header(data)
     parts = list(chunks(data))

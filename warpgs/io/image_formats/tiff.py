@@ -131,7 +131,7 @@ def check(data: bytes) -> None:
     """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must.
 
     Raises:
-        ValueError: They do not, or a checksum does not match.
+        ValueError: A strip or tile is missing, overlaps another, or has the wrong size; or a checksum does not match.
     """
     image = _Image(_tags(data))
     pieces = image.pieces()

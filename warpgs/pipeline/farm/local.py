@@ -113,7 +113,7 @@ class LocalEngine:
         """Compile kernels of all devices that a process sees.
 
         Raises:
-            ResourceError: It dies.
+            ResourceError: The process ends early.
         """
         process.worker.send(json.dumps({"kernels": device}))
         _, line = self._news.get()
@@ -132,7 +132,7 @@ class LocalEngine:
         """Start a job in an idle process, or in a new one; before the first, kernels are compiled.
 
         Raises:
-            ResourceError: They cannot be.
+            ResourceError: The kernels cannot be compiled.
         """
         if not self._compiled:
             self._prepare()

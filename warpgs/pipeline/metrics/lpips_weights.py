@@ -134,7 +134,7 @@ def _check_unpacked(file: BinaryIO) -> None:
     """Check that an archive unpacks to no more than its own size, for torch packs nothing, and has no large pickle.
 
     Raises:
-        ValueError: It does, or has.
+        ValueError: The archive unpacks to more, or has a large pickle.
     """
     if zipfile.is_zipfile(file):
         with zipfile.ZipFile(file) as archive:

@@ -53,7 +53,7 @@ class InitConfig:
     merge_px: float = 4.0
     """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps one for every pixel."""
     fill_px: float = 16.0
-    """sweep, flow: width of the cells of points without consistent depth [px]; 0 leaves these areas empty."""
+    """sweep, flow: cell width [px] for filling in points where depth is not consistent; 0 fills in none."""
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind edges of depth
     (docs/decisions/026-extrapolated-points.md). If there are some, opacity decay spares Gaussians that a step does not use.

@@ -193,7 +193,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
     for v in request.variants:
         lost = [f"{p} seed {s}" for (p, name, s), o in runs.items() if name == v and o.metrics is None]
         if lost:
-            notes.append(f"{v} lacks {', '.join(lost)}: these seeds are left out of its means and of its pairs")
+            notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
     if request.seeds < 2:
         notes.append("one seed: no deviations and no intervals; run more seeds before you claim a difference")
     last = metrics[-1].key

@@ -94,7 +94,7 @@ PRESETS = Presets(FOLDER)
 
 
 def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -> tuple[FitConfig, str]:
-    """Return the settings of a preset, and words on where they come from.
+    """Return the settings of a preset, and a note on their source.
 
     Args:
         preset: Name of a preset; path of a .toml file; ``module:NAME`` or ``path/to/file.py:NAME`` of a `FitConfig` or a
@@ -188,7 +188,7 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def _config_of_file(path: Path, name: str, above: int = 0) -> tuple[FitConfig, str]:
-    """Return the settings of a file, and words on where they come from; ``above`` is the number of files that start from it."""
+    """Return the settings of a file, and a note on their source; ``above`` is the number of files that start from it."""
     import dataclasses
 
     values, digest = _read(path)
@@ -197,7 +197,7 @@ def _config_of_file(path: Path, name: str, above: int = 0) -> tuple[FitConfig, s
 
 
 def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path | None = None) -> tuple[FitConfig, str]:
-    """Return the settings of a mapping, and words on where they come from; a base that is a file lies below ``folder``."""
+    """Return the settings of a mapping, and a note on their source; a base that is a file lies below ``folder``."""
     from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.overrides import changed_settings, with_settings
 

@@ -63,7 +63,7 @@ class ViewModule:
         """Check at the start of a fit that the training views can have the parameters.
 
         Raises:
-            UsageError: They cannot.
+            UsageError: The training views cannot have the parameters.
         """
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
