@@ -325,7 +325,7 @@ class Trainer:
             if self.steps < self.phases.planned:
                 self.messages.append(f"early stopping: left-out pixels no longer improve; {self.steps:,} steps in all")
             words = f"stopping: growth ended at step {step} with {len(self.table):,} Gaussians, because {stopping.why}"
-            self.messages.append(Detail(f"{words}; all pixels are trained on from here"))
+            self.messages.append(Detail(f"{words}; from now on, training uses all pixels"))
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
 
     def show_learned(self) -> None:
