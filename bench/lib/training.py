@@ -19,7 +19,8 @@ from warpgs.pipeline.train.learned_views import LearnedViews
 from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
-from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step_graphs import StepGraphs
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack

@@ -55,14 +55,17 @@ def captures() -> str:
 
 
 def ranks() -> str:
-    """Return the table of steps on one and two GPUs."""
+    """Return the table of steps by the number of GPUs."""
     result, source = _result("ranks_h200")
     body = []
     for case, words in MODELS.items():
-        one, two = sorted((r for r in result["rows"] if r["case"] == case), key=lambda r: r["ranks"])
-        times = [f"{r['step_ms']:.1f} ms" for r in (one, two)]
-        body.append([words.format(one["gaussians"]), *times, f"{two['efficiency']:.2f}"])
-    return table(["model", "1 GPU", "2 GPUs", "scaling efficiency"], body) + source
+        rows = sorted((r for r in result["rows"] if r["case"] == case), key=lambda r: r["ranks"])
+        for r in rows:
+            name = words.format(r["gaussians"]) if r is rows[0] else ""
+            body.append(
+                [name, f"{r['ranks']}", f"{r['step_ms']:.1f} ms", f"{r['collectives_ms']:.1f} ms", f"{r['efficiency']:.2f}"]
+            )
+    return table(["model", "GPUs", "step", "in collectives", "scaling efficiency"], body) + source
 
 
 def surfaces() -> str:

@@ -19,7 +19,7 @@ from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.model.scale_limits import LimitConfig, TrainingCameras
 from warpgs.pipeline.runs.failed_step import failed_step, repeated
 from warpgs.pipeline.runs.model_and_cameras import open_file
-from warpgs.pipeline.train import step
+from warpgs.pipeline.train import step, step_graphs
 from warpgs.pipeline.train.memory_plan import most_instances
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import RasterizeOptions, rasterize
@@ -73,7 +73,9 @@ def test_a_step_renders_with_the_filter(device, captured):
         for a in (True, False)
     ]
     assert most_instances(fit.gaussians, cameras, options) == wanted[0] != wanted[1]
-    assert step.instance_capacity(fit.gaussians, stack, 0, options) == int(step.CAPACITY_FACTOR * wanted[0]) + 1024
+    assert (
+        step_graphs.instance_capacity(fit.gaussians, stack, 0, options) == int(step_graphs.CAPACITY_FACTOR * wanted[0]) + 1024
+    )
     image = repeated(failed_step(fit, 1, "01.png"))[1].rendered.rgb.detach().cpu().numpy()
     assert np.array_equal(image, filtered(fit.gaussians, view.camera))
 

@@ -13,12 +13,13 @@ from warpgs.errors import NotFiniteError
 from warpgs.kernels.adam import scheduled_lrs
 from warpgs.kernels.step_buffers import Setting
 from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.train import batch
 from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.slots import Tree
-from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers
+from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers, steps_at_once
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.runtime.ranks import ALONE
@@ -112,6 +113,7 @@ def test_several_steps_at_once_are_those_one_by_one():
     while many.step < 20:
         taken.append(len(in_series(many).advance(100)))
     losses = [fit.buffers.history.isfinite().all() for fit in (one, many)]
+    assert [steps_at_once(batch) for batch in (1, 8, 500)] == [100, 50, 1]
     assert max(taken) == 7 and len(many.table) > 61 and all(losses) and same_bits(advanced(one, 20), many)
 
 
@@ -127,6 +129,25 @@ def test_a_loss_that_is_no_number_ends_a_series_before_its_step():
         many.advance(100)
     assert found.value.view == 4 and found.value.slot == 1 and many.step == 2
     assert many.order[-5:] == [8, 7, 6, 4, 5] and same_bits(advanced(one, 2), many, ("generator",))
+
+
+def test_a_view_beyond_the_capacity_ends_a_series_which_is_taken_up_again(monkeypatch):
+    """It stops steps in the middle of a series, as a graph with too little capacity does: their bits do not change."""
+    config = dataclasses.replace(PLAIN, batch=3, dropout=0.3, steps=12)
+    one, many = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(2))
+    honest, calls = batch.view_gradients, []
+
+    def overflowing(learned, views, buffers, *rest):
+        calls.append(1)
+        found = honest(learned, views, buffers, *rest)
+        if len(calls) in (8, 30):
+            buffers.stop.fill_(1)
+        return found
+
+    monkeypatch.setattr(batch, "view_gradients", overflowing)
+    steps = [r.step for _ in range(12) if many.step < 12 for r in in_series(many).advance(100)]
+    monkeypatch.undo()
+    assert steps == list(range(1, 13)) and len(calls) > 36 and same_bits(advanced(one, 12), many, ("generator",))
 
 
 def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):

@@ -36,9 +36,9 @@ def failing(monkeypatch, owner, name: str, calls: set[int]):
 
 
 def saved(fit: Trainer) -> tuple[dict, dict]:
-    """A state of its own memory, as a file has it."""
+    """A state in memory of its own on the host, as a file has it: the device may be full."""
     tensors, plain = fit.state()
-    return {n: t.clone() for n, t in tensors.items()}, copy.deepcopy(plain)
+    return {n: t.to("cpu", copy=True) for n, t in tensors.items()}, copy.deepcopy(plain)
 
 
 def finished(fit: Trainer, states: list) -> list[int]:

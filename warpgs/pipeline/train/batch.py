@@ -14,17 +14,17 @@ import torch
 from warpgs.kernels.step_buffers import end_step
 from warpgs.pipeline.train.slots import SlotSums, Tree
 from warpgs.pipeline.train.step import (
-    MAX_STEPS,
     Learned,
     StepBuffers,
-    StepGraphs,
     StepPlan,
     ViewGradients,
     descend,
     eager_renderer,
     settle,
+    steps_at_once,
     view_gradients,
 )
+from warpgs.pipeline.train.step_graphs import StepGraphs
 from warpgs.pipeline.train.views import Kind, ViewStack
 from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
@@ -125,7 +125,7 @@ class BatchSteps:
             tree: The slots and their order.
         """
         self.learned, self.buffers, self.tree, self.options = learned, buffers, tree, options
-        self.slots = StepBuffers(buffers.device, 1, MAX_STEPS * len(tree.slots))
+        self.slots = StepBuffers(buffers.device, 1, steps_at_once(tree.batch) * len(tree.slots))
         """Settings and results of this process's slots, step by step."""
         self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device)
         """Sums of what the slots said in the last step, or in the one that a slot stopped."""

@@ -7,16 +7,14 @@ end. On a CPU the same function is called for each step.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
-from warpgs.errors import ResourceError
 from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
+from warpgs.kernels.step_buffers import SHIFT, Setting, begin_step, end_step
+from warpgs.kernels.tiles import InstanceMemory
 from warpgs.pipeline.metrics.psnr import masked_mse
 from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits, TrainingCameras
 from warpgs.pipeline.model.table import Table
@@ -25,20 +23,21 @@ from warpgs.pipeline.train.learned_views import LearnedViews, seen
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
 from warpgs.pipeline.train.opacity_decay import decay_opacities
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Kind, Rows, ViewStack, current
-from warpgs.render.compose import compose, count_instances, inputs_of
+from warpgs.pipeline.train.views import Rows, ViewStack
+from warpgs.render.compose import compose, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
-from warpgs.runtime.cuda_graph import CapturedGraph, GraphMemory
-from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Camera, Gaussians, Render
 
 MAX_STEPS = 100
 """Largest number of steps after which results are read back from the device."""
-CAPACITY_FACTOR = 1.3
-"""Capacity of a captured step for instances, as a multiple of the most that any view has when it is captured."""
-DEAD_BYTES = 2**30
-"""Bytes of unused graphs that are kept. Freeing them takes milliseconds, in which the device waits."""
+MAX_VIEWS = 400
+"""The same as a number of rendered views, for steps of several views: a request to stop waits for them."""
+
+
+def steps_at_once(batch: int) -> int:
+    """Return how many steps of ``batch`` views are taken at most before results are read back."""
+    return min(MAX_STEPS, max(1, MAX_VIEWS // batch))
 
 
 @dataclass(frozen=True)
@@ -315,7 +314,7 @@ def descend(
 
 @torch.no_grad()
 def settle(learned: Learned, plan: StepPlan, found: ViewGradients) -> None:
-    """Do what follows Adam: opacity decay, the strategy's own changes, limits, statistics."""
+    """Apply what follows Adam: opacity decay, the strategy's own changes, limits, statistics."""
     table, strategy = learned.table, learned.strategy
     gradient = found.gradients[list(table.params).index("logit_opacities")]
     used = gradient != 0 if plan.spares_unused else None
@@ -324,103 +323,3 @@ def settle(learned: Learned, plan: StepPlan, found: ViewGradients) -> None:
     plan.limits.hold(table.params, learned.cameras, found.going)
     for name, value in found.statistics.items():
         table.columns[name] += value
-
-
-class OverLimitError(ResourceError):
-    """A captured step would exceed the memory limit of the fit."""
-
-
-class StepGraphs:
-    """Captured steps, one for each plan and kind of view; captured at first use."""
-
-    def __init__(
-        self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions,
-        work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
-    ):  # fmt: skip
-        """Capture nothing yet.
-
-        Args:
-            learned: Tables and strategy that steps change.
-            buffers: Settings and results of steps.
-            options: Rule, background [3] and antialiasing of the fit.
-            work: Function that is captured.
-        """
-        self.work = work
-        self.learned, self.buffers, self.options = learned, buffers, options
-        device = buffers.device
-        self.stream = torch.cuda.Stream(device)
-        """Stream of captures, always the same one, since torch keeps freed memory for the stream that it was used on."""
-        self.memory = GraphMemory(device)
-        """Account of the memory that torch keeps for deleted graphs."""
-        self._graphs: dict[tuple[Hashable, StepPlan], CapturedGraph] = {}
-
-    def clear(self) -> None:
-        """Drop all graphs, because the tensors that they refer to have changed."""
-        self._graphs.clear()
-
-    def capture_all(
-        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
-    ) -> list[CapturedGraph]:
-        """Return the graph of each of several steps of one plan, captured if necessary.
-
-        Args:
-            kinds: Kind of each step's view.
-            stacks: Views by kind.
-            plan: Choices that the steps are made of.
-            max_instances: Largest capacity for instances; None for no limit.
-
-        Raises:
-            OverLimitError: The capacity of one would be above ``max_instances``.
-            ResourceError: The instances would not fit into memory.
-        """
-        self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
-        for kind in dict.fromkeys(kinds):
-            if (kind, plan) in self._graphs:
-                continue
-            views = stacks[kind]
-            now = current(views, self.learned.views)
-            capacity = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
-            if max_instances is not None and capacity > max_instances:
-                raise OverLimitError(
-                    f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
-                )
-            self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
-            render = captured_renderer(self.options, capacity, self.buffers.stop)
-            work = functools.partial(self.work, self.learned, views, self.buffers, plan, render)
-            self._graphs[kind, plan] = self.capture(work)
-        return [self._graphs[kind, plan] for kind in kinds]
-
-    def capture(self, work: Callable[[], object]) -> CapturedGraph:
-        """Return the graph of a function that changes nothing where the stop flag is set."""
-        buffers = self.buffers
-        here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
-        self.stream.wait_stream(here)
-        with torch.cuda.stream(self.stream):
-            # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
-            buffers.stop.fill_(NOT_FINITE)
-            buffers.view_rows.zero_()
-            work()
-            buffers.stop.zero_()
-            buffers.view_rows.copy_(loaded)
-            self.stream.synchronize()
-            captured = CapturedGraph(work, self.stream)
-        here.wait_stream(self.stream)
-        return captured
-
-
-@torch.no_grad()
-def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
-    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
-
-    Raises:
-        ResourceError: They would not fit into memory.
-    """
-    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in views.cameras()]
-    wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
-    budget = available_bytes(gaussians.means.device) * 4 // 5
-    if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
-        raise ResourceError(
-            f"a step would touch {wanted:,} tiles, which needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB; "
-            f"{budget / 2**30:.2f} GiB may be used. Fit smaller images with --downscale, or limit --max-gaussians."
-        )
-    return wanted

@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.slots import Tree
-from warpgs.pipeline.train.step import Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step import Learned, StepBuffers, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.step_graphs import StepGraphs
 from warpgs.pipeline.train.views import Kind, ViewStack
 from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.ranks import Ranks

@@ -24,7 +24,8 @@ from warpgs.pipeline.train.learned_views import LearnedViews
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
 from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
-from warpgs.pipeline.train.step import CAPACITY_FACTOR, MAX_STEPS, Learned, OverLimitError, StepBuffers, StepPlan
+from warpgs.pipeline.train.step import Learned, StepBuffers, StepPlan, steps_at_once
+from warpgs.pipeline.train.step_graphs import CAPACITY_FACTOR, OverLimitError
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.stopping import STATE, Stopping
 from warpgs.pipeline.train.stored_state import check_state
@@ -236,7 +237,7 @@ class Trainer:
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
-            most = min(limit, MAX_STEPS, self.steps - self.step)
+            most = min(limit, steps_at_once(self.batch), self.steps - self.step)
             while count < most and self.plan_of(first + count) == plan and not self.is_due(first + count - 1):
                 count += 1
         chosen = [self.next_view() for _ in range(count * self.batch)]
