@@ -5,8 +5,8 @@ changes in the first half of the steps. garden: PATH is test_garden.npz; 2.8 mil
 views, no growth. Started by `torchrun --nproc-per-node N -m bench.fits.ranks`. Steps are taken in series of 10, as a fit does;
 the time of a step is the median over the series in the last half. A row is put into --out, in place of one of the same case,
 batch, steps and ranks; `same_model` says whether all rows of a case have one SHA-256 of parameters, moments and statistics.
-Time in collectives is that of the first rank, between events around them: it has in it the wait for slower ranks, and part
-overlaps with the update.
+``start_sha256`` is that of the start and of the photographs. Time in collectives is that of the first rank, between events
+around them, and includes the wait for slower ranks.
 """
 
 from __future__ import annotations
@@ -168,6 +168,7 @@ def main(arguments: list[str] | None = None) -> int:
     device, size = choose_device(a.device)[0], {"tiles": a.tiles, "width": a.width, "height": a.height}
     made = {"horns": horns, "garden": lambda *of: garden(*of, **size)}[a.case](a.path, a.batch, a.steps, device, ranks)
     row = {"case": a.case, "batch": a.batch, "ranks": ranks.count, "backend": ranks.backend, "steps": a.steps}
+    row["start_sha256"] = digest(*state_tensors(made), *(image for stack in made.stacks.values() for image in stack.images))
     row |= measured(made, ranks, a.steps)
     ranks.part()
     good = True

@@ -20,9 +20,10 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.slots import Tree
 from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers, steps_at_once
+from warpgs.pipeline.train.step_graphs import instance_capacity
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.runtime.ranks import ALONE
+from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.scene import View
 
 CPU = torch.device("cpu")
@@ -113,7 +114,7 @@ def test_several_steps_at_once_are_those_one_by_one():
     while many.step < 20:
         taken.append(len(in_series(many).advance(100)))
     losses = [fit.buffers.history.isfinite().all() for fit in (one, many)]
-    assert [steps_at_once(batch) for batch in (1, 8, 500)] == [100, 50, 1]
+    assert [steps_at_once(batch) for batch in (1, 8, 500)] == [100, 25, 1]
     assert max(taken) == 7 and len(many.table) > 61 and all(losses) and same_bits(advanced(one, 20), many)
 
 
@@ -148,6 +149,24 @@ def test_a_view_beyond_the_capacity_ends_a_series_which_is_taken_up_again(monkey
     steps = [r.step for _ in range(12) if many.step < 12 for r in in_series(many).advance(100)]
     monkeypatch.undo()
     assert steps == list(range(1, 13)) and len(calls) > 36 and same_bits(advanced(one, 12), many, ("generator",))
+
+
+def test_ranks_go_on_without_graphs_together():
+    """Large views are in the slots of one of two ranks alone: both take the same steps where these exceed the limit."""
+    views = [*photos(2), *photos(2, 24, 20)]
+    config = dataclasses.replace(PLAIN, batch=2, steps=6)
+
+    def fitted(ranks: Ranks) -> Trainer:
+        fit = in_series(Trainer(views, seeds(61), config, CPU, ranks=ranks))
+        fit.order = [2, 0, 3, 1]
+        capacities = [instance_capacity(fit.gaussians, s, 0, fit.context.render_options()) for s in fit.stacks.values()]
+        fit.context.max_instances = sum(capacities) // 2
+        return advanced(fit, 6)
+
+    alone = Trainer(views, seeds(61), config, CPU)
+    alone.order = [2, 0, 3, 1]
+    fits = by_threads(fitted, 2)
+    assert all("without CUDA graphs" in fit.messages[0] for fit in fits) and all(same_bits(advanced(alone, 6), f) for f in fits)
 
 
 def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):

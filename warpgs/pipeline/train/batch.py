@@ -24,7 +24,7 @@ from warpgs.pipeline.train.step import (
     steps_at_once,
     view_gradients,
 )
-from warpgs.pipeline.train.step_graphs import StepGraphs
+from warpgs.pipeline.train.step_graphs import Capacities, StepGraphs
 from warpgs.pipeline.train.views import Kind, ViewStack
 from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
@@ -133,6 +133,7 @@ class BatchSteps:
         """True if this process was asked to stop; the next step tells all others."""
         self.sums: SlotSums | None = None
         """Sums over slots, of the sizes of the last step."""
+        self._capacities = Capacities(learned, options)
         self._graphs = self._updates = None
         if buffers.device.type == "cuda":
             self._graphs = StepGraphs(learned, self.slots, options, view_gradients)
@@ -142,6 +143,7 @@ class BatchSteps:
     def clear(self) -> None:
         """Drop all graphs, because the tensors that they refer to have changed."""
         self._update = None
+        self._capacities.clear()
         if self._graphs is not None:
             self._graphs.clear()
 
@@ -164,6 +166,8 @@ class BatchSteps:
             ResourceError: The instances would not fit into memory, or another process is gone.
         """
         slots, batch = self.tree.slots, self.tree.batch
+        if captured and max_instances is not None:  # in all processes, or one alone would go on without graphs
+            self._capacities.of([kind for kind, _ in places], stacks, plan, max_instances)
         own = [i for i in range(len(places)) if i % batch in slots]
         self.slots.load([places[i][1] for i in own], [[1.0]] * len(own), [settings[i] for i in own])
         works = self._works([places[i][0] for i in own], stacks, plan, max_instances, captured)

@@ -31,7 +31,7 @@ from warpgs.scene import Camera, Gaussians, Render
 
 MAX_STEPS = 100
 """Largest number of steps after which results are read back from the device."""
-MAX_VIEWS = 400
+MAX_VIEWS = 200
 """The same as a number of rendered views, for steps of several views: a request to stop waits for them."""
 
 

@@ -28,6 +28,51 @@ class OverLimitError(ResourceError):
     """A captured step would exceed the memory limit of the fit."""
 
 
+class Capacities:
+    """Capacities of captured steps for instances, by kind of view and plan."""
+
+    def __init__(self, learned: Learned, options: RasterizeOptions):
+        """Compute nothing yet.
+
+        Args:
+            learned: Tables that steps change.
+            options: Rule, background [3] and antialiasing of the fit.
+        """
+        self.learned, self.options = learned, options
+        self._known: dict[tuple[Hashable, StepPlan], int] = {}
+
+    def clear(self) -> None:
+        """Drop all capacities, because the Gaussians have changed."""
+        self._known.clear()
+
+    def of(
+        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
+    ) -> dict[Kind, int]:
+        """Return the capacity for each kind, computed at its first use.
+
+        Args:
+            kinds: Kinds of views.
+            stacks: Views by kind.
+            plan: Choices that the steps are made of.
+            max_instances: Largest capacity; None for no limit.
+
+        Raises:
+            OverLimitError: A capacity would be above ``max_instances``.
+            ResourceError: The instances would not fit into memory.
+        """
+        found = {}
+        for kind in dict.fromkeys(kinds):
+            if (kind, plan) not in self._known:
+                now = current(stacks[kind], self.learned.views)
+                self._known[kind, plan] = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
+            found[kind] = self._known[kind, plan]
+            if max_instances is not None and found[kind] > max_instances:
+                raise OverLimitError(
+                    f"a captured step would need capacity for {found[kind]:,} instances, the limit allows {max_instances:,}"
+                )
+        return found
+
+
 class StepGraphs:
     """Captured steps, one for each plan and kind of view; captured at first use."""
 
@@ -50,11 +95,14 @@ class StepGraphs:
         """Stream of captures, always the same one, since torch keeps freed memory for the stream that it was used on."""
         self.memory = GraphMemory(device)
         """Account of the memory that torch keeps for deleted graphs."""
+        self.capacities = Capacities(learned, options)
+        """Capacities of the graphs."""
         self._graphs: dict[tuple[Hashable, StepPlan], CapturedGraph] = {}
 
     def clear(self) -> None:
         """Drop all graphs, because the tensors that they refer to have changed."""
         self._graphs.clear()
+        self.capacities.clear()
 
     def capture_all(
         self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
@@ -75,16 +123,10 @@ class StepGraphs:
         for kind in dict.fromkeys(kinds):
             if (kind, plan) in self._graphs:
                 continue
-            views = stacks[kind]
-            now = current(views, self.learned.views)
-            capacity = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
-            if max_instances is not None and capacity > max_instances:
-                raise OverLimitError(
-                    f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
-                )
+            capacity = self.capacities.of([kind], stacks, plan, max_instances)[kind]
             self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
             render = captured_renderer(self.options, capacity, self.buffers.stop)
-            work = functools.partial(self.work, self.learned, views, self.buffers, plan, render)
+            work = functools.partial(self.work, self.learned, stacks[kind], self.buffers, plan, render)
             self._graphs[kind, plan] = self.capture(work)
         return [self._graphs[kind, plan] for kind in kinds]
 
