@@ -67,7 +67,7 @@ for words in (
     assert main(words) == 0, words
 
 folders = {p: s for p, s in placed.items() if p.is_dir()}
-assert set(folders) == {out / "run-pruned", out / "cameras" / "sparse"}, folders
+assert set(folders) == {out / "scene", out / "run-pruned", out / "cameras" / "sparse"}, folders
 assert all(OWN_NAMES.fullmatch(source.name) for source in folders.values())
 for path in opened:
     own = OWN_NAMES.fullmatch(path.name) or path.name == LOCK or path.name == "metrics.jsonl"
