@@ -61,7 +61,9 @@ class Registry(Generic[T]):
         def decorate(cls: type[T]) -> type[T]:
             before = self._classes.get(name)
             if before is not None and _is_ours(before) and not _is_ours(cls):
-                raise UsageError(f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours by another name")
+                raise UsageError(
+                    f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours under another name"
+                )
             cls.name = name
             self._classes[name] = cls
             return cls
@@ -112,8 +114,8 @@ class Registry(Generic[T]):
             own = name.rpartition(":")[2]
             in_study = f'; in a study: a preset in a .py file, with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
-                f"the {self.kind} {name!r} is a class of your own, which is never imported because a file names it; give it "
-                f"again, on the command line or as a class in Python{in_study}"
+                f"the {self.kind} {name!r} is a class of your own. Files cannot import code: give the class again, on the "
+                f"command line or in Python{in_study}"
             )
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 

@@ -21,7 +21,7 @@ Settings = TypeVar("Settings")
 def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | None = None) -> tuple[type, Any]:
     """Derive the flags of a settings dataclass, nested settings included.
 
-    Every field becomes a flag with the field's docstring as its help, those of nested settings under the field's name.
+    Every field becomes a flag with the field's docstring as its help. Flags of nested settings begin with the field's name.
 
     Args:
         kind: The dataclass.
@@ -132,19 +132,19 @@ def _number_rule(info: Any) -> Any:
 
 
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
-    """Return an instance of a dataclass of flags from the words of a command line; ``--help`` prints one screen.
+    """Return an instance of a dataclass of flags from the arguments of a command line; ``--help`` prints one screen.
 
     Numbers are finite and written in the digits 0 to 9.
 
     Args:
         kind: The dataclass.
-        arguments: Words after the name of the command.
+        arguments: Arguments after the name of the command.
         program: Name of the program and the command, for the help.
-        description: Words about the command, for the help.
+        description: Description of the command, for the help.
 
     Raises:
         SystemExit: Help was asked for.
-        UsageError: A word is wrong, or one is missing.
+        UsageError: An argument is wrong or missing.
     """
     import tyro
 
@@ -176,7 +176,7 @@ def check_range(flag: str, value: float, low: float, high: float) -> None:
 
 
 def listed(title: str, lines: Mapping[str, str]) -> str:
-    """Return names and a line about each under a title, for the head of a help."""
+    """Return a title and a list of names with descriptions, for the beginning of a help text."""
     return "\n".join([f"{title}:", *(f"  {name}: {about}" if about else f"  {name}" for name, about in lines.items())])
 
 
@@ -185,7 +185,7 @@ def word_after(arguments: list[str], flag: str) -> str | None:
     found = None
     for i, word in enumerate(arguments):
         name, given, value = word.partition("=")
-        if name.replace("_", "-") != flag:  # tyro takes either
+        if name.replace("_", "-") != flag:  # tyro accepts _ and -
             continue
         if given:
             found = value

@@ -60,7 +60,7 @@ def check_finite(path: Path, arrays: Arrays) -> None:
         bad = array.size - int(np.isfinite(array).sum())
         if bad:
             raise DataError(
-                f"{path}: not written, {name} holds {bad} non-finite of {array.size} values, which no viewer can show. "
+                f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
                 "Export an earlier checkpoint, or fit again with a lower learning rate."
             )
 

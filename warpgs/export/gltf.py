@@ -264,7 +264,7 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     def count(row: dict[str, Any], key: str, default: int | None = None) -> int:
         value = row.get(key, default)
         if type(value) is not int or not 0 <= value <= len(body):
-            raise malformed(path, f"{key} {str(value)[:20]!r} does not fit its {len(body)} bytes of numbers")
+            raise malformed(path, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
         return value
 
     accessor = item("accessors", index)

@@ -123,10 +123,8 @@ def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussi
             dtype = np.dtype(vertex.properties)
             end = start + vertex.count * dtype.itemsize
             if end > size:
-                raise ply_error(
-                    path,
-                    f"truncated: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
-                )
+                needed = f"{vertex.count} Gaussians of {dtype.itemsize} bytes end at byte {end}"
+                raise ply_error(path, f"truncated: {needed}, but the file has {size} bytes")
             file.seek(start)
 
             def rows(part: slice) -> np.ndarray:

@@ -170,7 +170,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         if meta.get("model", "default") not in ("default", "antialiased"):
             raise malformed(path, f"its model {str(meta['model'])[:40]!r} is not supported")
         if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
-            raise malformed(path, f"{str(n)[:20]} Gaussians in {size} bytes")
+            raise malformed(path, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
         most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
 
         def pixels(part: str, i: int) -> np.ndarray:
@@ -234,7 +234,7 @@ def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
     """Return the rotations [N, 4] of their pixels [P, 4]."""
     largest = pixels[:n, 3]
     if (largest < 252).any():
-        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} has no largest component")
+        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} does not name its largest component")
     return by_rows(
         n, (4,), lambda p: from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * SQRT2)
     )
@@ -303,7 +303,7 @@ def _book(path: Path, part: dict[str, Any]) -> np.ndarray:
     """Return the 256 numbers of a codebook."""
     book = np.array(part["codebook"], np.float64)
     if book.shape != (LEVELS,):
-        raise malformed(path, f"a codebook has the shape {book.shape} instead of {LEVELS} numbers")
+        raise malformed(path, f"a codebook has the shape {book.shape}, not {LEVELS} numbers")
     return book
 
 
@@ -311,11 +311,11 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
     """Return the rows of the palette of harmonics [P, K - 1, 3]."""
     bands, count = part["bands"], part["count"]
     if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= PALETTE:
-        raise malformed(path, f"{str(count)[:20]} rows of harmonics of {str(bands)[:20]} degrees")
+        raise malformed(path, f"its table of harmonics is invalid: {str(count)[:20]} rows, {str(bands)[:20]} degrees")
     k = SH_SIZES[bands] - 1
     pixels = _pixels(path, "harmonics", content, count * k)
     if len(pixels) % (COLUMNS * k):
-        raise malformed(path, "its image of harmonics has another width")
+        raise malformed(path, "its image of harmonics has an invalid width")
     return _book(path, part).astype(np.float32)[pixels[: count * k, :3].reshape(count, k, 3)]
 
 
@@ -323,7 +323,7 @@ def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarra
     """Return labels of Gaussians from ``first`` on that all lie below ``count``; DataError where one does not."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
-        raise malformed(path, f"Gaussian {row} points beyond its {count} rows of harmonics")
+        raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")
     return labels
 
 

@@ -169,7 +169,7 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
     def read(size: int) -> bytes:
         data = _inflated(path, stream, size)
         if len(data) != size:
-            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has fewer, or its end is cut off")
+            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer, or its end is cut off")
         return data
 
     for _ in sizes:
@@ -179,7 +179,7 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
     except (EOFError, OSError, zlib.error) as e:
         raise malformed(path, f"its compressed content is damaged ({str(e)[:80]}), or its end is cut off") from e
     if more:
-        raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has more")
+        raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
 
 
 def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
@@ -195,7 +195,7 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
         raise malformed(path, f"its coordinates have {bits} fractional bits of 24")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
     if sum(sizes) > MAX_RATIO * size + SMALL:
-        raise malformed(path, f"{n} Gaussians in {size} bytes")
+        raise malformed(path, f"it announces {n} Gaussians in only {size} bytes")
     return sizes
 
 

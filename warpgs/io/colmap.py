@@ -139,7 +139,7 @@ def _expect(condition: bool, message: str) -> None:
 
 def _store(table: dict, key: int, value: object, where: str) -> None:
     if key in table:
-        raise DataError(f"{where}: number {key} is given twice; write the file again")
+        raise DataError(f"{where}: id {key} is given twice; write the file again")
     table[key] = value
 
 
@@ -318,7 +318,10 @@ def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str)
     if len(lost) == len(names) == len(files):
         pairs = dict(zip(sorted(names), files))
         first = min(names)
-        return pairs, f"images of {images.name} have other names, matched in sorted order ({first} is {pairs[first].name})"
+        return (
+            pairs,
+            f"images of {images.name} matched in sorted order, because their names differ ({first} is {pairs[first].name})",
+        )
     return paths, ""  # the missing file is named when it is read
 
 

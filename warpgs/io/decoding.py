@@ -95,7 +95,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
 
 def _too_large(path: Path, pixels: int) -> str:
     needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: {needed:.1f} GiB to decode the image are not free; shrink it, or end other programs"
+    return f"{path}: decoding the image needs {needed:.1f} GiB, which are not free; shrink it, or end other programs"
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

@@ -90,8 +90,8 @@ class MapFolder:
                 raise DataError(f"{file}: {self._files[key].name} is for the same image; remove one of them")
             self._files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
         if not any(not key.endswith(CONFIDENCE) for key in self._files):
-            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "put"
-            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named as the images are")
+            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "add"
+            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
         self.taken: set[str] = set()
         """Keys of the maps that images requested."""
 

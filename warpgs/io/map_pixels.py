@@ -60,7 +60,9 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
     rows, columns = values.shape[:2]
     if loaded.orientation in (5, 6, 7, 8) and _same_aspect(values.shape, (width, height)):
         if values.ndim == 3:
-            raise DataError(f"{path}: its image is turned by its EXIF tag, and the normals with it; save both upright")
+            raise DataError(
+                f"{path}: its image is rotated by an EXIF tag, and normals are not rotated with it; save both upright"
+            )
         values = turn_upright(values, loaded.orientation)
     elif not _same_aspect(values.shape, (height, width)):
         raise DataError(

@@ -30,7 +30,7 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     """Return why a photograph has no pose, in words that follow its name."""
     keypoints = found.keypoints[i]
     if keypoints < MIN_KEYPOINTS:
-        return f"has {keypoints} keypoints, too few to find again: a blank wall, darkness or blur"
+        return f"has {keypoints} keypoints, too few to match: a blank wall, darkness or blur"
     best = partners(found, i)
     if not best:
         return f"has {keypoints:,} keypoints and matches no other photograph"
@@ -74,7 +74,7 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
             elif best:
                 said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
             else:
-                said.append(f"take photographs from {names[i]} to the others, each overlapping the last by two thirds")
+                said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
     tree = neighbours(found)
     for i, j, angle in sorted(tree, key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:
@@ -84,4 +84,4 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
         if best and best[0][0] < WEAK_MATCHES:
             said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}: they share {best[0][0]} matches only")
     more = len(said) - MAX_ADVICE
-    return said[:MAX_ADVICE] + ([f"and {more} more places like these, once these are done"] if more > 0 else [])
+    return said[:MAX_ADVICE] + ([f"and {more} more; do these first"] if more > 0 else [])

@@ -158,7 +158,7 @@ def _with_network(
     (second / "model").rename(work / "model")
     notes = [f"keypoints and matches by {network.title}: {len(other.views)} poses; SIFT, which is more accurate, finds {count}"]
     if turned:
-        notes.append(f"matched after quarter turns: {', '.join(photographs[i].name for i in turned)}")
+        notes.append(f"matched after rotation by 90 or 180 degrees: {', '.join(photographs[i].name for i in turned)}")
     return other, notes
 
 
@@ -168,7 +168,7 @@ def _something_else(folder: Path) -> str:
         return "is the folder of a run; give the scene that it was fitted to"
     scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
     if scenes:
-        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one of them, or all to `warpgs farm`"
+        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one scene, or use `warpgs farm` for all"
     return ""
 
 
@@ -199,7 +199,8 @@ def _prepared(
         root = work / "frames"
         make_folder(root)
         total = write_frames(source, root, frames, progress)
-        notes.append(f"{min(frames, total)} of {total} frames are used: the sharpest of as many equal parts of the video")
+        taken = min(frames, total)
+        notes.append(f"{taken} of {total} frames are used: the sharpest frame of each of {taken} equal parts of the video")
     root = image_root(root)
     paths, unread = find_photographs(root), unread_note(root)
     notes += folder_notes(root)

@@ -54,8 +54,8 @@ def to_jpeg(
         return {}
     if importlib.util.find_spec("pi_heif") is None:
         raise UsageError(
-            f"{paths[0]}: is a HEIC photograph, which pi-heif reads, and that is not installed; `pip install 'warpgs[poses]'`, "
-            "or convert all of them to JPEG"
+            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; `pip install 'warpgs[poses]'`, "
+            "or convert all HEIC files to JPEG"
         )
     copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
     for copy in copies.values():

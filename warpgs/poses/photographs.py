@@ -176,7 +176,7 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
 
     data = read_image_file(photograph.path, max_pixels)
     if hashlib.sha256(data).hexdigest() != photograph.digest:
-        raise DataError(f"{photograph.path}: the file changed while its pose was sought; start again")
+        raise DataError(f"{photograph.path}: the file has changed since it was read; start again")
     kind, target = _format(data), folder / PurePosixPath(photograph.name)
     make_folder(target.parent)
     if photograph.orientation == 1 and kind in ("JPEG", "PNG"):

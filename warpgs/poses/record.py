@@ -56,8 +56,8 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         remarks.append(f"the focal length is taken from EXIF, because {len(found.views)} photographs cannot improve it")
     elif found.kept_focal is False:
         remarks.append(
-            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; it was estimated "
-            "from them instead. Such an estimate is often 5 % off, at worst 20 % or more"
+            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; the focal length "
+            "was estimated instead. Such an estimate is often 5 % off, at worst 20 % or more"
         )
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
@@ -66,7 +66,8 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         )
     if found.method == "global":
         remarks.append(
-            "global mapping joined more photographs than incremental mapping; its results differ a little from run to run"
+            "global mapping is used, because it joined more photographs than incremental mapping; results of global mapping "
+            "differ a little from run to run"
         )
     return {
         "format": FORMAT, "source_sha256": digest, "photographs": rows,

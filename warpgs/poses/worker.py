@@ -175,7 +175,7 @@ def believes_exif(kept: list[Any], free: list[Any]) -> bool:
 
 def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
     """Return the models in which all poses are found at once."""
-    _say(progress="finding poses: all at once")
+    _say(progress="finding poses: all photographs at once")
     if not pycolmap.calibrate_view_graph(job["database"]):
         return []
     options = pycolmap.GlobalPipelineOptions()

@@ -129,7 +129,7 @@ def connection_class(rules: Rules) -> type:
                     continue
                 try:
                     if not self.allowance.take():
-                        raise DataError(f"more than {MESSAGES_PER_SECOND:.0f} messages a second came")
+                        raise DataError(f"more than {MESSAGES_PER_SECOND:.0f} messages a second")
                     checked = rules.checked(frame)
                 except DataError as e:
                     self.refused = True
