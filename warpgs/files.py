@@ -227,7 +227,7 @@ def read_file(path: Path, below: Path) -> bytes:
         below: Folder that contains it; no link below that folder is followed.
 
     Raises:
-        DataError: It cannot be read, is a link, or is not a regular file.
+        DataError: The file cannot be read, is a link, or is not a regular file.
     """
     try:
         return read_input(path, below=below)
@@ -239,7 +239,7 @@ def appending(path: Path) -> BinaryIO:
     """Open a file to append to, made if it is missing; a link is not followed.
 
     Raises:
-        OSError: It cannot be opened, is a link, or is not a regular file.
+        OSError: The file cannot be opened, is a link, or is not a regular file.
     """
     with open_folder(path.parent) as folder:
         descriptor = folder.open_regular(path.name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -250,7 +250,7 @@ def remove_file(path: Path) -> None:
     """Remove a file, or a link itself, if it is there.
 
     Raises:
-        ResourceError: It cannot be removed.
+        ResourceError: The file cannot be removed.
     """
     try:
         with contextlib.suppress(FileNotFoundError), open_folder(path.parent) as folder:
@@ -263,7 +263,7 @@ def move_folder(folder: Path, name: str) -> Path:
     """Rename a folder in its place, and return its path.
 
     Raises:
-        OSError: It cannot be moved, or is a link.
+        OSError: The folder cannot be moved, or is a link.
     """
     with open_folder(folder.parent) as above:
         above.folder(folder.name).close()
@@ -275,7 +275,7 @@ def make_folder(folder: Path) -> bool:
     """Make a folder, and those above it, where it is missing; return whether it was made.
 
     Raises:
-        ResourceError: It cannot be created, or is behind a link that is not followed.
+        ResourceError: The folder cannot be created, or is behind a link that is not followed.
     """
     try:
         made = not os.path.exists(folder)  # False where Path.exists would raise an error
@@ -298,7 +298,7 @@ def writing_into(folder: Path) -> Iterator[bool]:
     """Make a folder if it is missing, and follow no link below it in this block; yields whether it was made.
 
     Raises:
-        ResourceError: It cannot be created or opened, or is behind a link that is not followed.
+        ResourceError: The folder cannot be created or opened, or is behind a link that is not followed.
     """
     made = make_folder(folder)
     with contextlib.ExitStack() as stack:
@@ -315,7 +315,7 @@ def is_empty(folder: Path) -> bool:
     """Return whether a folder holds nothing but what an interrupted write or its lock left there.
 
     Raises:
-        ResourceError: It cannot be looked into.
+        ResourceError: The folder cannot be listed.
     """
     try:
         return all(p.name == LOCK or OWN_NAMES.fullmatch(p.name) for p in folder.iterdir())

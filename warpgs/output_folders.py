@@ -83,7 +83,7 @@ class Folder:
         """Open a file, and return its descriptor.
 
         Raises:
-            OSError: It cannot be opened, or is a link.
+            OSError: The file cannot be opened, or is a link.
         """
         if WINDOWS and self.is_link(name):
             raise _link(self.path / name)
@@ -97,7 +97,7 @@ class Folder:
 
         Raises:
             OSError: As for `open`.
-            RefusedError: It is a pipe or a device, which is not waited for.
+            RefusedError: The file is a pipe or a device; the call does not wait for it.
         """
         try:
             descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
@@ -114,8 +114,8 @@ class Folder:
         """Open a folder in this one.
 
         Raises:
-            NotADirectoryError: It is a file.
-            OSError: It cannot be opened, or is a link.
+            NotADirectoryError: The entry is a file.
+            OSError: The folder cannot be opened, or is a link.
         """
         path = self.path / name
         if WINDOWS:
@@ -190,7 +190,7 @@ def output_folder(folder: Path) -> Iterator[None]:
     meanwhile, the next write is rejected.
 
     Raises:
-        OSError: It is missing, or is behind a link below an open folder.
+        OSError: The folder is missing, or is behind a link below an open folder.
     """
     path = folder.absolute()
     with _LOCK:
@@ -222,7 +222,7 @@ def open_folder(path: Path, make: bool = False) -> Folder:
         make: True to create missing parent folders, only below an open folder.
 
     Raises:
-        OSError: It cannot be opened, or a parent folder is a link.
+        OSError: The folder cannot be opened, or a parent folder is a link.
     """
     path = path.absolute()
     with _LOCK:
@@ -248,8 +248,8 @@ def open_file(path: Path, below: Path) -> BinaryIO:
         below: Folder above it, such as that of a run.
 
     Raises:
-        OSError: It cannot be opened, or is a link.
-        RefusedError: It is not a regular file.
+        OSError: The file cannot be opened, or is a link.
+        RefusedError: The file is not a regular file.
     """
     with output_folder(below), open_folder(path.parent) as folder:
         return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")

@@ -83,7 +83,7 @@ class Registry(Generic[T]):
         """Return the name of a class, which is registered as ``module:Class`` where it has none yet.
 
         Raises:
-            UsageError: It is a class of another kind.
+            UsageError: The class is of another kind.
         """
         self._checked(cls, cls.__name__)
         return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name

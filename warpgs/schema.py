@@ -38,7 +38,7 @@ def parse(text: str | bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        SchemaError: It is not JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
+        SchemaError: The text is not JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
     """
     if len(text) > MAX_BYTES:
         raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
@@ -68,7 +68,7 @@ def check_depth(value: Any, most: int) -> None:
     """Check that at most so many lists and objects are nested, without a call for each.
 
     Raises:
-        SchemaError: There are more.
+        SchemaError: More are nested.
     """
     level, depth = [value], 0
     while level := [part for outer in level for part in _parts(outer)]:
@@ -92,7 +92,7 @@ def read(path: Path, below: Path | None = None) -> Any:
             the user names.
 
     Raises:
-        OSError: It cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
+        OSError: The file cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
         SchemaError: `parse` rejects its content.
     """
     return parse(read_input(path, MAX_BYTES, below))

@@ -61,7 +61,7 @@ class TemporaryFile:
             suffix: End of its name: none, .mp4 or .webm.
 
         Raises:
-            OSError: It cannot be made.
+            OSError: The file cannot be made.
         """
         self._folder = folder
         self.name, self.descriptor = _own_file(folder, suffix, locks=sys.platform != "win32")
@@ -98,7 +98,7 @@ class TemporaryFolder:
             mode: Rights of the folder.
 
         Raises:
-            OSError: It cannot be made.
+            OSError: The folder cannot be made.
         """
         self._above, self._process = above, os.getpid()
         lock, self._descriptor = _own_file(above, LOCKED, locks=True, prefix=prefix, mode=0o600)
@@ -139,7 +139,7 @@ def temporary_folder() -> TemporaryFolder:
     What killed commands of this user left there is removed.
 
     Raises:
-        OSError: There is no writable folder for it.
+        OSError: No folder for temporary files is writable.
     """
     sweep_temporary_files()
     return TemporaryFolder(open_folder(system_folder()), "warpgs-", 0o700)

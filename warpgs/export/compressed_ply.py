@@ -84,7 +84,7 @@ def start_of(path: Path) -> bytes:
 
 
 def is_compressed(path: Path, data: bytes) -> bool:
-    """Return whether the bytes of a .ply file are of this format, by its header; DataError where it has none."""
+    """Return whether the header of a .ply file announces this format; DataError if the file has no header."""
     elements, _ = parse_header(path, data[:MAX_HEADER_BYTES])
     return any(e.name == "vertex" and "packed_position" in dict(e.properties) for e in elements)
 
@@ -93,7 +93,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The file is malformed, truncated, or for another way of rendering.
+        DataError: The file is malformed or truncated, or needs another render mode.
     """
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     tables = {}

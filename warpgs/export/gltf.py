@@ -1,6 +1,7 @@
 """The format glTF with the extension KHR_gaussian_splatting, in float32: .glb, or .gltf with its numbers inside.
 
-Axes lengths are linear, opacities after the sigmoid, rotations xyzw. Axes have y up, a half turn about z from those of PLY.
+Axis lengths are linear, opacities after the sigmoid, rotations xyzw. Coordinates have y up: a half turn about z from those of
+PLY.
 """
 
 from __future__ import annotations
@@ -228,7 +229,7 @@ def _inside(path: Path, uri: object) -> bytes:
 
 
 def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    """Return the one primitive of Gaussians, checked for what this program does not read."""
+    """Return the one primitive of Gaussians; DataError for features that are not supported."""
     meshes, nodes = document.get("meshes"), document.get("nodes", [])
     found = []
     for mesh in meshes if isinstance(meshes, list) else []:

@@ -250,7 +250,7 @@ class PLY(Format):
         write_ply(path, gaussians, normalization, units=units, antialiased=self.antialiased)
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-        """Read Gaussians with `read_ply`, or as `CompressedPLY` where the header is of that.
+        """Read Gaussians with `read_ply`, or with `CompressedPLY` if the header announces that format.
 
         Raises:
             DataError: The file is missing or malformed.

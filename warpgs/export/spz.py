@@ -131,7 +131,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     Raises:
         DataError: The file is malformed, truncated, or announces more than its size can hold.
-        UsageError: It is of version 4, and zstandard is not installed.
+        UsageError: The file has version 4, and zstandard is not installed.
     """
     if data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
@@ -148,7 +148,7 @@ def decode(path: Path, data: bytes) -> Arrays:
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
         sections = _streams(path, data, sizes, count, place)
     arrays = _unpack(sections, n, degree, bits, version)
-    next(sections, None)  # checks the end of the last one
+    next(sections, None)  # checks the end of the last section
     half_turn_in_place(arrays, "x")
     return arrays
 

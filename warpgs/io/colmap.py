@@ -124,7 +124,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 @contextmanager
 def _understood(path: Path, line: int):
-    """Turn what parsing a line may raise into an error that names file and line."""
+    """Turn errors of parsing a line into a DataError that names file and line."""
     try:
         yield
     except (ValueError, IndexError, OverflowError) as e:
@@ -166,7 +166,7 @@ def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]])
 
 
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` reads those that are not undistorted, too.
+    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows `NATIVE_MODELS`.
 
     Raises:
         DataError: The file is malformed, or a camera model is not supported.

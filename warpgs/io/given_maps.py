@@ -41,7 +41,7 @@ class GivenMaps:
         """List the folders that are named.
 
         Raises:
-            DataError: One is missing, or holds no map.
+            DataError: A folder is missing, or holds no map.
         """
         self.options, self.max_pixels = options, max_pixels
 
@@ -116,7 +116,7 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
     """Return notes on the maps of a scene's views.
 
     Raises:
-        DataError: A folder is named, and no view has a map of it.
+        DataError: A folder is given, but no view has a map in it.
     """
     notes = []
     flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
@@ -133,7 +133,7 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
 
 
 def _about(name: str, views: Sequence[View], options: MapOptions) -> str:
-    """Return words on the values of the maps, for a note."""
+    """Return a description of the values of the maps, for a note."""
     if name == "normals":
         return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
     share = float(np.mean([(v.depth.values > 0).mean() for v in views if v.depth is not None]))

@@ -12,7 +12,7 @@ def inside(path: Path, root: Path, noun: str) -> Path:
     """Return a path after a check that no link in it points outside ``root``; ``noun`` is its name in messages.
 
     Raises:
-        DataError: One does.
+        DataError: A link points outside.
     """
     if not is_below(path, root):
         raise DataError(f"{path}: a link points outside {noun}; put the files inside of it, or pass --allow-outside")

@@ -186,7 +186,7 @@ def _finished(
     if points is not None:
         points = normalize_points(points, n, str(root))
     if score_masks is not None or (root / FOLDER).is_dir():
-        # links of a folder that the user names must stay in it, those of the scene's own folder in the scene
+        # links in a folder that the user names must stay inside it; links in the scene's own folder, inside the scene
         masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
         plain = replace(options, mask_keeps="white", maps=NO_MAPS)
         views, note = add_score_masks(views, masks, SceneFolder(bound, plain))

@@ -98,7 +98,7 @@ class MapFolder:
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for a missing one.
 
-        A map has the path of the image below any folder above it, so `a/b.jpg` has `a/b.png` or `b.png`; the longest counts.
+        A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match counts.
         """
         tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
         for tail in tails:
@@ -131,7 +131,7 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
 def _read_array(path: Path, max_pixels: int) -> np.ndarray:
     try:
         open_input(path).close()
-        # mapped, because that holds the announced shape against the file's size before memory is taken
+        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
@@ -206,7 +206,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
 def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
-    Integers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
+    Integers are divided by the largest value of their type; maps with only the levels 0, 1 and 2 are divided by 2.
 
     Raises:
         DataError: The file is not a map, of another shape, or not in [0, 1].

@@ -16,8 +16,8 @@ SAME_SURFACE = 0.05
 def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
     """Return a map [H, W] or [H, W, C] at another size; 0 marks missing values.
 
-    A pixel of a smaller map has the value known nearest to its centre, so that few points stay what they are. A larger map is
-    interpolated between known neighbours on one surface, and else takes the nearest value.
+    In a reduced map, a pixel takes the known value nearest to its centre, which keeps sparse depths. An enlarged map is
+    interpolated between known neighbours on one surface; elsewhere a pixel takes the nearest value.
     """
     import cv2
 

@@ -142,7 +142,7 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     """Return the transform_matrix of a frame, shape [3, 4] or [4, 4].
 
     Raises:
-        DataError: It is missing, or not made of rows of numbers.
+        DataError: The matrix is missing or not made of rows of numbers.
     """
     try:
         # through object, so that ragged rows and huge integers are caught here and strings are not parsed

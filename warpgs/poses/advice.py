@@ -1,4 +1,4 @@
-"""Advice on photographs and their poses: why one has no pose, and what to photograph next."""
+"""Advice on photographs and their poses: why a photograph has no pose, and what to photograph next."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from warpgs.poses.mapping import Mapping
 
 MIN_KEYPOINTS = 100
-"""Keypoints below which a photograph shows too little to find again: a blank wall, darkness, blur."""
+"""Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
 MIN_MATCHES = 15
-"""Matches that agree with one motion of the camera which a pair needs."""
+"""Number of matches that a pair needs; they agree with one motion of the camera."""
 WEAK_MATCHES = 60
 """Matches below which the link between two photographs is called weak: a few wrong ones bend the poses."""
 WIDE_ANGLE = 30.0
-"""Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few places again."""
+"""Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few matches."""
 MAX_ADVICE = 8
 """Number of pieces of advice that are given, the most urgent first."""
 
 
 def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
-    """Return the photographs that one matches, each with the number of matches, the most first."""
+    """Return the photographs that photograph ``i`` matches, each with the number of matches, most matches first."""
     return sorted(found.links.get(i, ()), key=lambda link: (-link[1], link[0]))
 
 
@@ -50,7 +50,7 @@ def axis_angle(found: Mapping, i: int, j: int) -> float:
 
 
 def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
-    """Return the pairs of views that join all by the smallest angles (a minimum spanning tree), with the angle of each."""
+    """Return the pairs of views that connect all views by the smallest angles (a minimum spanning tree), with their angles."""
     last, *left = list(found.views) or [-1]
     nearest: dict[int, tuple[float, int]] = dict.fromkeys(left, (math.inf, -1))
     tree = []

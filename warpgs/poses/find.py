@@ -92,10 +92,10 @@ def find_poses(
     Args:
         source: Folder of images, or a video file.
         out: Scene folder to make; new or empty.
-        frames: Frames that are taken of a video.
+        frames: Number of frames to take from a video.
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.
-        allow_outside: Let links lead to photographs outside the folder.
+        allow_outside: True to allow links to photographs outside the folder.
         matcher: ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose;
             None for SIFT only.
         progress: Called with lines for the user.
@@ -140,9 +140,10 @@ def _with_network(
     network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
     progress: Callable[[str], object], threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
-    """Return the model by the network's matches if it has more photographs than SIFT's, and notes; it is asked where some lack.
+    """Return the model from the network's matches if it has more photographs than SIFT's, and notes.
 
-    The model lies in ``work``/model. Arguments are those of `find_model`.
+    The network runs only if SIFT leaves photographs without a pose. The model lies in ``work``/model. Arguments are those of
+    `find_model`.
     """
     count = len(found.views)
     if count == len(photographs):

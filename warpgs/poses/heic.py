@@ -29,7 +29,7 @@ def is_heic(path: Path) -> bool:
     """Return whether a file begins as a HEIC file does.
 
     Raises:
-        DataError: It cannot be read.
+        DataError: The file cannot be read.
     """
     return kind(read_image_start(path, BRANDS_END)) == "HEIC"
 

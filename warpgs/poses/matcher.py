@@ -76,8 +76,8 @@ class Matcher:
 
         Args:
             image: The image as it is, uint8 RGB [H, W, 3].
-            turns: Quarter turns to the left after which the network sees it.
-            side: Longer side at which the network sees it [px], unless its graph fixes the size.
+            turns: Quarter turns to the left by which the image is rotated first.
+            side: Longer side at which the network sees the image [px], unless its graph fixes the size.
             most: Largest number of keypoints, those of the highest score.
 
         Raises:
@@ -172,7 +172,7 @@ def mutual_matches(a: Features, b: Features) -> np.ndarray:
 
 
 def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the quarter turns to the left after which photographs have the same side up, most of them none.
+    """Return the quarter turns to the left after which photographs have the same side up; for most photographs 0.
 
     Each pair is matched with the second photograph in all four turns. The pairs with the most matches, a maximum spanning tree,
     decide.
@@ -210,7 +210,7 @@ def write_matches(
         images: Copies of the photographs that are matched, PNG.
         out: File to write, .npz.
         kind: photographs or video.
-        exhaustive: Most photographs of which all pairs are matched.
+        exhaustive: Largest number of photographs of which all pairs are matched.
         progress: Called with lines for the user.
 
     Returns:

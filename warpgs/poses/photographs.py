@@ -25,7 +25,7 @@ MASK_FOLDERS = ("mask", "masks", "idrmasks")
 RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
 """Files that identify, with a config.json, the folder of a run."""
 SHOWN_FOLDERS = 10
-"""Folders of photographs that a note names."""
+"""Largest number of folders of photographs that a note names."""
 MATCHING_SIDE = 2000
 """Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
 DIAGONAL_35MM = math.hypot(36, 24)
@@ -57,7 +57,7 @@ class Photograph:
 
 
 def image_root(folder: Path) -> Path:
-    """Return the folder with the photographs: ``images`` in it where that holds some, else the folder itself."""
+    """Return the folder with the photographs: its subfolder ``images`` if that holds photographs, else the folder itself."""
     inner = folder / "images"
     return inner if inner.is_dir() and list_images(inner) else folder
 
@@ -145,7 +145,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
     data = read_image_file(path, max_pixels)
     name, colors = path.relative_to(root).as_posix(), decode(path, max_pixels, data)[0]
-    exif = read_exif(data)  # of a file that has been found to be an image within the limits
+    exif = read_exif(data)  # decode has checked that the file is an image within the limits
     image = turn_upright(colors, exif.orientation)
     del colors
     height, width = image.shape[:2]

@@ -17,9 +17,9 @@ JSON, TEXT = "poses.json", "poses.txt"
 FORMAT = 1
 """Number of the format of poses.json."""
 SHOWN_PARTNERS = 5
-"""Matched photographs that the record names for each."""
+"""Largest number of matched photographs that the record names for a photograph."""
 FEW = 5
-"""Most photographs with which a focal length without EXIF is called uncertain (decision 017)."""
+"""Largest number of photographs for which a focal length without EXIF is called uncertain (decision 017)."""
 _PHOTOGRAPH = schema.fields(
     {
         "name": schema.text, "sha256": schema.text, "registered": schema.flag, "keypoints": schema.whole(0),
@@ -121,7 +121,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found.
 
     Raises:
-        DataError: It is missing, or not whole.
+        DataError: The record is missing or incomplete.
     """
     path = folder / JSON
     try:

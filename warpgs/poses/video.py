@@ -76,7 +76,7 @@ def _check_container(path: Path) -> None:
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size that noise is averaged away at."""
+    """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size at which noise averages out."""
     import cv2
 
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)

@@ -23,7 +23,8 @@ from warpgs.runtime.terminal import answer
 SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
-"""Matches that agree with one motion of the camera which a pair needs, and points that a new photograph must see."""
+"""Number of matches that a pair needs, all in agreement with one motion of the camera, and of points that a new photograph must
+see."""
 MIN_RATIO = 0.6
 """Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
 (decision 017)."""
@@ -69,7 +70,7 @@ def extract(pycolmap: Any, job: dict[str, Any]) -> None:
 
 
 def numbers_of(database: Any, job: dict[str, Any]) -> list[int]:
-    """Return the database's number of each photograph, in the order of the job."""
+    """Return the database's id of each photograph, in the order of the job."""
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     return [numbers[name] for name in job["names"]]
 

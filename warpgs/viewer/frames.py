@@ -86,7 +86,7 @@ def read_frame(frame: bytes | str) -> dict[str, Any]:
         frame: MessagePack, as viser's page sends it.
 
     Raises:
-        DataError: It is not a message, not one of `MESSAGES`, or a field has an invalid value.
+        DataError: The frame is not a message, not one of `MESSAGES`, or a field has an invalid value.
     """
     import msgspec
 

@@ -25,7 +25,7 @@ def require_viser() -> None:
     """Check that viser is there.
 
     Raises:
-        ResourceError: It is not installed; the message names the package.
+        ResourceError: viser is not installed; the message names the package.
     """
     try:
         version("viser")
