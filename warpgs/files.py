@@ -38,8 +38,8 @@ def replacing(
 ) -> Iterator[Path]:
     """Give the path of a temporary file beside ``path``; once the block has written it, it takes the place of ``path``.
 
-    It is synced to the disk and checked first, and the folder is synced after. On any error, also of the block, the temporary
-    file is removed and an old file stays unchanged. Where ``path`` is a link, the link is replaced.
+    The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error, also one of the
+    block, the temporary file is removed and an old file stays unchanged. Where ``path`` is a link, the link is replaced.
 
     Args:
         path: File to write or to replace.
@@ -101,8 +101,8 @@ def _reachable(folder: Folder) -> Path:
 def filling(folder: Path) -> Iterator[Path]:
     """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
 
-    On any error, also of the block, the temporary folder is removed. It is locked
-    meanwhile. Left-overs of killed writers beside it are removed.
+    The temporary folder is locked during the block, and removed on any error, also one of the block. Left-overs of killed
+    writers beside it are removed.
 
     Args:
         folder: Folder to make; it may exist if it is empty.
@@ -148,7 +148,7 @@ def _not_made(folder: Path, error: OSError) -> ResourceError:
 
 
 def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
-    """Put a file in the place of another; on Windows, where no open file can be replaced, a few times."""
+    """Replace a file by another; on Windows, where no open file can be replaced, try a few times."""
     if WINDOWS:
         temporary.close()
     for pause in PAUSES if WINDOWS else ():

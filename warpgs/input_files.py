@@ -1,4 +1,4 @@
-"""Opening of input files: regular files alone, of bounded size, so that no pipe hangs a command and no device fills its memory.
+"""Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its memory.
 
 Every untrusted file is opened here. An unreadable one raises an OSError with the reason as its ``strerror``; callers turn it
 into a `DataError` with a remedy, with the text of `unread_reason`.

@@ -44,7 +44,7 @@ class Folder:
     """An open folder, whose entries are used by name without following links; a context manager that closes it."""
 
     def __init__(self, path: Path, descriptor: int | None):
-        """Take its path, and its descriptor: None where the system has none."""
+        """Take the path of the folder and its descriptor, None where the system has no descriptors of folders."""
         self.path, self.descriptor = path, descriptor
 
     def __enter__(self) -> Folder:
@@ -76,7 +76,7 @@ class Folder:
         )
 
     def _explained(self, name: str, error: OSError) -> OSError:
-        """Return the error to raise for an entry: that it is a link, where it is one."""
+        """Return the error to raise for an entry: one about a link if the entry is a link, else ``error``."""
         return _link(self.path / name) if self.is_link(name) else error
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
@@ -184,10 +184,10 @@ _LOCK = threading.RLock()
 
 @contextlib.contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
-    """Have all that is written below a folder, in this block, go through its descriptor and follow no link.
+    """Write everything below a folder, in this block, through its descriptor and without following links.
 
-    The folder itself may be reached through links, unless it is below another open one. Where another folder takes its place
-    meanwhile, the next write is rejected.
+    The folder itself may be reached through links, unless it is below another open one. If another folder takes its place
+    during the block, the next write is rejected.
 
     Raises:
         OSError: The folder is missing, or is behind a link below an open folder.
@@ -266,13 +266,13 @@ def _opened(name: str, more: int, at: int | None) -> int:
 
 
 def _outermost(path: Path) -> _Root | None:
-    """Return the open folder above a path, or at it, that has no other above it."""
+    """Return the outermost open folder that is the path or above it."""
     parts = path.parts
     return next((_ROOTS[parts[:i]] for i in range(1, len(parts) + 1) if parts[:i] in _ROOTS), None) if _ROOTS else None
 
 
 def _again(root: _Root) -> Folder:
-    """Return another opening of an open folder, which is still the one that its path names."""
+    """Open an open folder again, after a check that its path still names this folder."""
     try:
         now = os.stat(root.path)
     except OSError as e:

@@ -1,4 +1,4 @@
-"""Parts that plug in: classes found by name, whether ours or a user's."""
+"""Parts that plug in: classes found by name, built-in or a user's own."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ class Registry(Generic[T]):
     """Classes of one kind by name.
 
     Built-in classes are in the modules of a package, which are imported to look up a name; so a new class is a new file. A
-    user's own is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. Nothing
-    is ever imported because a stored file names it.
+    user's own is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A name in
+    a stored file never causes an import.
     """
 
     def __init__(self, kind: str, base: type[T], package: str):
         """Start without classes.
 
         Args:
-            kind: What the classes are, for messages: strategy, loss term, view module, reader.
-            base: What each class derives from.
+            kind: Kind of the classes, for messages: strategy, loss term, view module, reader.
+            base: Class from which each class derives.
             package: Dotted name of the package, or module, of the built-in classes.
         """
         self.kind, self.base, self.package = kind, base, package
@@ -181,7 +181,7 @@ def _digest(cls: type) -> str:
 
 
 def own_places(classes: Iterable[type]) -> list[str]:
-    """Return where `module_of` finds the modules of classes that are not of warpgs; a script that runs is left out."""
+    """Return where `module_of` finds the modules of classes that are not of warpgs; the running script is left out."""
     modules = {c.__module__ for c in classes if not _is_ours(c)} - {"__main__"}
     files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
     return sorted(str(place) for place in files.values() if place)

@@ -53,7 +53,7 @@ MAX_PIXEL_BYTES = 8
 MAX_PALETTE_PIXELS = 2**20
 """Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
 """Most Gaussians per byte of a file, most pixels per Gaussian, and a number added to both limits: real files have one Gaussian
-per ten bytes, and one pixel per Gaussian. Larger files are decompression bombs."""
+per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 

@@ -17,7 +17,7 @@ MAX_BYTES = 2**30
 MAX_FPS = 50
 """Frames per second above which browsers slow an animated image down to 10."""
 QUALITY = 80
-"""Quality of WebP, of 100."""
+"""Quality of WebP, from 0 to 100."""
 PALETTE_PIXELS = 2**18
 """Pixels of all frames that a GIF's palette is chosen from."""
 

@@ -38,7 +38,7 @@ def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
 
 
 def remedy_for(why: str) -> str:
-    """Return how to help against the reason that `run_pyvista` gave."""
+    """Return the fix for a reason that `run_pyvista` returned."""
     if disk_is_full(folder := system_folder(), why):
         return f"free some disk space for temporary files in {folder}, or set the variable TMPDIR to another folder"
     return "`pip install pyvista`" if "No module named" in why else REMEDY

@@ -82,7 +82,7 @@ class ScenePlot:
     direction: np.ndarray
     """Direction from the scene to the eye, any length, shape [3]."""
     legend: list[tuple[str, str]]
-    """Words and colour (#rrggbb) of each entry besides the cameras."""
+    """Text and colour (#rrggbb) of each entry besides the cameras."""
 
 
 def _frustum_size(cameras: list[Camera], reach: float) -> float:
@@ -95,7 +95,7 @@ def _frustum_size(cameras: list[Camera], reach: float) -> float:
 
 
 def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, int], background: str) -> bytes:
-    """Return a PNG of the size wanted: a render, and below it a strip with a square and words for each entry."""
+    """Return a PNG of the size wanted: a render, and below it a strip with a square and text for each entry."""
     from PIL import Image, ImageDraw, ImageFont
 
     canvas = Image.new("RGB", size, background)

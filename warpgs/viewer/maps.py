@@ -1,4 +1,4 @@
-"""Images that the browser cannot draw, rendered here at its camera: all directions, depth, coverage, error."""
+"""Images that the browser cannot draw, rendered here at the browser's camera: all directions, depth, coverage, error."""
 
 from __future__ import annotations
 
