@@ -22,7 +22,7 @@ LOW_PASS = 0.3
 """Variance added to both image axes [px^2]: about the box filter of one pixel (1/12) plus margin against aliasing."""
 
 TILE_SIZE = 16
-"""Side of a tile [px] where no other is requested, in fits too."""
+"""Default side of a tile [px], also in fits."""
 
 K_TOLERANCE = 1e-5
 """Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""

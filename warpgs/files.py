@@ -92,7 +92,7 @@ def _replaced(
 
 
 def _reachable(folder: Folder) -> Path:
-    """Return a path to an open folder that libraries can use: that of its descriptor, where the system has such paths."""
+    """Return a path to an open folder that libraries can use: the path of its descriptor, where the system has such paths."""
     shown = DESCRIPTORS / str(folder.descriptor)
     return shown if folder.descriptor is not None and shown.is_dir() else folder.path
 
@@ -135,7 +135,7 @@ def filling(folder: Path) -> Iterator[Path]:
 
 
 def _clear(above: Folder, name: str) -> None:
-    """Remove an empty folder, with what killed writers left in it."""
+    """Remove an empty folder, and leftovers of killed writers in it."""
     with above.folder(name) as inside:
         sweep(inside)
     above.rmdir(name)
@@ -312,7 +312,7 @@ def writing_into(folder: Path) -> Iterator[bool]:
 
 
 def is_empty(folder: Path) -> bool:
-    """Return whether a folder holds nothing but what an interrupted write or its lock left there.
+    """Return whether a folder is empty, except for a lock and leftovers of interrupted writes.
 
     Raises:
         ResourceError: The folder cannot be listed.

@@ -66,8 +66,8 @@ def check_pinhole(camera: Camera) -> None:
     """
     if camera.model != "pinhole":
         raise UsageError(
-            f"this works for pinhole cameras only, and this one is {camera.model!r}; read the scene with --lenses "
-            "undistort, or undistort the images first"
+            f"only pinhole cameras are supported here, not {camera.model!r}; read the scene with --lenses undistort, or "
+            "undistort the images first"
         )
 
 

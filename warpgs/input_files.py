@@ -28,8 +28,8 @@ def open_input(path: str | os.PathLike[str], below: Path | None = None) -> Binar
 
     Args:
         path: The file.
-        below: Folder above it, such as a run's, from which no link to it is followed. None for a file that the user names,
-            which may be a link.
+        below: Folder above the file, such as a run folder; no link from there to the file is followed. None for a file that the
+            user names, which may be a link.
 
     Raises:
         OSError: The file is missing, unreadable, a folder, a link that is not followed, or no regular file (a pipe, a socket, a

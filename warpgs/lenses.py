@@ -33,8 +33,8 @@ def check_known(model: str) -> None:
     """
     if model not in MODELS:
         raise UsageError(
-            f"points are projected outside of the rasterizer for the models {', '.join(MODELS)} only, and this camera is "
-            f"{model!r}; undistort the images first"
+            f"outside the rasterizer only the camera models {', '.join(MODELS)} are supported, not {model!r}; undistort the "
+            "images first"
         )
 
 

@@ -1,4 +1,4 @@
-"""Folders that this process writes into: the one that the user names may be a link, below it no link is followed.
+"""Folders that this process writes into: the folder that the user names may be a link; below it no link is followed.
 
 `output_folder` opens such a folder for a block. Everything below it is then reached from its descriptor, folder by folder,
 without following links, so that no other program can redirect a write or a read. Of nested folders the outermost counts.
@@ -245,7 +245,7 @@ def open_file(path: Path, below: Path) -> BinaryIO:
 
     Args:
         path: The file.
-        below: Folder above it, such as that of a run.
+        below: Folder above the file, such as a run folder.
 
     Raises:
         OSError: The file cannot be opened, or is a link.

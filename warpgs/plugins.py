@@ -80,7 +80,7 @@ class Registry(Generic[T]):
         return sorted(n for n in self._classes if ":" not in n)
 
     def name_of(self, cls: type[T]) -> str:
-        """Return the name of a class, which is registered as ``module:Class`` where it has none yet.
+        """Return the name of a class; a class without a name is registered as ``module:Class``.
 
         Raises:
             UsageError: The class is of another kind.

@@ -21,7 +21,7 @@ MAX_BYTES = 2**25
 MAX_DEPTH = 50
 """Largest number of nested lists and objects, so that code that walks through a value needs no limit of its own."""
 MAX_PARTS = 2**19
-"""Largest number of lists and objects, each of which takes some thirty times as much memory as text."""
+"""Largest number of lists and objects; each takes some thirty times as much memory as its text."""
 MAX_WHOLE = 2**63 - 1
 """Largest integer: that of 64 bits."""
 MAX_NUMBER = 1e300

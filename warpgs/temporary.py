@@ -167,7 +167,7 @@ def sweep(folder: Folder, own: bool = False) -> None:
 
     Args:
         folder: Their folder.
-        own: Whether to touch only what belongs to this user.
+        own: True to remove only entries of this user.
     """
     with contextlib.suppress(OSError):
         for name in filter(NAMES.fullmatch, folder.names()):

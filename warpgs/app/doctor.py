@@ -36,7 +36,7 @@ class Finding:
     """Result of one check."""
 
     topic: str
-    """Subject in a word or two, unique within a report."""
+    """Subject, one or two words, unique within a report."""
     status: Literal["ok", "missing", "note"]
     """``missing`` where something does not work; ``note`` where a fit works, but slower or with fewer features."""
     detail: str
@@ -346,7 +346,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
 
 
 def print_report(findings: list[Finding], console=None) -> int:
-    """Print the findings as a table, and below it what to do about them.
+    """Print the findings as a table, and the fixes below it.
 
     Args:
         findings: what `diagnose` returned.

@@ -81,7 +81,7 @@ MAX_NUMBER = 3e38
 
 
 def _whole(words: list[str]) -> int:
-    """Return the integer that a word stands for; ValueError if it is not an integer of 64 bits."""
+    """Return the integer of an argument; ValueError if it is not an integer of 64 bits."""
     if not re.fullmatch(r"[+-]?[0-9][0-9_]*", words[0]):
         raise ValueError(f"expected an integer, got {words[0][:40]!r}")
     if len(words[0]) > 40 or abs(number := int(words[0])) > MAX_WHOLE:
@@ -90,7 +90,7 @@ def _whole(words: list[str]) -> int:
 
 
 def _number(words: list[str]) -> float:
-    """Return the number that a word stands for; ValueError if it is not a number, not finite, or beyond float32."""
+    """Return the number of an argument; ValueError if it is not a number, not finite, or beyond float32."""
     plain = re.fullmatch(r"[+-]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][+-]?[0-9]+)?", words[0])
     if not plain:
         raise ValueError(f"expected a finite number, got {words[0][:40]!r}")
@@ -100,7 +100,7 @@ def _number(words: list[str]) -> float:
 
 
 def _switch(words: list[str]) -> bool:
-    """Return True or False for its word, in any case; ValueError for another word."""
+    """Return True for true and False for false, in any case; ValueError for another argument."""
     found = {"true": True, "false": False}.get(words[0].lower())
     if found is None:
         raise ValueError(f"expected true, false or none, got {words[0][:40]!r}")
@@ -108,7 +108,7 @@ def _switch(words: list[str]) -> bool:
 
 
 PARSERS: dict[Any, Any] = {int: _whole, float: _number, bool: _switch}
-"""Functions that return the value of a word, by its type."""
+"""Functions that return the value of an argument, by its type."""
 
 
 def _number_rule(info: Any) -> Any:

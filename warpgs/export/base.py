@@ -40,7 +40,7 @@ class Format:
     name: ClassVar[str] = ""
     """Name in the registry."""
     suffix: ClassVar[str] = ""
-    """End of the names of its files in lower case, with the dot, such as ``.spz``."""
+    """Suffix of file names in lower case, with the dot, such as ``.spz``."""
     description: ClassVar[str] = ""
     """One line about the format, for the help."""
     Config: ClassVar[type | None] = None

@@ -49,7 +49,7 @@ MAX_CONTENTS_BYTES = 2**16
 """Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
 MAX_PIXEL_BYTES = 8
-"""Most bytes of a pixel in a lossless WebP image; one that cannot be compressed takes little more than 4."""
+"""Largest number of bytes per pixel of a lossless WebP image; incompressible pixels take little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
 """Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
 """Most Gaussians per byte of a file, most pixels per Gaussian, and a number added to both limits: real files have one Gaussian

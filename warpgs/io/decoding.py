@@ -120,7 +120,7 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
     Args:
         path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.
         max_pixels: Largest number of pixels that its header may announce.
-        data: Its bytes, where they have been read already.
+        data: Bytes of the file, if they have been read already.
 
     Returns:
         Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.

@@ -20,5 +20,5 @@ def inside(path: Path, root: Path, noun: str) -> Path:
 
 
 def is_below(path: Path, root: Path) -> bool:
-    """Return True if a path is below ``root``, links followed; a circular link counts at its own place."""
+    """Return True if a path is below ``root``, links followed; a circular link is not followed."""
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))

@@ -39,9 +39,9 @@ class MapOptions:
     """Given maps of depth and normals, and the meaning of their numbers."""
 
     depths: Path | None = None
-    """Folder of depth maps; None for those that the scene names, ``none`` to ignore these."""
+    """Folder of depth maps; None for the maps that the scene names, ``none`` to ignore these."""
     normals: Path | None = None
-    """Folder of normal maps; None for those that the scene names, ``none`` to ignore these."""
+    """Folder of normal maps; None for the maps that the scene names, ``none`` to ignore these."""
     depth_kind: str = "metric"
     """Meaning of the depth maps, one of `DEPTH_KINDS`."""
     depth_unit: float | None = None
@@ -169,7 +169,7 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
 
 
 def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 for missing values.
+    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values.
 
     Raises:
         DataError: The file is not a map, or its values cannot be depths.
@@ -195,9 +195,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
         with np.errstate(over="ignore"):
             values = values * np.float32(unit)
     if not values.any():
-        raise DataError(
-            f"{path}: contains no depth, all values are 0 or not finite; remove the file, because views may have none"
-        )
+        raise DataError(f"{path}: contains no depth, all values are 0 or not finite; remove the file: maps are optional")
     if not values.max() < MAX_DEPTH:
         raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; use 0 for missing values")
     return values
@@ -221,7 +219,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
         largest = int(raw.max())
         values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
     if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"{path}: confidence must be in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
+        raise DataError(f"{path}: confidence must be in [0, 1], but ranges from {values.min():.4g} to {values.max():.4g}")
     return values
 
 
@@ -244,7 +242,7 @@ def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) 
         lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
     known = usable & (lengths >= NO_NORMAL)
     if not known.any():
-        raise DataError(f"{path}: contains no normals; remove the file, because views may have none")
+        raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
         raise DataError(

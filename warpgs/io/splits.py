@@ -203,7 +203,7 @@ def held_out_split(scene: Scene) -> tuple[str, str]:
 def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
     """Return pairs (held-out view, training view) with the same camera: a copy of the training image would score as well.
 
-    Two cameras are the same where no entry of their poses differs by a thousandth, lengths in extents of the camera set.
+    Two cameras count as the same if no entry of their poses differs by a thousandth; lengths are in extents of the camera set.
     """
     extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
     unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])

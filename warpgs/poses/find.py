@@ -164,7 +164,7 @@ def _with_network(
 
 
 def _something_else(folder: Path) -> str:
-    """Return what a folder holds instead of photographs, and what to give in its place; empty where it may hold some."""
+    """Return a message on a folder of a run or of scenes, with the fix; empty for a folder that may hold photographs."""
     if (folder / "config.json").is_file() and (folder / "renders").is_dir():
         return "is the folder of a run; give the scene that it was fitted to"
     scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
@@ -266,14 +266,14 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     if 2 * blank >= count:
         most = max(found.keypoints)
         why = (
-            f"{blank} of {count} show almost nothing that can be matched (at most {most:,} keypoints): a blank wall, "
-            "darkness or blur. Take sharp photographs of textured things, in good light"
+            f"{blank} of {count} photographs show almost nothing that can be matched (at most {most:,} keypoints): a blank "
+            "wall, darkness or blur. Take sharp photographs of textured things, in good light"
         )
     elif not largest:
-        why = f"no two of {count} show the same place. Take photographs that overlap by two thirds, in small steps"
+        why = f"no two of {count} photographs show the same place. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (
-            f"at most {len(found.views)} of {count} fit together, and {MIN_PHOTOGRAPHS} are needed. Take photographs that "
-            f"overlap by two thirds, moving the camera, not only turning it. So far {_links(found, photographs)}"
+            f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
+            f"photographs that overlap by two thirds, moving the camera, not only turning it. So far {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")

@@ -27,9 +27,9 @@ OUTPUTS = ("keypoints", "scores", "descriptors")
 SIDE = 1024
 """Longer side at which the network sees a photograph [px]."""
 MULTIPLE = 32
-"""Both sides are multiples of this [px], the coarsest stride of such networks."""
+"""Divisor of both sides [px], the coarsest stride of such networks."""
 MAX_KEYPOINTS = 4096
-"""Most keypoints of a photograph, those of the highest score."""
+"""Largest number of keypoints of a photograph; those with the highest scores are kept."""
 MAX_CHANNELS = 256
 """Longest descriptor."""
 MIN_COSINE = 0.82
@@ -75,10 +75,10 @@ class Matcher:
         """Return the keypoints of an image.
 
         Args:
-            image: The image as it is, uint8 RGB [H, W, 3].
+            image: The image before rotation, uint8 RGB [H, W, 3].
             turns: Quarter turns to the left by which the image is rotated first.
             side: Longer side at which the network sees the image [px], unless its graph fixes the size.
-            most: Largest number of keypoints, those of the highest score.
+            most: Largest number of keypoints; those with the highest scores are kept.
 
         Raises:
             DataError: onnxruntime cannot run the network, or its outputs are not those of a matcher.

@@ -63,7 +63,7 @@ def image_root(folder: Path) -> Path:
 
 
 def _is_run(folder: Path) -> bool:
-    """Return whether a folder is one that `warpgs fit` fills, by its files."""
+    """Return whether the files of a folder are those of a run."""
     if (folder / "scene" / "poses.json").is_file():  # a fit that has found poses only
         return True
     return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
@@ -169,7 +169,7 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
     else as PNG of 8 bits.
 
     Raises:
-        DataError: The file is no longer the one that was matched.
+        DataError: The file has changed since it was matched.
         ResourceError: The disk is full.
     """
     import cv2

@@ -36,7 +36,8 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 KEEP_FOCAL = 4
 """Most photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""
 MAX_RATIO = 1.05
-"""Mean reprojection error with EXIF's focal length over that with a free one, up to which EXIF's is kept (decision 017)."""
+"""Largest ratio of mean reprojection errors, with EXIF's focal length and with a free one, at which EXIF's is kept (decision
+017)."""
 
 
 def _say(**values: Any) -> None:

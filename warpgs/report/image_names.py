@@ -1,4 +1,4 @@
-"""Names of the image files of views: each view has its own, on every system."""
+"""Names of the image files of views, unique on every system."""
 
 from __future__ import annotations
 

@@ -210,5 +210,5 @@ class Panel:
 
 
 def _plain(text: str) -> str:
-    """Return text in UTF-8 without what Markdown would make of it."""
+    """Return text in UTF-8, with the special characters of Markdown escaped."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]()<>#|!" else c for c in readable(text))

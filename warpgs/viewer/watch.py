@@ -32,7 +32,7 @@ POLL = 1.0
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
-    """Show a run folder or a file of Gaussians until Ctrl-C; checkpoints of a fit that continues are shown as they come.
+    """Show a run folder or a file of Gaussians until Ctrl-C; new checkpoints of a running fit are shown, too.
 
     Args:
         path: Run folder, also while its fit runs; or a file of any registered format.
@@ -97,7 +97,7 @@ def _pause() -> None:
 
 
 def _update(window: Window, path: Path, device: str) -> None:
-    """Show the newest checkpoint; report an unreadable one and keep the one before."""
+    """Show the newest checkpoint; report an unreadable one and keep the previous one."""
     try:
         window.show(content_of_run(path, device, window.content.views))
     except WarpgsError as e:

@@ -207,7 +207,7 @@ def _names_a_run_alone(arguments: list[str]) -> bool:
 
 
 def _continued(arguments: list[str], about: str) -> FitRequest:
-    """Return the request that continues a run as it was started."""
+    """Return the request that continues a run with its original settings."""
     from warpgs.pipeline.runs.folder import stored_request
 
     @dataclass(frozen=True, kw_only=True)

@@ -128,7 +128,7 @@ def _check_by_pillow(data: bytes) -> None:
 
 
 def check(data: bytes) -> None:
-    """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must.
+    """Check that all strips or tiles are there, do not overlap, and unpack to the right number of bytes.
 
     Raises:
         ValueError: A strip or tile is missing, overlaps another, or has the wrong size; or a checksum does not match.
