@@ -274,6 +274,7 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     else:
         why = (
             f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
-            f"photographs that overlap by two thirds, moving the camera, not only turning it. So far {_links(found, photographs)}"
+            f"photographs that overlap by two thirds, moving the camera, not only turning it. "
+            f"So far {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")
