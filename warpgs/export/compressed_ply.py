@@ -103,10 +103,10 @@ def decode(path: Path, data: bytes) -> Arrays:
         tables[element.name], start = _table(path, data, element, start)
     chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
     if chunk is None or vertex is None:
-        raise malformed(path, "it lacks the element chunk or vertex")
+        raise malformed(path, "the element chunk or vertex is missing")
     n = len(vertex)
     if len(chunk) != -(-n // CHUNK):
-        raise malformed(path, f"{len(chunk)} chunks for {n} Gaussians")
+        raise malformed(path, f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
     position, rotation, scale, color = (_column(path, vertex, name, "<u4") for name in _VERTEX_NAMES)
     bounds = [_bounds(path, chunk, group) for group in _GROUPS]
 
@@ -150,7 +150,7 @@ def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np
     """Return a function for the coefficients above degree 0 [P, K - 1, 3] of some rows, and K."""
     count = len(sh.dtype.names or ())
     if len(sh) != n or count // 3 + 1 not in SH_SIZES or count % 3:
-        raise malformed(path, f"{len(sh)} rows of {count} harmonics for {n} Gaussians")
+        raise malformed(path, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
     columns = [_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)]
 
     def rows(part: slice) -> np.ndarray:

@@ -132,7 +132,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     degrees = [d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names]
     if degrees != list(range(len(degrees))) or not degrees:
-        raise malformed(path, f"it has harmonics of degrees {degrees}")
+        raise malformed(path, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
     orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(SH_SIZES[degrees[-1]])]
     means, turns, scales, opacities = (
         values(name) for name in ("POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY")))
