@@ -13,7 +13,8 @@ ALPHA_CUT = 1.0 / 255.0
 """Smallest alpha that is blended: one step of an 8-bit channel (renderer of Kerbl et al. 2023)."""
 
 TRANSMITTANCE_STOP = 1e-4
-"""Transmittance below which a pixel is finished: that behind two layers of the largest alpha, (1 - 0.99)^2 = 1e-4."""
+"""Transmittance below which a pixel is finished: the transmittance behind two layers of the largest alpha, (1 - 0.99)^2 =
+1e-4."""
 
 ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""

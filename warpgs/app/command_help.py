@@ -24,7 +24,7 @@ def help_text(kind: type, program: str, description: str) -> str:
     """Return the help of a command.
 
     Args:
-        kind: Dataclass of its flags, as `parse_flags` takes it.
+        kind: Dataclass of the flags, as for `parse_flags`.
         program: Name of the program and the command.
         description: Description of the command; lines of lists begin with two spaces.
     """

@@ -25,7 +25,7 @@ def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | 
 
     Args:
         kind: The dataclass.
-        default: An instance of it, with the defaults of the flags.
+        default: Instance of ``kind`` with the defaults of the flags.
         special: Markers and constructors of tyro for some fields of ``kind`` itself, by name.
 
     Returns:
@@ -169,7 +169,7 @@ def check_range(flag: str, value: float, low: float, high: float) -> None:
     """Check the number of a flag.
 
     Raises:
-        UsageError: It is below ``low`` or above ``high``.
+        UsageError: The value is below ``low`` or above ``high``.
     """
     if not low <= value <= high:
         raise UsageError(f"{flag} must be a number from {low:,} to {high:,}, not {value}")

@@ -82,7 +82,7 @@ class Format:
 
         Args:
             path: The file, for messages.
-            data: Its bytes; of an ``archive`` the open file.
+            data: Bytes of the file; for an ``archive`` the open file.
 
         Raises:
             UsageError: The format does not define `decode`.

@@ -183,7 +183,7 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
 
 
 def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
-    """Return the sizes of the sections [bytes]; DataError where the header cannot be true of a file of ``size`` bytes."""
+    """Return the sizes of the sections [bytes]; DataError where the header does not fit a file of ``size`` bytes."""
     magic, version, n, degree, bits = header
     if magic != MAGIC:
         raise malformed(path, "it does not start with the SPZ signature")
@@ -221,7 +221,7 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
 
 
 def _decompressed(path: Path, reader: BinaryIO, i: int, whole: int, size: int, *, end: bool = False) -> bytes:
-    """Return the next ``size`` of ``whole`` bytes of the i-th stream; at its end maybe fewer."""
+    """Return the next ``size`` of ``whole`` bytes of the i-th stream; fewer at its end."""
     try:
         data = reader.read(size)
     except _zstandard().ZstdError as e:

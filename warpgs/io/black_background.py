@@ -14,7 +14,7 @@ DARK_FRACTION = 0.3
 """Fraction of dark pixels from which on an image with a dark border shows an object on black."""
 
 HOLE = 0.001
-"""Fraction of an image from which on dark pixels that an object encloses are a hole in it, not a part of it."""
+"""Fraction of an image from which on an enclosed dark region is a hole in the object, not a part of it."""
 
 
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:

@@ -70,7 +70,7 @@ def view_name(name: str) -> str:
 
 
 def view_name_of(path: Path, root: Path) -> str:
-    """Return the name of the view of a file: its path below ``root``, links not followed, or one below `outside`."""
+    """Return the name of the view of a file: its path below ``root`` without following links, else a path below `outside`."""
     plain, base = (posixpath.normpath(p.absolute().as_posix()) for p in (path, root))
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 

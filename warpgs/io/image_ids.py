@@ -9,7 +9,8 @@ from warpgs.errors import DataError
 
 
 def _numbers(names: list[str]) -> list[int] | None:
-    """Return the number that distinguishes each name: the first group of digits that is different in all names; else None."""
+    """Return the number that distinguishes each name: the first group of digits that is different in all names. None if there
+    is none."""
     groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
     for place in range(min(map(len, groups), default=0)):
         values = [int(g[place]) for g in groups]

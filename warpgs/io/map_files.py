@@ -18,7 +18,7 @@ SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
 """Suffixes of other files that may hold maps, which a message names."""
 NONE = "none"
-"""Word instead of a folder, to ignore maps."""
+"""Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
 """End of the stem of a map of confidence."""
 MILLIMETRES = 0.001

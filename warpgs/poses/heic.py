@@ -99,7 +99,7 @@ def _coded_again(source: Path, max_pixels: int) -> bytes:
 
 
 def main(path: str) -> None:
-    """Copy the files that a job names; print a line of JSON before each, and one with the error of the first that fails."""
+    """Copy the files of a job; print a line of JSON before each file, and one with the first error."""
     job: dict[str, Any] = json.loads(Path(path).read_text("utf-8"))
     for i, (source, target) in enumerate(job["files"]):
         answer(json.dumps({"file": i}))

@@ -26,7 +26,7 @@ CARDS = """
 .card.failed{border-color:#c0392b}
 """
 SHORT = 120
-"""Letters of a message on a card; the table of failures shows the whole message."""
+"""Largest number of letters of a message on a card; the table of failures shows the whole message."""
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
 
 
 def _rendered(arrays: dict[str, np.ndarray], words: dict[str, object]) -> bytes:
-    """Return what `PLOT_SCRIPT` renders of arrays and settings, as PNG bytes."""
+    """Run `PLOT_SCRIPT` with arrays and settings; return its render as PNG bytes."""
     try:
         with temporary_folder() as folder:
             source, target = (folder.path / name for name in ("scene.npz", "plot.png"))

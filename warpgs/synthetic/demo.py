@@ -248,7 +248,7 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
 
 
 def _check(folder: Path, width: int, height: int) -> None:
-    """Raise a UsageError for a demo that cannot be written, before anything is."""
+    """Raise a UsageError for a demo that cannot be written, before any file is written."""
     if min(width, height) < MIN_SIDE:
         raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {width} x {height}")
     try:

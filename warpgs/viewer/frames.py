@@ -119,7 +119,7 @@ def write_frame(message: Mapping[str, Any]) -> bytes:
 
 
 def control_value(value: Any, control: Any) -> Any:
-    """Return the value that a control takes, brought within its limits.
+    """Return the value that a control takes, clamped to its limits.
 
     Args:
         value: Value of a message, as `read_frame` returns it.

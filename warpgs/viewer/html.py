@@ -75,7 +75,7 @@ def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gau
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return cameras with the one nearest to the mean of their centres first, and the others in their order."""
+    """Return cameras, first the camera nearest to the mean of all centres, then the others in order."""
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])

@@ -158,7 +158,7 @@ class Window:
         self._wake.set()
 
     def _hide_near(self) -> None:
-        """Hide the cameras about the eye of a browser: their photographs would be all that is seen."""
+        """Hide the cameras near the eye of a browser, because their photographs would fill the view."""
         eyes = [c.camera.position for c in self.server.get_clients().values()]
         for name, frustum in self._frusta.items():
             center = self.content.model.scene_cameras[name].center

@@ -70,7 +70,8 @@ Parts = dict[str, Any]
 
 
 def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
-    """Return the parts of a registry that a command line names after a flag, with default settings; ``base`` without it."""
+    """Return the parts of a registry that a command line names after a flag, with default settings; ``base`` without the
+    flag."""
     given = word_after(arguments, flag)
     if given is None:
         return {flag_group(p.name): p for p in base}
