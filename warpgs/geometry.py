@@ -103,8 +103,7 @@ def inverse(m: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(m: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to m [3, 3], for a positive determinant: its polar factor, by Newton's method (Higham
-    1986)."""
+    """Return the rotation nearest to m [3, 3] of positive determinant: its polar factor by Newton's method (Higham 1986)."""
     for _ in range(10):  # five steps suffice for a matrix that is orthogonal to 0.1; further steps change nothing
         c = cofactors(m)
         nearer = 0.5 * (m + c / (m[0] * c[0]).sum())

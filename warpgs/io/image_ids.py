@@ -9,8 +9,7 @@ from warpgs.errors import DataError
 
 
 def _numbers(names: list[str]) -> list[int] | None:
-    """Return the number that distinguishes each name: the first group of digits that is different in all names. None if there
-    is none."""
+    """Return the number that distinguishes each name: the first group of digits that differs between all names; or None."""
     groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
     for place in range(min(map(len, groups), default=0)):
         values = [int(g[place]) for g in groups]

@@ -167,8 +167,7 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether models with EXIF's focal length hold at least as many photographs as free ones, at nearly the same
-    error."""
+    """Return whether models with EXIF's focal length hold no fewer photographs than free ones, at nearly the same error."""
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))

@@ -112,8 +112,7 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
-    """Return a mask [N] of the points in a box: that of nine tenths of the points, enlarged by ``margin`` of its size at each
-    side."""
+    """Return a mask [N] of points in the box of nine tenths of all points, enlarged by ``margin`` of its size at each side."""
     low, high = np.percentile(points, [5, 95], axis=0)
     return ((points >= low - margin * (high - low)) & (points <= high + margin * (high - low))).all(1)
 

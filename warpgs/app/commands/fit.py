@@ -70,8 +70,7 @@ Parts = dict[str, Any]
 
 
 def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
-    """Return the parts of a registry that a command line names after a flag, with default settings; ``base`` without the
-    flag."""
+    """Return the parts of a registry that a flag names, with default settings; ``base`` if the flag is not given."""
     given = word_after(arguments, flag)
     if given is None:
         return {flag_group(p.name): p for p in base}
