@@ -1,8 +1,8 @@
 """Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or only the rasterizer, `warpgs.rasterize`.
 
 Units: Gaussians and cameras are in ``scene`` units, those of a `Scene` that `load_scene` returned (recentred and rescaled), or
-in ``file`` units, those of the scene's own files and of PLY. Every function and method that takes or returns them has an
-argument ``units``.
+in ``file`` units, those of the scene's own files and of PLY. Functions that convert have an argument ``units``. Others, such as
+`rasterize`, need Gaussians and cameras in the same units.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ ALPHA_CUT = 1.0 / 255.0
 """Smallest alpha that is blended: one step of an 8-bit channel (renderer of Kerbl et al. 2023)."""
 
 TRANSMITTANCE_STOP = 1e-4
-"""Transmittance below which a pixel is finished: that behind two layers of the largest alpha, (1 - 0.99)^2 = 1e-4."""
+"""Transmittance below which a pixel is finished: the transmittance behind two layers of the largest alpha, (1 - 0.99)^2 =
+1e-4."""
 
 ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
@@ -22,7 +23,7 @@ LOW_PASS = 0.3
 """Variance added to both image axes [px^2]: about the box filter of one pixel (1/12) plus margin against aliasing."""
 
 TILE_SIZE = 16
-"""Side of a tile [px] where no other is requested, in fits too."""
+"""Default side of a tile [px], also in fits."""
 
 K_TOLERANCE = 1e-5
 """Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""

@@ -37,7 +37,7 @@ def checked_normalization(normalization: Normalization | None, units: str, where
     Args:
         normalization: Similarity from file to scene units, or None.
         units: Units of the Gaussians: scene or file.
-        where: Opening of messages, such as the path of a file.
+        where: Beginning of messages, such as the path of a file.
 
     Raises:
         DataError: The normalization is not finite, or its scale is not above 0.

@@ -27,9 +27,9 @@ class NotFiniteError(WarpgsError):
     """A non-finite loss or parameter of a fit."""
 
     view: int | None = None
-    """Number of the training view with that loss; None for other values."""
+    """Number of the training view with a non-finite loss; None for other values."""
     slot: int = 0
-    """Number of that view among those of the step."""
+    """Index of this view among the views of the step."""
 
 
 class ResourceError(WarpgsError):

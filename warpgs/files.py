@@ -38,8 +38,8 @@ def replacing(
 ) -> Iterator[Path]:
     """Give the path of a temporary file beside ``path``; once the block has written it, it takes the place of ``path``.
 
-    It is synced to the disk and checked first, and the folder is synced after. On any error, also of the block, the temporary
-    file is removed and an old file stays unchanged. Where ``path`` is a link, the link is replaced.
+    The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error, also one of the
+    block, the temporary file is removed and an old file stays unchanged. Where ``path`` is a link, the link is replaced.
 
     Args:
         path: File to write or to replace.
@@ -92,7 +92,7 @@ def _replaced(
 
 
 def _reachable(folder: Folder) -> Path:
-    """Return a path to an open folder that libraries can use: that of its descriptor, where the system has such paths."""
+    """Return a path to an open folder that libraries can use: the path of its descriptor, where the system has such paths."""
     shown = DESCRIPTORS / str(folder.descriptor)
     return shown if folder.descriptor is not None and shown.is_dir() else folder.path
 
@@ -101,8 +101,8 @@ def _reachable(folder: Folder) -> Path:
 def filling(folder: Path) -> Iterator[Path]:
     """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
 
-    On any error, also of the block, the temporary folder is removed. It is locked
-    meanwhile. Left-overs of killed writers beside it are removed.
+    The temporary folder is locked during the block, and removed on any error, also one of the block. Left-overs of killed
+    writers beside it are removed.
 
     Args:
         folder: Folder to make; it may exist if it is empty.
@@ -135,7 +135,7 @@ def filling(folder: Path) -> Iterator[Path]:
 
 
 def _clear(above: Folder, name: str) -> None:
-    """Remove an empty folder, with what killed writers left in it."""
+    """Remove an empty folder, and leftovers of killed writers in it."""
     with above.folder(name) as inside:
         sweep(inside)
     above.rmdir(name)
@@ -148,7 +148,7 @@ def _not_made(folder: Path, error: OSError) -> ResourceError:
 
 
 def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
-    """Put a file in the place of another; on Windows, where no open file can be replaced, a few times."""
+    """Replace a file by another; on Windows, where no open file can be replaced, try a few times."""
     if WINDOWS:
         temporary.close()
     for pause in PAUSES if WINDOWS else ():
@@ -227,7 +227,7 @@ def read_file(path: Path, below: Path) -> bytes:
         below: Folder that contains it; no link below that folder is followed.
 
     Raises:
-        DataError: It cannot be read, is a link, or is not a regular file.
+        DataError: The file cannot be read, is a link, or is not a regular file.
     """
     try:
         return read_input(path, below=below)
@@ -239,7 +239,7 @@ def appending(path: Path) -> BinaryIO:
     """Open a file to append to, made if it is missing; a link is not followed.
 
     Raises:
-        OSError: It cannot be opened, is a link, or is not a regular file.
+        OSError: The file cannot be opened, is a link, or is not a regular file.
     """
     with open_folder(path.parent) as folder:
         descriptor = folder.open_regular(path.name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -250,7 +250,7 @@ def remove_file(path: Path) -> None:
     """Remove a file, or a link itself, if it is there.
 
     Raises:
-        ResourceError: It cannot be removed.
+        ResourceError: The file cannot be removed.
     """
     try:
         with contextlib.suppress(FileNotFoundError), open_folder(path.parent) as folder:
@@ -263,7 +263,7 @@ def move_folder(folder: Path, name: str) -> Path:
     """Rename a folder in its place, and return its path.
 
     Raises:
-        OSError: It cannot be moved, or is a link.
+        OSError: The folder cannot be moved, or is a link.
     """
     with open_folder(folder.parent) as above:
         above.folder(folder.name).close()
@@ -275,7 +275,7 @@ def make_folder(folder: Path) -> bool:
     """Make a folder, and those above it, where it is missing; return whether it was made.
 
     Raises:
-        ResourceError: It cannot be created, or is behind a link that is not followed.
+        ResourceError: The folder cannot be created, or is behind a link that is not followed.
     """
     try:
         made = not os.path.exists(folder)  # False where Path.exists would raise an error
@@ -298,7 +298,7 @@ def writing_into(folder: Path) -> Iterator[bool]:
     """Make a folder if it is missing, and follow no link below it in this block; yields whether it was made.
 
     Raises:
-        ResourceError: It cannot be created or opened, or is behind a link that is not followed.
+        ResourceError: The folder cannot be created or opened, or is behind a link that is not followed.
     """
     made = make_folder(folder)
     with contextlib.ExitStack() as stack:
@@ -312,10 +312,10 @@ def writing_into(folder: Path) -> Iterator[bool]:
 
 
 def is_empty(folder: Path) -> bool:
-    """Return whether a folder holds nothing but what an interrupted write or its lock left there.
+    """Return whether a folder is empty, except for a lock and leftovers of interrupted writes.
 
     Raises:
-        ResourceError: It cannot be looked into.
+        ResourceError: The folder cannot be listed.
     """
     try:
         return all(p.name == LOCK or OWN_NAMES.fullmatch(p.name) for p in folder.iterdir())

@@ -66,8 +66,8 @@ def check_pinhole(camera: Camera) -> None:
     """
     if camera.model != "pinhole":
         raise UsageError(
-            f"this works for pinhole cameras only, and this one is {camera.model!r}; read the scene with --lenses "
-            "undistort, or undistort the images first"
+            f"only pinhole cameras are supported here, not {camera.model!r}; read the scene with --lenses undistort, or "
+            "undistort the images first"
         )
 
 
@@ -85,7 +85,7 @@ def pinhole_of(camera: Camera) -> Camera:
 def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return a [..., J] times b [J] or [J, K], the same bits on every x86-64 processor.
 
-    ``@`` calls BLAS, which takes other kernels, and so another order of its sums, on another processor.
+    ``@`` calls BLAS; its kernels, and so the order of sums, depend on the processor.
     """
     return np.einsum("...j,j->..." if b.ndim == 1 else "...j,jk->...k", a, b)
 
@@ -103,7 +103,7 @@ def inverse(m: np.ndarray) -> np.ndarray:
 
 
 def nearest_rotation(m: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to m [3, 3] of positive determinant: its polar factor, by Newton (Higham 1986)."""
+    """Return the rotation nearest to m [3, 3] of positive determinant: its polar factor by Newton's method (Higham 1986)."""
     for _ in range(10):  # five steps suffice for a matrix that is orthogonal to 0.1; further steps change nothing
         c = cofactors(m)
         nearer = 0.5 * (m + c / (m[0] * c[0]).sum())
@@ -122,7 +122,8 @@ def relative_pose(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray
 def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels [N, 2] (pixel centres at +0.5) and depths [N] [u] of world points [N, 3].
 
-    Depths are those of a render: z, of a fisheye the distance. Where a lens other than a pinhole cannot see, depth is 0.
+    Depths are those of a render: z, for a fisheye the distance. Depth is 0 for points that a lens other than a pinhole cannot
+    see.
 
     Raises:
         UsageError: The camera model is only supported by the kernels.
@@ -160,10 +161,10 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
 def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
     """Return what `back_project` returns, from tensors and without a matrix product: R^T (d K^-1 [x y 1] - t) for a pinhole.
 
-    Such a product would load another library on CUDA. Of K only focal lengths and principal point count, as in projection.
+    A matrix product would load another library on CUDA. Of K only focal lengths and principal point count, as in projection.
 
     Args:
-        camera: Its tensors are float32 or float64, on the device of the others.
+        camera: A camera with float32 or float64 tensors, on the device of ``pixels`` and ``depths``.
         pixels: Positions (x, y) with centres at +0.5 [px], shape [S, 2].
         depths: Depths [u], shape [S].
 
@@ -188,10 +189,10 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
 def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what `project_points` returns, from tensors and without a matrix product: pixels [S, 2] and depths [S] [u].
 
-    Where a camera cannot see a point, its depth is at most 0 and its pixel means nothing.
+    Where a camera cannot see a point, its depth is at most 0 and its pixel is meaningless.
 
     Args:
-        camera: Its tensors are float32 or float64, on the device of the points.
+        camera: A camera with float32 or float64 tensors, on the device of the points.
         points: World points [u], shape [S, 3].
 
     Raises:
@@ -293,7 +294,7 @@ def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarra
 
 
 def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return which world points [N, 3] a camera sees: their numbers, rows, columns and z-depths [u], of shape [S] each."""
+    """Return which world points [N, 3] a camera sees: their indices, rows, columns and z-depths [u], of shape [S] each."""
     pixels, z = project_points(camera, points)
     seen = np.nonzero(_inside(camera, pixels) & (z > 0))[0]
     columns, rows = np.floor(pixels[seen]).astype(int).T

@@ -1,4 +1,4 @@
-"""Opening of input files: regular files alone, of bounded size, so that no pipe hangs a command and no device fills its memory.
+"""Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its memory.
 
 Every untrusted file is opened here. An unreadable one raises an OSError with the reason as its ``strerror``; callers turn it
 into a `DataError` with a remedy, with the text of `unread_reason`.
@@ -28,11 +28,11 @@ def open_input(path: str | os.PathLike[str], below: Path | None = None) -> Binar
 
     Args:
         path: The file.
-        below: Folder above it, such as a run's, from which no link to it is followed. None for a file that the user names,
-            which may be a link.
+        below: Folder above the file, such as a run folder; no link from there to the file is followed. None for a file that the
+            user names, which may be a link.
 
     Raises:
-        OSError: It is missing, unreadable, a folder, a link that is not followed, or no regular file (a pipe, a socket, a
+        OSError: The file is missing, unreadable, a folder, a link that is not followed, or no regular file (a pipe, a socket, a
             device).
     """
     if below is not None:
@@ -63,7 +63,7 @@ def read_input(path: str | os.PathLike[str], most: int = MAX_BYTES, below: Path 
     """Return the contents of a regular file of at most ``most`` bytes; ``below`` as in `open_input`.
 
     Raises:
-        OSError: It cannot be opened or read, is not a regular file, or is larger.
+        OSError: The file cannot be opened or read, is not a regular file, or is larger.
     """
     with open_input(path, below) as file:
         size = os.fstat(file.fileno()).st_size
@@ -83,7 +83,7 @@ def read_start(path: str | os.PathLike[str], count: int) -> bytes:
     """Return the first bytes of a regular file, at most ``count``.
 
     Raises:
-        OSError: It cannot be opened or read, or is not a regular file.
+        OSError: The file cannot be opened or read, or is not a regular file.
     """
     with open_input(path) as file:
         return file.read(count)
@@ -93,7 +93,7 @@ def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str
     """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`.
 
     Raises:
-        OSError: It cannot be opened or read, or is not a regular file.
+        OSError: The file cannot be opened or read, or is not a regular file.
     """
     with open_input(path, below) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -33,13 +33,13 @@ def check_known(model: str) -> None:
     """
     if model not in MODELS:
         raise UsageError(
-            f"points are projected outside of the rasterizer for the models {', '.join(MODELS)} only, and this camera is "
-            f"{model!r}; undistort the images first"
+            f"outside the rasterizer only the camera models {', '.join(MODELS)} are supported, not {model!r}; undistort the "
+            "images first"
         )
 
 
 def _library(array: Array) -> Any:
-    """Return numpy or torch, to which the array belongs."""
+    """Return the library of the array, numpy or torch."""
     if isinstance(array, np.ndarray):
         return np
     import torch
@@ -58,7 +58,7 @@ def depth_of(model: str, positions: Array) -> Array:
 def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
     """Return the points in the image plane [..., 2] of positions in the camera [..., 3].
 
-    They mean nothing behind a pinhole, nor beyond the rim of a lens: see `on_lens`.
+    Points behind a pinhole or beyond the rim of a lens are meaningless: see `on_lens`.
 
     Raises:
         UsageError: The model is unknown here.

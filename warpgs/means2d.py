@@ -14,12 +14,12 @@ PASSED = "_backward_passes"
 
 
 class ProjectedMeans(torch.Tensor):
-    """A tensor [C, N, 2] that explains where its ``absgrad`` is missing; results of operations are plain tensors."""
+    """A tensor [C, N, 2] with an error message for a missing ``absgrad``; results of operations are plain tensors."""
 
     __torch_function__ = torch._C._disabled_torch_function_impl
 
     def __getattr__(self, name: str) -> Any:
-        """Raise AttributeError; for ``absgrad`` it says what is missing."""
+        """Raise AttributeError; for ``absgrad`` the message names what is missing."""
         if name != "absgrad":
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
         raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")
@@ -42,8 +42,7 @@ class ProjectedMeans(torch.Tensor):
 def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> None:
     """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`.
 
-    ``passes`` is a list that gets an entry for each pass, which autograd nodes append; with None a hook does it, which is
-    slower.
+    ``passes`` is a list that gets an entry for each pass, which autograd nodes append; with None a slower hook does this.
     """
     if not projected.requires_grad:
         return

@@ -1,4 +1,4 @@
-"""Folders that this process writes into: the one that the user names may be a link, below it no link is followed.
+"""Folders that this process writes into: the folder that the user names may be a link; below it no link is followed.
 
 `output_folder` opens such a folder for a block. Everything below it is then reached from its descriptor, folder by folder,
 without following links, so that no other program can redirect a write or a read. Of nested folders the outermost counts.
@@ -44,7 +44,7 @@ class Folder:
     """An open folder, whose entries are used by name without following links; a context manager that closes it."""
 
     def __init__(self, path: Path, descriptor: int | None):
-        """Take its path, and its descriptor: None where the system has none."""
+        """Take the path of the folder and its descriptor, None where the system has no descriptors of folders."""
         self.path, self.descriptor = path, descriptor
 
     def __enter__(self) -> Folder:
@@ -76,14 +76,14 @@ class Folder:
         )
 
     def _explained(self, name: str, error: OSError) -> OSError:
-        """Return the error to raise for an entry: that it is a link, where it is one."""
+        """Return the error to raise for an entry: one about a link if the entry is a link, else ``error``."""
         return _link(self.path / name) if self.is_link(name) else error
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
         """Open a file, and return its descriptor.
 
         Raises:
-            OSError: It cannot be opened, or is a link.
+            OSError: The file cannot be opened, or is a link.
         """
         if WINDOWS and self.is_link(name):
             raise _link(self.path / name)
@@ -97,7 +97,7 @@ class Folder:
 
         Raises:
             OSError: As for `open`.
-            RefusedError: It is a pipe or a device, which is not waited for.
+            RefusedError: The file is a pipe or a device; the call does not wait for it.
         """
         try:
             descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
@@ -114,8 +114,8 @@ class Folder:
         """Open a folder in this one.
 
         Raises:
-            NotADirectoryError: It is a file.
-            OSError: It cannot be opened, or is a link.
+            NotADirectoryError: The entry is a file.
+            OSError: The folder cannot be opened, or is a link.
         """
         path = self.path / name
         if WINDOWS:
@@ -184,13 +184,13 @@ _LOCK = threading.RLock()
 
 @contextlib.contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
-    """Have all that is written below a folder, in this block, go through its descriptor and follow no link.
+    """Write everything below a folder, in this block, through its descriptor and without following links.
 
-    The folder itself may be reached through links, unless it is below another open one. Where another folder takes its place
-    meanwhile, the next write is rejected.
+    The folder itself may be reached through links, unless it is below another open one. If another folder takes its place
+    during the block, the next write is rejected.
 
     Raises:
-        OSError: It is missing, or is behind a link below an open folder.
+        OSError: The folder is missing, or is behind a link below an open folder.
     """
     path = folder.absolute()
     with _LOCK:
@@ -222,7 +222,7 @@ def open_folder(path: Path, make: bool = False) -> Folder:
         make: True to create missing parent folders, only below an open folder.
 
     Raises:
-        OSError: It cannot be opened, or a parent folder is a link.
+        OSError: The folder cannot be opened, or a parent folder is a link.
     """
     path = path.absolute()
     with _LOCK:
@@ -245,11 +245,11 @@ def open_file(path: Path, below: Path) -> BinaryIO:
 
     Args:
         path: The file.
-        below: Folder above it, such as that of a run.
+        below: Folder above the file, such as a run folder.
 
     Raises:
-        OSError: It cannot be opened, or is a link.
-        RefusedError: It is not a regular file.
+        OSError: The file cannot be opened, or is a link.
+        RefusedError: The file is not a regular file.
     """
     with output_folder(below), open_folder(path.parent) as folder:
         return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
@@ -266,13 +266,13 @@ def _opened(name: str, more: int, at: int | None) -> int:
 
 
 def _outermost(path: Path) -> _Root | None:
-    """Return the open folder above a path, or at it, that has no other above it."""
+    """Return the outermost open folder that is the path or above it."""
     parts = path.parts
     return next((_ROOTS[parts[:i]] for i in range(1, len(parts) + 1) if parts[:i] in _ROOTS), None) if _ROOTS else None
 
 
 def _again(root: _Root) -> Folder:
-    """Return another opening of an open folder, which is still the one that its path names."""
+    """Open an open folder again, after a check that its path still names this folder."""
     try:
         now = os.stat(root.path)
     except OSError as e:

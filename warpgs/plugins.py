@@ -1,4 +1,4 @@
-"""Parts that plug in: classes found by name, whether ours or a user's."""
+"""Parts that plug in: classes found by name, built-in or a user's own."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ class Registry(Generic[T]):
     """Classes of one kind by name.
 
     Built-in classes are in the modules of a package, which are imported to look up a name; so a new class is a new file. A
-    user's own is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. Nothing
-    is ever imported because a stored file names it.
+    user's own is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A name in
+    a stored file never causes an import.
     """
 
     def __init__(self, kind: str, base: type[T], package: str):
         """Start without classes.
 
         Args:
-            kind: What the classes are, for messages: strategy, loss term, view module, reader.
-            base: What each class derives from.
+            kind: Kind of the classes, for messages: strategy, loss term, view module, reader.
+            base: Class from which each class derives.
             package: Dotted name of the package, or module, of the built-in classes.
         """
         self.kind, self.base, self.package = kind, base, package
@@ -61,7 +61,9 @@ class Registry(Generic[T]):
         def decorate(cls: type[T]) -> type[T]:
             before = self._classes.get(name)
             if before is not None and _is_ours(before) and not _is_ours(cls):
-                raise UsageError(f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours by another name")
+                raise UsageError(
+                    f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours under another name"
+                )
             cls.name = name
             self._classes[name] = cls
             return cls
@@ -78,10 +80,10 @@ class Registry(Generic[T]):
         return sorted(n for n in self._classes if ":" not in n)
 
     def name_of(self, cls: type[T]) -> str:
-        """Return the name of a class, which is registered as ``module:Class`` where it has none yet.
+        """Return the name of a class; a class without a name is registered as ``module:Class``.
 
         Raises:
-            UsageError: It is a class of another kind.
+            UsageError: The class is of another kind.
         """
         self._checked(cls, cls.__name__)
         return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name
@@ -112,8 +114,8 @@ class Registry(Generic[T]):
             own = name.rpartition(":")[2]
             in_study = f'; in a study: a preset in a .py file, with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
-                f"the {self.kind} {name!r} is a class of your own, which is never imported because a file names it; give it "
-                f"again, on the command line or as a class in Python{in_study}"
+                f"the {self.kind} {name!r} is a class of your own. Files cannot import code: give the class again, on the "
+                f"command line or in Python{in_study}"
             )
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 
@@ -179,7 +181,7 @@ def _digest(cls: type) -> str:
 
 
 def own_places(classes: Iterable[type]) -> list[str]:
-    """Return where `module_of` finds the modules of classes that are not of warpgs; a script that runs is left out."""
+    """Return where `module_of` finds the modules of classes that are not of warpgs; the running script is left out."""
     modules = {c.__module__ for c in classes if not _is_ours(c)} - {"__main__"}
     files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
     return sorted(str(place) for place in files.values() if place)

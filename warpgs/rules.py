@@ -5,7 +5,7 @@ from warpgs.errors import UsageError
 
 
 def rule_named(name: str) -> Rule:
-    """Return the cut-offs of a name.
+    """Return the rule of a name.
 
     Raises:
         UsageError: The name is unknown.

@@ -19,9 +19,9 @@ from warpgs.input_files import read_input
 MAX_BYTES = 2**25
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""
 MAX_DEPTH = 50
-"""Number of lists and objects that may lie in each other, so that code that walks through a value needs no limit of its own."""
+"""Largest number of nested lists and objects, so that code that walks through a value needs no limit of its own."""
 MAX_PARTS = 2**19
-"""Number of lists and objects, each of which takes some thirty times as much memory as text."""
+"""Largest number of lists and objects; each takes some thirty times as much memory as its text."""
 MAX_WHOLE = 2**63 - 1
 """Largest integer: that of 64 bits."""
 MAX_NUMBER = 1e300
@@ -38,7 +38,7 @@ def parse(text: str | bytes) -> Any:
     """Return the value of a JSON text.
 
     Raises:
-        SchemaError: It is not JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
+        SchemaError: The text is not JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
     """
     if len(text) > MAX_BYTES:
         raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
@@ -65,10 +65,10 @@ def check_parts(text: str | bytes) -> None:
 
 
 def check_depth(value: Any, most: int) -> None:
-    """Check that at most so many lists and objects are nested, without a call for each.
+    """Check that at most ``most`` lists and objects are nested, without recursion.
 
     Raises:
-        SchemaError: There are more.
+        SchemaError: More are nested.
     """
     level, depth = [value], 0
     while level := [part for outer in level for part in _parts(outer)]:
@@ -92,7 +92,7 @@ def read(path: Path, below: Path | None = None) -> Any:
             the user names.
 
     Raises:
-        OSError: It cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
+        OSError: The file cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
         SchemaError: `parse` rejects its content.
     """
     return parse(read_input(path, MAX_BYTES, below))
@@ -160,7 +160,7 @@ def number(low: float = -math.inf, above: float = -math.inf) -> Schema:
 
 
 def or_null(schema: Schema) -> Schema:
-    """Return the schema of what ``schema`` allows, and of null."""
+    """Return the schema of null and of all values that ``schema`` allows."""
 
     def check(value: Any, place: str) -> None:
         if value is not None:
@@ -170,7 +170,7 @@ def or_null(schema: Schema) -> Schema:
 
 
 def items(schema: Schema, count: int | None = None) -> Schema:
-    """Return the schema of lists, of ``count`` items where that is given, each as ``schema`` has it."""
+    """Return the schema of lists of items that ``schema`` allows, ``count`` of them if given."""
 
     def check(value: Any, place: str) -> None:
         if not isinstance(value, list) or count not in (None, len(value)):

@@ -51,7 +51,7 @@ def shared_locks() -> Iterator[tuple[int, ...]]:
 
 
 class TemporaryFile:
-    """A new file that its owner holds, and removes where it still has its name at the end; use it with ``with``."""
+    """A new file that its owner locks, and removes at the end unless it was renamed; use it with ``with``."""
 
     def __init__(self, folder: Folder, suffix: str = ""):
         """Make the file.
@@ -61,7 +61,7 @@ class TemporaryFile:
             suffix: End of its name: none, .mp4 or .webm.
 
         Raises:
-            OSError: It cannot be made.
+            OSError: The file cannot be made.
         """
         self._folder = folder
         self.name, self.descriptor = _own_file(folder, suffix, locks=sys.platform != "win32")
@@ -98,7 +98,7 @@ class TemporaryFolder:
             mode: Rights of the folder.
 
         Raises:
-            OSError: It cannot be made.
+            OSError: The folder cannot be made.
         """
         self._above, self._process = above, os.getpid()
         lock, self._descriptor = _own_file(above, LOCKED, locks=True, prefix=prefix, mode=0o600)
@@ -119,7 +119,7 @@ class TemporaryFolder:
         self.remove()
 
     def remove(self) -> None:
-        """Remove the folder, where it still has its name, and then its lock; a forked child leaves both to its parent."""
+        """Remove the folder unless it was renamed, and then its lock; a forked child leaves both to its parent."""
         if os.getpid() != self._process or self._descriptor not in _HELD:
             return
         try:
@@ -136,10 +136,10 @@ class TemporaryFolder:
 def temporary_folder() -> TemporaryFolder:
     """Make a folder that only this user can read or write, where the system has temporary files; use it with ``with``.
 
-    What killed commands of this user left there is removed.
+    Leftovers of killed commands of this user are removed there.
 
     Raises:
-        OSError: There is no writable folder for it.
+        OSError: No folder for temporary files is writable.
     """
     sweep_temporary_files()
     return TemporaryFolder(open_folder(system_folder()), "warpgs-", 0o700)
@@ -147,7 +147,7 @@ def temporary_folder() -> TemporaryFolder:
 
 @functools.cache
 def sweep_temporary_files() -> None:
-    """Remove what killed commands of this user left where the system has temporary files; looks once in each process."""
+    """Remove leftovers of killed commands of this user from the system's temporary files, once in each process."""
     with contextlib.suppress(OSError), open_folder(system_folder()) as folder:
         sweep(folder, own=True)
 
@@ -167,7 +167,7 @@ def sweep(folder: Folder, own: bool = False) -> None:
 
     Args:
         folder: Their folder.
-        own: Whether to touch only what belongs to this user.
+        own: True to remove only entries of this user.
     """
     with contextlib.suppress(OSError):
         for name in filter(NAMES.fullmatch, folder.names()):
@@ -178,7 +178,7 @@ def sweep(folder: Folder, own: bool = False) -> None:
 
 
 def _sweep_one(folder: Folder, name: str, mode: int) -> None:
-    """Remove one temporary entry without a lock."""
+    """Remove one temporary entry that nobody has locked."""
     if stat.S_ISLNK(mode):
         folder.unlink(name)
     elif stat.S_ISDIR(mode) or name.endswith(LOCKED):

@@ -44,7 +44,7 @@ def test_depths_of_every_format_are_in_scene_units(kind, tmp_path):
     for view in loaded.views:
         assert view.depth.kind == "metric" and view.depth.values.dtype == np.float32
         assert np.allclose(view.depth.values, RAMP * 0.001 * loaded.normalization.scale, rtol=1e-6)
-    assert any("depth maps: 5 of 5 views" in n and "0.001 in whole numbers" in n for n in loaded.notes)
+    assert any("depth maps: 5 of 5 views" in n and "0.001 for integers" in n for n in loaded.notes)
     assert loaded.fingerprint != load_scene(scene).fingerprint
 
 
@@ -142,7 +142,7 @@ def test_folders_without_maps(tmp_path):
     with pytest.raises(DataError, match="no such folder"):
         load_scene(scene, depths=maps)
     maps.mkdir()
-    with pytest.raises(DataError, match="holds no maps; put NPY"):
+    with pytest.raises(DataError, match="holds no maps; add NPY"):
         load_scene(scene, depths=maps)
     (maps / "photo0.exr").write_bytes(b"v/1\1")
     with pytest.raises(DataError, match=r"it holds \.exr files, which are not read"):
@@ -216,7 +216,7 @@ def test_maps_that_transforms_json_names(tmp_path):
     content = json.loads(file.read_text())
     for name, reason in (
         ("../x.png", "points outside"),
-        ("x.exr", "maps are read as .png or .npy"),
+        ("x.exr", "maps must be .png or .npy"),
         ("gone.npy", "cannot be read"),
     ):
         content["frames"][2]["depth_file_path"] = name
@@ -266,5 +266,5 @@ def test_a_map_lies_as_its_image_was_stored_or_upright():
     stored = RAMP.astype(np.float32)
     upright = turn_upright(stored, 6)
     assert (in_pixels_of(image, stored, "a.npy") == upright).all() and (in_pixels_of(image, upright, "a.npy") == upright).all()
-    with pytest.raises(DataError, match="turned by its EXIF tag"):
+    with pytest.raises(DataError, match="rotated by an EXIF tag"):
         in_pixels_of(image, facing(), "n.npy")

@@ -100,8 +100,8 @@ def test_errors_name_the_way_to_keep_a_lens(tmp_path):
             load_scene(tmp_path / "b")
     for values, message in (
         ({"k4": 0.1}, "k4 belongs to a fisheye or rational lens"),
-        ({"is_fisheye": True, "p1": 0.1}, "p1 belongs to another lens than a fisheye"),
-        ({"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius belongs to another lens"),
+        ({"is_fisheye": True, "p1": 0.1}, "p1 is not supported for a fisheye"),
+        ({"is_fisheye": True, "fisheye_crop_radius": 9}, "fisheye_crop_radius is not supported for a fisheye"),
     ):
         scenes.write_transforms(tmp_path / "b", scenes.transforms_json(fl_x=F, **values))
         with pytest.raises(DataError, match=message):

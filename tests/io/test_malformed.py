@@ -199,7 +199,7 @@ def patched_pose(tmp_path, **changes):
         ({"_1": "1e308"}, r"'photo1.png': the rotation quaternion .* is zero or not finite"),
         ({"_2": "x"}, r"images.txt, line 4: cannot be understood \(could not convert"),
         ({"_8": "9"}, r"'photo1.png': camera 9 is missing from cameras.txt"),
-        ({"_0": "1"}, r"images.txt, line 4: number 1 is given twice"),
+        ({"_0": "1"}, r"images.txt, line 4: id 1 is given twice"),
         ({"_5": "1e100"}, r"image 'photo1.png': its camera centre .* is beyond 1e\+12 units"),
         ({"_9": "photo0.png"}, r"the image 'photo0.png' is listed twice"),
         ({"_9": "gone.png"}, r"images/gone.png: the image file is missing; restore it"),
@@ -300,7 +300,7 @@ def test_json_numbers_that_are_none(number, tmp_path):
     scenes.write_transforms(tmp_path)
     path = tmp_path / "transforms.json"
     path.write_text(path.read_text().replace('"fl_x": 20.0', f'"fl_x": {number}'))
-    refused(tmp_path, r"transforms.json.*(is not a number that a camera can have|not a finite number)")
+    refused(tmp_path, r"transforms.json.*not a finite number")
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,7 @@ def test_a_run_says_and_keeps_what_was_given(folder, capsys):
     record, metrics = (json.loads((folder / "run" / f).read_text()) for f in ("config.json", "metrics.json"))
     notes = html.unescape((folder / "run" / "report.html").read_text())
     assert (
-        "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 in whole numbers" in notes
+        "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
         and "given depth: used in 5 of 6 views" in notes
     )
     assert "rendered depth differs from it by" in notes and "start: " in notes and "by given depth and sweep" in notes

@@ -126,5 +126,5 @@ def test_a_pinhole_in_place_of_a_lens():
     assert (found.model, found.distortion) == ("pinhole", None) and found.K is camera.K and found.viewmat is camera.viewmat
     assert framed(camera, (20, 16)).model == "pinhole" and pinhole_of(found) is found
     parallel = Camera(camera.viewmat, camera.K, 40, 32, "orthographic")
-    with pytest.raises(UsageError, match="pinhole cameras only, and this one is 'orthographic'"):
+    with pytest.raises(UsageError, match="only pinhole cameras are supported here, not 'orthographic'"):
         pinhole_of(parallel)

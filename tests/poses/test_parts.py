@@ -157,7 +157,7 @@ def test_reasons_and_advice():
     """Blank and lost photographs first, then wide gaps, then weak links; nothing where all is well."""
     names = ["a", "b", "c", "d", "e"]
     assert reason(mapping(), 3, names) == "has 600 keypoints and 9 matches with c, too few of them at places of known depth"
-    assert reason(mapping(), 4, names).startswith("has 12 keypoints, too few to find again")
+    assert reason(mapping(), 4, names).startswith("has 12 keypoints, too few to match")
     said = advice(mapping(), names)
     assert ["between d and c" in said[0], "take e again" in said[1], "between b and c, which look 50 degrees" in said[2]] == [
         True

@@ -47,7 +47,7 @@ def test_only_pinholes_have_epipolar_lines():
     fisheye = dataclasses.replace(b, model="fisheye")
     for pair in ((a, fisheye), (fisheye, a)):
         for op, more in ((fundamental, ()), (plane_homography, (0.3,)), (project_inverse, (np.zeros((1, 2)), np.ones(1)))):
-            with pytest.raises(UsageError, match="pinhole cameras only, and this one is 'fisheye'"):
+            with pytest.raises(UsageError, match="only pinhole cameras are supported here, not 'fisheye'"):
                 op(*pair, *more)
 
 

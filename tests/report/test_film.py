@@ -135,7 +135,7 @@ def test_an_animation_that_breaks_off_leaves_the_old_one(tmp_path, monkeypatch, 
 
 
 def test_films_that_cannot_be_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(UsageError, match=r"one of .mp4, .webm, .webp, .gif, not .avi"):
+    with pytest.raises(UsageError, match=r"one of .mp4, .webm, .webp, .gif, got .avi"):
         write_film(tmp_path / "a.avi", np.zeros((2, 8, 8, 3)))
     with pytest.raises(UsageError, match=f"at most {MAX_FPS} frames per second"):
         write_film(tmp_path / "a.gif", np.zeros((2, 8, 8, 3)), fps=MAX_FPS + 1)

@@ -55,7 +55,7 @@ GROUPS = {
 PRINTING = ("doctor", "compare", "ablate")
 """Commands with their result on the terminal."""
 ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
-"""Arguments that only print text."""
+"""Arguments for which a command only prints text."""
 
 
 def _help() -> str:
@@ -76,7 +76,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted.
 
     Raises:
-        SystemExit: Help of a command was requested, or a word is wrong.
+        SystemExit: Help of a command was requested, or an argument is wrong.
     """
     if arguments is None:
         use_utf8_names()
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             with interrupting_signals():
                 return output.exit_code(_run(words))
-        except SystemExit as e:  # tyro has printed the help, or said which word is wrong
+        except SystemExit as e:  # tyro has printed the help or the error
             if e.code or not (code := output.exit_code(0)):
                 raise
             raise SystemExit(code) from e

@@ -13,20 +13,20 @@ from warpgs.field_docs import field_docs
 WIDTH = 80
 """Columns of a terminal."""
 NAMES = 22
-"""Most columns of a flag and its value, before the words about it."""
+"""Largest width of the column with flags and values [letters]."""
 FEW = 4
-"""Most flags of a group that are explained; a larger one is listed by name."""
+"""Largest group of flags that is explained; of larger groups only names are listed."""
 VALUES = {int: "N", float: "X", Path: "PATH", str: "VALUE"}
-"""Words for the value of a flag, by its type."""
+"""Placeholders for the value of a flag, by its type."""
 
 
 def help_text(kind: type, program: str, description: str) -> str:
     """Return the help of a command.
 
     Args:
-        kind: Dataclass of its flags, as `parse_flags` takes it.
+        kind: Dataclass of the flags, as for `parse_flags`.
         program: Name of the program and the command.
-        description: Words about the command; lines of lists begin with two spaces.
+        description: Description of the command; lines of lists begin with two spaces.
     """
     docs, usage, positionals, flags, more = field_docs(kind), [program], [], [], []
     for field in dataclasses.fields(kind):
@@ -51,7 +51,7 @@ def help_text(kind: type, program: str, description: str) -> str:
 
 
 def flag_names(kind: type, prefix: str = "") -> Iterator[str]:
-    """Yield the names of all flags of a dataclass, those of nested settings and of ``no-`` included, with their dashes."""
+    """Yield the names of all flags of a dataclass, with dashes: also flags of nested settings and ``no-`` flags."""
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint, markers = _parts(hints[field.name])
@@ -78,7 +78,7 @@ def positional_names(kind: type) -> list[str]:
 
 
 def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return the type and the markers of an annotation; None is left out of a union."""
+    """Return the type and the markers of an annotation; of a union the first type that is not None."""
     markers: tuple[Any, ...] = ()
     while hasattr(hint, "__metadata__"):
         hint, markers = hint.__origin__, (*markers, *hint.__metadata__)
@@ -88,7 +88,7 @@ def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _prefix(name: str, markers: tuple[Any, ...]) -> str:
-    """Return the words before the names of a group's flags."""
+    """Return the prefix of the names of a group's flags."""
     named = [m.name for m in markers if getattr(m, "name", None) is not None]
     if "OmitArgPrefixes" in str(markers) or "" in named:
         return ""
@@ -101,7 +101,7 @@ def _required(field: Any) -> bool:
 
 
 def _row(field: Any, hint: Any, prefix: str, text: str) -> tuple[str, str]:
-    """Return a flag with its value, and the words about it with its default."""
+    """Return a flag with its value, and its description with the default."""
     default = field.default
     if isinstance(default, bool):
         word, flag, stated = "", "[no-]" * default, " [on]" * default
@@ -113,7 +113,7 @@ def _row(field: Any, hint: Any, prefix: str, text: str) -> tuple[str, str]:
 
 
 def _fields(kind: type) -> Iterator[tuple[Any, Any, str]]:
-    """Yield the fields of a group that a user may give: field, type, words about it."""
+    """Yield the fields of a group that a user may give: field, type, description."""
     docs, hints = field_docs(kind), typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint, markers = _parts(hints[field.name])
@@ -122,7 +122,7 @@ def _fields(kind: type) -> Iterator[tuple[Any, Any, str]]:
 
 
 def _group(kind: type, prefix: str, *, sole: bool) -> Iterator[tuple[str, list[str]]]:
-    """Yield title and lines of a group of flags; without the words about each where there are many."""
+    """Yield title and lines of a group of flags; flags of a large group have no descriptions."""
     rows = [_row(field, hint, prefix, text) for field, hint, text in _fields(kind)]
     if sole or len(rows) <= FEW:
         yield "", _columns(rows)
@@ -139,7 +139,7 @@ def _wrapped(text: str) -> list[str]:
 
 
 def _columns(rows: list[tuple[str, str]]) -> list[str]:
-    """Return names and words about them as two columns; a long name has a line of its own."""
+    """Return names and descriptions as two columns; a long name has a line of its own."""
     width = min(max((len(name) for name, _ in rows), default=0), NAMES)
     lines = []
     for name, text in rows:

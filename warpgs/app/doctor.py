@@ -33,16 +33,16 @@ LOW_MEMORY = 4 * 2**30  # [bytes]
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     topic: str
-    """Subject in a word or two, unique within a report."""
+    """Subject, one or two words, unique within a report."""
     status: Literal["ok", "missing", "note"]
-    """``missing`` where something does not work; ``note`` where all works, only slower or with less."""
+    """``missing`` where something does not work; ``note`` where a fit works, but slower or with fewer features."""
     detail: str
-    """Observation, in words."""
+    """Observation, as text."""
     remedy: str = ""
-    """Way to get it; never empty where the status is ``missing``."""
+    """Fix; never empty where the status is ``missing``."""
     required: bool = False
     """True where a fit needs it."""
 
@@ -81,7 +81,7 @@ EXTRAS = {
     "view": ("viser", "the viewer and pages to send"),
     "formats": ("zstandard", "SPZ of version 4"),
 }
-"""Optional dependencies for users with photographs: the module that shows that one is installed, and its purpose."""
+"""Optional dependencies by name: the module by which each is detected, and its purpose."""
 
 
 def _reason(error: BaseException) -> str:
@@ -103,7 +103,7 @@ def _python() -> Iterable[Finding]:
 
 
 def _find(name: str) -> object:
-    """Look for a module without importing it, which for VTK takes long; ModuleNotFoundError where it is missing."""
+    """Look for a module without importing it, because importing VTK takes long; ModuleNotFoundError where it is missing."""
     spec = importlib.util.find_spec(name)
     if spec is None:
         raise ModuleNotFoundError(f"No module named {name!r}")
@@ -232,7 +232,7 @@ def _size(folder: Path) -> int:
 
 
 def _prior_cache() -> Iterable[Finding]:
-    """Check the folder that maps of networks are kept in; a fit works without."""
+    """Check the cache folder for maps of networks; a fit works without it."""
     from warpgs.priors.cache import cache_folder
 
     folder = cache_folder()
@@ -321,7 +321,7 @@ APART = frozenset({_rendering})
 
 
 def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
-    """Return what a check finds; its own failure is a finding, too."""
+    """Return the findings of a check; a failure of the check is a finding, too."""
     try:
         return list(check())
     except Exception as e:
@@ -330,7 +330,7 @@ def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
 
 
 def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]:
-    """Look at everything a fit and its report need.
+    """Check everything that a fit and its report need.
 
     Args:
         tell: Called with a line about each check.
@@ -346,7 +346,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
 
 
 def print_report(findings: list[Finding], console=None) -> int:
-    """Print the findings as a table, and below it what to do about them.
+    """Print the findings as a table, and the fixes below it.
 
     Args:
         findings: what `diagnose` returned.

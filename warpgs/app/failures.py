@@ -1,4 +1,4 @@
-"""The last words of a command that failed, and its exit code."""
+"""Error messages and exit codes of commands that failed."""
 
 from warpgs.errors import ResourceError, UsageError, WarpgsError
 from warpgs.plugins import own_frame

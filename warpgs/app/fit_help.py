@@ -6,7 +6,7 @@ FLAGS = (
     ("--out", "RUN", "", "run folder to fill; new or empty"),
     ("--split", "SPEC", "", "views to hold out for scores; default: none"),
     ("--preset", "NAME", DEFAULT_PRESET, "settings to start from: below, or a .toml file"),
-    ("--steps", "N", "", "number of steps, one view each; default: by the preset"),
+    ("--steps", "N", "", "number of steps, one view each; default: from the preset"),
     ("--device", "NAME", "auto", "auto, cpu or cuda"),
     ("--downscale", "F", "", "divide both sides of the images by F"),
     ("--max-side", "N", "", "longest side [px]; 1600, on a CPU 800; 0 no limit"),
@@ -19,7 +19,7 @@ FLAGS = (
     ("--resume", "", "False", "continue the run in --out from its last checkpoint"),
     ("--view", "", "False", "watch in a browser while it trains"),
 )
-"""Flags that most fits need: name, word for the value, default (empty for none; False for a switch), and words about it."""
+"""Flags that most fits need: name, placeholder of the value, default (empty for none; False for a switch), description."""
 
 SPLITS = {
     "every:N": "hold out every Nth view",
@@ -41,7 +41,7 @@ SCENE = (
     "folder with cameras, in a format that --help-all lists;",
     "or photographs or a video; fit then finds the poses",
 )
-"""Words about the positional argument."""
+"""Description of the positional argument."""
 
 
 def wants_help(arguments: list[str]) -> bool:
@@ -53,7 +53,7 @@ def help_lines(about: str) -> list[str]:
     """Return the help of `warpgs fit` in at most 45 lines of 80 columns.
 
     Args:
-        about: Words about the command.
+        about: Description of the command.
     """
 
     def rows(pairs: list[tuple[str, str]]) -> list[str]:

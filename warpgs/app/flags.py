@@ -21,11 +21,11 @@ Settings = TypeVar("Settings")
 def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | None = None) -> tuple[type, Any]:
     """Derive the flags of a settings dataclass, nested settings included.
 
-    Every field becomes a flag with the field's docstring as its help, those of nested settings under the field's name.
+    Every field becomes a flag with the field's docstring as its help. Flags of nested settings begin with the field's name.
 
     Args:
         kind: The dataclass.
-        default: An instance of it, with the defaults of the flags.
+        default: Instance of ``kind`` with the defaults of the flags.
         special: Markers and constructors of tyro for some fields of ``kind`` itself, by name.
 
     Returns:
@@ -81,7 +81,7 @@ MAX_NUMBER = 3e38
 
 
 def _whole(words: list[str]) -> int:
-    """Return the integer that a word stands for; ValueError if it is not an integer of 64 bits."""
+    """Return the integer of an argument; ValueError if it is not an integer of 64 bits."""
     if not re.fullmatch(r"[+-]?[0-9][0-9_]*", words[0]):
         raise ValueError(f"expected an integer, got {words[0][:40]!r}")
     if len(words[0]) > 40 or abs(number := int(words[0])) > MAX_WHOLE:
@@ -90,7 +90,7 @@ def _whole(words: list[str]) -> int:
 
 
 def _number(words: list[str]) -> float:
-    """Return the number that a word stands for; ValueError if it is not a number, not finite, or beyond float32."""
+    """Return the number of an argument; ValueError if it is not a number, not finite, or beyond float32."""
     plain = re.fullmatch(r"[+-]?([0-9][0-9_]*\.?[0-9_]*|\.[0-9][0-9_]*)([eE][+-]?[0-9]+)?", words[0])
     if not plain:
         raise ValueError(f"expected a finite number, got {words[0][:40]!r}")
@@ -100,7 +100,7 @@ def _number(words: list[str]) -> float:
 
 
 def _switch(words: list[str]) -> bool:
-    """Return True or False for its word, in any case; ValueError for another word."""
+    """Return True for true and False for false, in any case; ValueError for another argument."""
     found = {"true": True, "false": False}.get(words[0].lower())
     if found is None:
         raise ValueError(f"expected true, false or none, got {words[0][:40]!r}")
@@ -108,7 +108,7 @@ def _switch(words: list[str]) -> bool:
 
 
 PARSERS: dict[Any, Any] = {int: _whole, float: _number, bool: _switch}
-"""Functions that return the value of a word, by its type."""
+"""Functions that return the value of an argument, by its type."""
 
 
 def _number_rule(info: Any) -> Any:
@@ -132,19 +132,19 @@ def _number_rule(info: Any) -> Any:
 
 
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
-    """Return an instance of a dataclass of flags from the words of a command line; ``--help`` prints one screen.
+    """Return an instance of a dataclass of flags from the arguments of a command line; ``--help`` prints one screen.
 
     Numbers are finite and written in the digits 0 to 9.
 
     Args:
         kind: The dataclass.
-        arguments: Words after the name of the command.
+        arguments: Arguments after the name of the command.
         program: Name of the program and the command, for the help.
-        description: Words about the command, for the help.
+        description: Description of the command, for the help.
 
     Raises:
         SystemExit: Help was asked for.
-        UsageError: A word is wrong, or one is missing.
+        UsageError: An argument is wrong or missing.
     """
     import tyro
 
@@ -169,14 +169,14 @@ def check_range(flag: str, value: float, low: float, high: float) -> None:
     """Check the number of a flag.
 
     Raises:
-        UsageError: It is below ``low`` or above ``high``.
+        UsageError: The value is below ``low`` or above ``high``.
     """
     if not low <= value <= high:
         raise UsageError(f"{flag} must be a number from {low:,} to {high:,}, not {value}")
 
 
 def listed(title: str, lines: Mapping[str, str]) -> str:
-    """Return names and a line about each under a title, for the head of a help."""
+    """Return a title and a list of names with descriptions, for the beginning of a help text."""
     return "\n".join([f"{title}:", *(f"  {name}: {about}" if about else f"  {name}" for name, about in lines.items())])
 
 
@@ -185,7 +185,7 @@ def word_after(arguments: list[str], flag: str) -> str | None:
     found = None
     for i, word in enumerate(arguments):
         name, given, value = word.partition("=")
-        if name.replace("_", "-") != flag:  # tyro takes either
+        if name.replace("_", "-") != flag:  # tyro accepts _ and -
             continue
         if given:
             found = value

@@ -20,7 +20,7 @@ def format_lines() -> str:
 
 
 def format_flags(arguments: list[str]) -> type:
-    """Return the dataclass of the flags that `export` and `convert` share, those of a format that is named included."""
+    """Return the dataclass of the flags that `export` and `convert` share, including options of the format of --format."""
     import tyro
 
     @dataclass(frozen=True, kw_only=True)
@@ -30,8 +30,8 @@ def format_flags(arguments: list[str]) -> type:
         crop: str | None = None
         """Box to keep, in units of the scene's files: x,y,z,X,Y,Z, or a .json file such as the one that the viewer saves."""
         clean: tyro.conf.FlagCreatePairsOff[bool] = False
-        """Remove floaters and needles: Gaussians that no training view of a run sees, larger than the scene, or long and thin.
-        Default: on, except for .ply files."""
+        """Remove floaters and needles: Gaussians that no training view of a run sees, that are larger than the scene, or that
+        are long and thin. Default: on, except for .ply files."""
         no_clean: tyro.conf.FlagCreatePairsOff[bool] = False
         """Keep floaters and needles."""
         sh_degree: int | None = None
@@ -47,7 +47,7 @@ def format_flags(arguments: list[str]) -> type:
 
 
 def _with_options(own: str | None) -> dict[str, type]:
-    """Return the options of formats by the group of their flags, those of the user's ``own`` format included."""
+    """Return the options of formats by the group of their flags, including the user's ``own`` format."""
     kinds = [type(f) for f in all_formats()]
     if own is not None and (kind := type(_found(own))) not in kinds:
         kinds.append(kind)
@@ -61,7 +61,7 @@ def _found(choice: str) -> Format:
 
 
 def chosen_formats(a: Any, target: Path) -> list[Format]:
-    """Return the formats that parsed flags name, and that of the file to write with its options.
+    """Return the format of the file to write, with its options, and the format that --format names.
 
     Args:
         a: Parsed flags of `format_flags`.

@@ -1,4 +1,4 @@
-"""Loading of code of the user's own that a command line names."""
+"""Loading of the user's own code that a command line names."""
 
 import traceback
 from collections.abc import Callable
@@ -18,7 +18,7 @@ def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
         load: Function that loads it.
 
     Raises:
-        UsageError: It is missing, or its code does not run; the message names the line.
+        UsageError: The object is missing, or its code does not run; the message names the line.
     """
     try:
         return load()

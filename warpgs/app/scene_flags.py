@@ -1,4 +1,4 @@
-"""Flags of how a scene is read: those of `SceneRequest`, for every command that reads one."""
+"""Flags for reading a scene: those of `SceneRequest`, for every command that reads a scene."""
 
 import dataclasses
 import os
@@ -15,7 +15,7 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
     """Return the dataclass of the flags, and their defaults.
 
     Args:
-        positional: Whether the folder is one of them, without a flag; else the command names its scenes itself.
+        positional: Whether the scene folder is a positional argument; else the command defines its own argument for scenes.
     """
     import tyro
 

@@ -1,4 +1,4 @@
-"""Errors of a command line in one line: a flag that is unknown, a value that is wrong, a word that is missing or too many."""
+"""One-line errors for a wrong command line: an unknown flag, a wrong value, a missing or an extra argument."""
 
 import re
 import textwrap
@@ -13,27 +13,27 @@ from warpgs.suggestion import did_you_mean
 TARGETS = ("--to", "--out")
 """Flags that name the file to write."""
 MAX_SHOWN = 40
-"""Most letters of a wrong word that are repeated."""
+"""Largest number of letters of a wrong argument that a message repeats."""
 
 
 def refuse(kind: type, arguments: list[str], program: str, complaint: str) -> NoReturn:
-    """Refuse a command line that tyro has refused, with one line.
+    """Raise an error in one line for a command line that tyro has rejected.
 
     Args:
         kind: The dataclass of flags.
-        arguments: Words after the name of the command.
+        arguments: Arguments after the name of the command.
         program: Name of the program and the command.
-        complaint: What tyro printed: a box with a title, the reason, and words on the help below a line.
+        complaint: Text that tyro printed: a box with a title, the reason, and a hint on the help below a line.
 
     Raises:
-        UsageError: Always; it names the word that is wrong, missing or too many, and what to write.
+        UsageError: Always; the message names the wrong, missing or extra argument, and the fix.
     """
     _refuse_unknown_flag(kind, arguments, program)
     _refuse_lone_side(kind, arguments)
     text = re.sub(r"\x1b\[[0-9;]*m", "", complaint)
     _, *rows = [row for row in re.sub(r"(?m)^│|│$", "", text).splitlines() if row.strip()]  # without the title
     _refuse_stray_word(kind, arguments, program, rows)
-    drawn = re.compile(r"[ ─╰╯-]+").fullmatch  # a line, with words on the help below it
+    drawn = re.compile(r"[ ─╰╯-]+").fullmatch  # a line, with the hint on the help below
     rows = [*takewhile(lambda row: not drawn(row), dropwhile(drawn, rows))]
     reason = _missing(kind, rows) or _wrong_value(" ".join(" ".join(rows).split()))
     raise UsageError(f"{reason}; `{program} --help` lists its arguments")
@@ -79,7 +79,7 @@ def _refuse_stray_word(kind: type, arguments: list[str], program: str, rows: lis
 
 
 def _missing(kind: type, rows: list[str]) -> str:
-    """Return which words are missing, of which tyro writes each after four spaces; empty for another complaint."""
+    """Return the message on missing arguments, which tyro lists after four spaces; empty for another error."""
     if not rows or not rows[0].strip().startswith("Missing from "):
         return ""
     found = [row.strip() for row in textwrap.dedent("\n".join(rows)).splitlines()[1:] if re.match(r" {4}\S", row)]
@@ -91,7 +91,7 @@ def _missing(kind: type, rows: list[str]) -> str:
 
 
 def _wrong_value(reason: str) -> str:
-    """Return tyro's reason as one line, worded as our errors are."""
+    """Return tyro's reason as one line, in the wording of our errors."""
     if found := re.match(r"Missing value for argument '(.+?)'\. Expected (\d+)", reason):
         flag, count = found.groups()
         return f"{flag} needs {'a value' if count == '1' else f'{count} values'}"
@@ -104,6 +104,6 @@ def _wrong_value(reason: str) -> str:
         return f"{flag} needs {count} values, got {given}"
     if found := re.match(r"Error parsing (.+?): (.*)", reason):
         flag, why = found.groups()
-        one = re.search(r"expected .*?, got .*?(?= - <class|$)", why)  # of the types that may stand there, the number
+        one = re.search(r"expected .*?, got .*?(?= - <class|$)", why)  # of all types that the flag accepts, the number
         return f"{flag}: {one[0] if one else why}"
     return reason

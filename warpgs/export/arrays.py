@@ -30,9 +30,9 @@ def malformed(path: Path, what: str) -> DataError:
 
 
 def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
-    """Return an array, float32 [n, *shape], of pieces of at most `ROWS` rows that are requested in their order.
+    """Return an array, float32 [n, *shape], made of pieces of at most `ROWS` rows that are requested in order.
 
-    What leaves float32 becomes an infinity, which `gaussians_of` names.
+    Values beyond float32 become infinities, which `gaussians_of` reports.
     """
     out = np.empty((n, *shape), np.float32)
     for part in parts(n):
@@ -60,7 +60,7 @@ def check_finite(path: Path, arrays: Arrays) -> None:
         bad = array.size - int(np.isfinite(array).sum())
         if bad:
             raise DataError(
-                f"{path}: not written, {name} holds {bad} non-finite of {array.size} values, which no viewer can show. "
+                f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
                 "Export an earlier checkpoint, or fit again with a lower learning rate."
             )
 

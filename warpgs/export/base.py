@@ -30,8 +30,8 @@ BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
     NotImplementedError, RecursionError, RuntimeError, OSError,
 )  # fmt: skip
-"""Errors of decoders, those of the standard library, of zstandard and our own, about invalid content: zipfile reports
-encryption as RuntimeError, unknown methods as NotImplementedError, and seeks before the start as OSError."""
+"""Errors of decoders (standard library, zstandard, our own) about invalid content: zipfile reports encryption as RuntimeError,
+unknown methods as NotImplementedError, and seeks before the start as OSError."""
 
 
 class Format:
@@ -40,9 +40,9 @@ class Format:
     name: ClassVar[str] = ""
     """Name in the registry."""
     suffix: ClassVar[str] = ""
-    """End of the names of its files in lower case, with the dot, such as ``.spz``."""
+    """Suffix of file names in lower case, with the dot, such as ``.spz``."""
     description: ClassVar[str] = ""
-    """One line about it for the help."""
+    """One line about the format, for the help."""
     Config: ClassVar[type | None] = None
     """Frozen dataclass of the options for writing; None for none. They become flags, grouped under the format's name."""
     cleaned: ClassVar[bool] = True
@@ -52,14 +52,14 @@ class Format:
     archive: ClassVar[bool] = False
     """True for an archive of several files: `decode` then receives the open file instead of its bytes."""
     max_degree: ClassVar[int] = 3
-    """Highest degree of spherical harmonics that it supports."""
+    """Highest degree of spherical harmonics that the format supports."""
     note: ClassVar[str] = ""
     """Note for users on its axes, if programs disagree on them."""
     declares: ClassVar[bool] = False
     """True if a file can declare that its Gaussians are antialiased (`RasterizeOptions.antialiased`)."""
 
     def __init__(self, config: Any = None):
-        """Take its options, an instance of ``Config``; None for their defaults."""
+        """Take the options, an instance of ``Config``; None for their defaults."""
         self.config: Any = self.Config() if config is None and self.Config is not None else config
         """The options."""
         self.antialiased = False
@@ -73,7 +73,7 @@ class Format:
                 units, quats wxyz of any length [N, 4], logit opacities [N], spherical harmonics [N, K, 3].
 
         Raises:
-            UsageError: The format does not define it.
+            UsageError: The format does not define `encode`.
         """
         raise UsageError(f"{self.suffix} files can be read but not written: {type(self).__name__} defines no encode")
 
@@ -82,15 +82,15 @@ class Format:
 
         Args:
             path: The file, for messages.
-            data: Its bytes; of an ``archive`` the open file.
+            data: Bytes of the file; for an ``archive`` the open file.
 
         Raises:
-            UsageError: The format does not define it.
+            UsageError: The format does not define `decode`.
         """
         raise UsageError(f"{path}: {self.suffix} files can be written but not read: {type(self).__name__} defines no decode")
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether a file declares that its Gaussians are antialiased; False if the format cannot.
+        """Return whether a file declares that its Gaussians are antialiased; False if the format cannot declare it.
 
         Raises:
             DataError: The file is missing or malformed.
@@ -143,7 +143,7 @@ class Format:
 
 
 def warn_of_antialiasing(path: Path) -> None:
-    """Warn the caller of a function that reads a file that its Gaussians are antialiased."""
+    """Warn that the Gaussians of a file are antialiased; the warning points to the caller of the reading function."""
     warnings.warn(f"{path}: its Gaussians are antialiased; render them with RasterizeOptions(antialiased=True)", stacklevel=3)
 
 

@@ -1,6 +1,6 @@
 """Cameras as files for other programs: cameras.json of the INRIA 3DGS code, which splat editors read, transforms.json, COLMAP.
 
-Images are named by number: no name or path of the user's leaves in them.
+Images are named by number, so that the files contain no name or path of the user.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from warpgs.scene import Camera
 NAMES = ("cameras.json", "transforms.json", "sparse")
 """Names of files, and of a folder, that determine the format."""
 MAX_OFF_CENTER = 0.01
-"""Least distance of a principal point from the image's middle for a note that the file drops it [px]."""
+"""Distance of the principal point from the image centre [px] above which a note reports that the file drops it."""
 
 
 def holds_cameras(path: Path) -> bool:
-    """Return whether a name is one of a format of cameras."""
+    """Return whether a file name is that of a camera format."""
     return path.name in NAMES
 
 
@@ -29,12 +29,12 @@ def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
     """Write cameras in the format of the file name; returns notes for the user.
 
     Args:
-        path: cameras.json or transforms.json, in any folder, where an existing file is replaced; or a folder named sparse, as
-            COLMAP's text files in its folder 0; it must be new or empty.
+        path: cameras.json or transforms.json in any folder; an existing file is replaced. Or a new or empty folder named
+            sparse, for COLMAP's text files in its subfolder 0.
         cameras: Cameras in file units, numpy arrays; cameras with lenses are written as pinholes of the same K, with a note.
 
     Raises:
-        ResourceError: The folder or the disk does not take the file.
+        ResourceError: The file cannot be written.
         UsageError: The name has no known format, the folder exists and is not empty, or a camera has no pinhole of the same K.
     """
     if not holds_cameras(path):

@@ -84,7 +84,7 @@ def start_of(path: Path) -> bytes:
 
 
 def is_compressed(path: Path, data: bytes) -> bool:
-    """Return whether the bytes of a .ply file are of this format, by its header; DataError where it has none."""
+    """Return whether the header of a .ply file announces this format; DataError if the file has no header."""
     elements, _ = parse_header(path, data[:MAX_HEADER_BYTES])
     return any(e.name == "vertex" and "packed_position" in dict(e.properties) for e in elements)
 
@@ -93,7 +93,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The file is malformed, truncated, or for another way of rendering.
+        DataError: The file is malformed or truncated, or needs another render mode.
     """
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     tables = {}
@@ -103,10 +103,10 @@ def decode(path: Path, data: bytes) -> Arrays:
         tables[element.name], start = _table(path, data, element, start)
     chunk, vertex, sh = tables.get("chunk"), tables.get("vertex"), tables.get("sh")
     if chunk is None or vertex is None:
-        raise malformed(path, "it lacks the element chunk or vertex")
+        raise malformed(path, "the element chunk or vertex is missing")
     n = len(vertex)
     if len(chunk) != -(-n // CHUNK):
-        raise malformed(path, f"{len(chunk)} chunks for {n} Gaussians")
+        raise malformed(path, f"it has {len(chunk)} chunks, but {n} Gaussians need {-(-n // CHUNK)}")
     position, rotation, scale, color = (_column(path, vertex, name, "<u4") for name in _VERTEX_NAMES)
     bounds = [_bounds(path, chunk, group) for group in _GROUPS]
 
@@ -150,7 +150,7 @@ def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np
     """Return a function for the coefficients above degree 0 [P, K - 1, 3] of some rows, and K."""
     count = len(sh.dtype.names or ())
     if len(sh) != n or count // 3 + 1 not in SH_SIZES or count % 3:
-        raise malformed(path, f"{len(sh)} rows of {count} harmonics for {n} Gaussians")
+        raise malformed(path, f"{len(sh)} rows of {count} harmonics do not fit {n} Gaussians")
     columns = [_column(path, sh, f"f_rest_{i}", "u1") for i in range(count)]
 
     def rows(part: slice) -> np.ndarray:

@@ -26,7 +26,7 @@ def suffixes() -> list[str]:
 def find_format(choice: str | type[Format] | Format) -> Format:
     """Return the format of a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object.
 
-    A string with a colon imports the module or file, which runs its code: never pass one that a file of others names.
+    A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
 
     Raises:
         UsageError: There is no such format, it does not derive from `Format`, or it has no suffix.
@@ -50,7 +50,7 @@ def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format 
     """Return the format of a file: the given one, else that of its suffix.
 
     Raises:
-        UsageError: No format has the suffix, or it is not that of the given format.
+        UsageError: No format has the suffix, or the given format has another suffix.
     """
     if choice is not None:
         chosen = find_format(choice)

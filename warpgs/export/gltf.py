@@ -1,6 +1,7 @@
 """The format glTF with the extension KHR_gaussian_splatting, in float32: .glb, or .gltf with its numbers inside.
 
-Axes lengths are linear, opacities after the sigmoid, rotations xyzw. Axes have y up, a half turn about z from those of PLY.
+Axis lengths are linear, opacities after the sigmoid, rotations xyzw. Coordinates have y up: a half turn about z from those of
+PLY.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"
 GLB, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 MAX_PARTS = 100_000
-"""Most lists and objects in a document, each of which takes some thirty times as much memory as text."""
+"""Largest number of lists and objects in a document; each takes some thirty times as much memory as its text."""
 MAX_VALUES = 300_000
 """Most commas in a document: each separates two values, which take up to a hundred bytes."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -131,7 +132,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     degrees = [d for d in range(4) if f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names]
     if degrees != list(range(len(degrees))) or not degrees:
-        raise malformed(path, f"it has harmonics of degrees {degrees}")
+        raise malformed(path, f"it has harmonics of degrees {degrees}, but degrees must start at 0 and have no gap")
     orders = [(math.isqrt(k), k - math.isqrt(k) ** 2) for k in range(SH_SIZES[degrees[-1]])]
     means, turns, scales, opacities = (
         values(name) for name in ("POSITION", *(f"{EXTENSION}:{n}" for n in ("ROTATION", "SCALE", "OPACITY")))
@@ -228,7 +229,7 @@ def _inside(path: Path, uri: object) -> bytes:
 
 
 def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
-    """Return the one primitive of Gaussians, checked for what this program does not read."""
+    """Return the one primitive of Gaussians; DataError for features that are not supported."""
     meshes, nodes = document.get("meshes"), document.get("nodes", [])
     found = []
     for mesh in meshes if isinstance(meshes, list) else []:
@@ -264,7 +265,7 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     def count(row: dict[str, Any], key: str, default: int | None = None) -> int:
         value = row.get(key, default)
         if type(value) is not int or not 0 <= value <= len(body):
-            raise malformed(path, f"{key} {str(value)[:20]!r} does not fit its {len(body)} bytes of numbers")
+            raise malformed(path, f"{key} {str(value)[:20]!r} does not fit into the {len(body)} bytes of its buffer")
         return value
 
     accessor = item("accessors", index)

@@ -43,7 +43,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
     Raises:
         DataError: A number is not finite, a triangle names a vertex that is missing, or the file would be too large.
         ResourceError: The file cannot be written.
-        UsageError: The suffix is neither.
+        UsageError: The suffix is neither .ply nor .glb.
     """
     path = Path(path)
     check_suffix(path)

@@ -123,10 +123,8 @@ def _read(path: Path, normalization: Normalization | None, units: str) -> Gaussi
             dtype = np.dtype(vertex.properties)
             end = start + vertex.count * dtype.itemsize
             if end > size:
-                raise ply_error(
-                    path,
-                    f"truncated: {vertex.count} Gaussians of {dtype.itemsize} bytes need {end} bytes, it has {size}",
-                )
+                needed = f"{vertex.count} Gaussians of {dtype.itemsize} bytes end at byte {end}"
+                raise ply_error(path, f"truncated: {needed}, but the file has {size} bytes")
             file.seek(start)
 
             def rows(part: slice) -> np.ndarray:
@@ -252,7 +250,7 @@ class PLY(Format):
         write_ply(path, gaussians, normalization, units=units, antialiased=self.antialiased)
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-        """Read Gaussians with `read_ply`, or as `CompressedPLY` where the header is of that.
+        """Read Gaussians with `read_ply`, or with `CompressedPLY` if the header announces that format.
 
         Raises:
             DataError: The file is missing or malformed.

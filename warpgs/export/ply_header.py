@@ -102,7 +102,7 @@ def parse_header(path: Path, head: bytes) -> tuple[list[Element], int]:
 
 
 def _check_comment(path: Path, words: list[str]) -> None:
-    """Raise a DataError where a comment says that the Gaussians are rendered in a way that this program does not know."""
+    """Raise a DataError where a comment names an unsupported render mode."""
     text = " ".join(words).lower().replace(":", " ").split()
     match text:
         case ["splatrendermode", mode] if mode not in ("default", "mip"):

@@ -1,8 +1,8 @@
 """PlayCanvas's SOG format, version 2: a zip archive of lossless WebP images whose pixels are Gaussians, and meta.json.
 
 Positions have 16 bits between bounds, on a logarithmic scale; rotations 8 bits a component; log scales, colours and harmonics
-are entries of codebooks of 256 values. Harmonics above degree 0 have a palette of at most 65,536 rows: up to as many Gaussians
-keep their own. Axes are those of PLY.
+are entries of codebooks of 256 values. Harmonics above degree 0 have a palette of at most 65,536 rows; a model with at most
+this number of Gaussians keeps all rows. Axes are those of PLY.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ MAX_CONTENTS_BYTES = 2**16
 """Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
 MAX_PIXEL_BYTES = 8
-"""Most bytes of a pixel in a lossless WebP image; one that cannot be compressed takes little more than 4."""
+"""Largest number of bytes per pixel of a lossless WebP image; incompressible pixels take little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
 """Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
-"""Most Gaussians per byte of a file, most pixels per Gaussian, and the least of both limits for any file: real files have a
-Gaussian in ten bytes, and one pixel each. Beyond, images are bombs."""
+"""Most Gaussians per byte of a file, most pixels per Gaussian, and a number added to both limits: real files have one Gaussian
+per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -108,7 +108,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a codebook of 256 values, ascending, and the index of the nearest entry, as uint8 in the shape of ``values``.
 
-    Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that it repeats.
+    Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that results repeat.
     """
     ordered = np.sort(values.reshape(-1).astype(np.float64))
     even = np.linspace(ordered[0], ordered[-1], LEVELS)
@@ -126,9 +126,9 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most 65,536 rows that stand for all, and the one for each, int64 [N].
+    """Return at most 65,536 rows that represent all rows, and for each row the index of its representative, int64 [N].
 
-    More rows than that are halved at the median of their widest column, again and again; each cell is one row, its mean.
+    If there are more rows, cells are halved repeatedly at the median of their widest column; the mean represents a cell.
     """
     n = len(rows)
     if n <= PALETTE:
@@ -157,7 +157,7 @@ def _webp(pixels: np.ndarray) -> bytes:
 
 
 def decode(path: Path, file: BinaryIO) -> Arrays:
-    """Return the Gaussians of an open file, of which no more is read than its Gaussians can take.
+    """Return the Gaussians of an open file; images larger than the Gaussians need are not decoded.
 
     Raises:
         DataError: The file is malformed, truncated, or announces more than its size can hold.
@@ -170,7 +170,7 @@ def decode(path: Path, file: BinaryIO) -> Arrays:
         if meta.get("model", "default") not in ("default", "antialiased"):
             raise malformed(path, f"its model {str(meta['model'])[:40]!r} is not supported")
         if type(n) is not int or not 0 < n <= MAX_PER_BYTE * size + SMALL:
-            raise malformed(path, f"{str(n)[:20]} Gaussians in {size} bytes")
+            raise malformed(path, f"it announces {str(n)[:20]} Gaussians in only {size} bytes")
         most = MAX_PIXEL_BYTES * (MAX_PIXELS * n + SMALL)
 
         def pixels(part: str, i: int) -> np.ndarray:
@@ -198,7 +198,7 @@ def _meta(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
 def _harmonics(
     path: Path, meta: dict[str, Any], n: int, pixels: Callable[[str, int], np.ndarray], member: Callable[[object], bytes]
 ) -> np.ndarray:
-    """Return the coefficients [N, K, 3], all but the first of which come from the palette; that one is not set yet."""
+    """Return the coefficients [N, K, 3] from the palette; the first of each Gaussian is not set yet."""
     if meta.get("shN") is None:
         return np.empty((n, 1, 3), np.float32)
     rows = _palette_rows(path, meta["shN"], member(meta["shN"]["files"][0]))
@@ -234,7 +234,7 @@ def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
     """Return the rotations [N, 4] of their pixels [P, 4]."""
     largest = pixels[:n, 3]
     if (largest < 252).any():
-        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} has no largest component")
+        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} does not name its largest component")
     return by_rows(
         n, (4,), lambda p: from_smallest_three(largest[p].astype(np.int64) - 252, (pixels[p, :3] / 255 - 0.5) * SQRT2)
     )
@@ -243,7 +243,7 @@ def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
 def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
     """Raise a DataError where the end of an archive announces a large table of contents, or leaves its size to other records.
 
-    These are a comment behind the end, and the locator of zip64 before it, which archives beyond 4 GiB need.
+    Other records are a comment after the end, and the zip64 locator before it, which archives beyond 4 GiB need.
     """
     file.seek(max(0, size - 42))
     locator, end = (last := file.read())[:-22], last[-22:]
@@ -253,7 +253,7 @@ def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:
-    """Return a file of the archive of at most ``most`` bytes, read into memory only: its name is never a path."""
+    """Return a file of the archive of at most ``most`` bytes, read into memory only: its name is never used as a path."""
     if not isinstance(name, str) or name not in archive.namelist():
         raise malformed(path, f"{str(name)[:40]!r} is not in the archive")
     if archive.getinfo(name).file_size > most:
@@ -303,7 +303,7 @@ def _book(path: Path, part: dict[str, Any]) -> np.ndarray:
     """Return the 256 numbers of a codebook."""
     book = np.array(part["codebook"], np.float64)
     if book.shape != (LEVELS,):
-        raise malformed(path, f"a codebook has the shape {book.shape} instead of {LEVELS} numbers")
+        raise malformed(path, f"a codebook has the shape {book.shape}, not {LEVELS} numbers")
     return book
 
 
@@ -311,11 +311,11 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
     """Return the rows of the palette of harmonics [P, K - 1, 3]."""
     bands, count = part["bands"], part["count"]
     if bands not in (1, 2, 3) or type(count) is not int or not 0 < count <= PALETTE:
-        raise malformed(path, f"{str(count)[:20]} rows of harmonics of {str(bands)[:20]} degrees")
+        raise malformed(path, f"its table of harmonics is invalid: {str(count)[:20]} rows, {str(bands)[:20]} degrees")
     k = SH_SIZES[bands] - 1
     pixels = _pixels(path, "harmonics", content, count * k)
     if len(pixels) % (COLUMNS * k):
-        raise malformed(path, "its image of harmonics has another width")
+        raise malformed(path, "its image of harmonics has an invalid width")
     return _book(path, part).astype(np.float32)[pixels[: count * k, :3].reshape(count, k, 3)]
 
 
@@ -323,7 +323,7 @@ def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarra
     """Return labels of Gaussians from ``first`` on that all lie below ``count``; DataError where one does not."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
-        raise malformed(path, f"Gaussian {row} points beyond its {count} rows of harmonics")
+        raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")
     return labels
 
 

@@ -38,7 +38,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     if not data:
         raise malformed(path, "it is empty")
     if len(data) % _ROW.itemsize:
-        raise malformed(path, f"its {len(data)} bytes are no multiple of {_ROW.itemsize}")
+        raise malformed(path, f"its {len(data)} bytes are not a multiple of {_ROW.itemsize}")
     rows = np.frombuffer(data, _ROW)
     n = len(rows)
     for part in parts(n):

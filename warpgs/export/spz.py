@@ -131,7 +131,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     Raises:
         DataError: The file is malformed, truncated, or announces more than its size can hold.
-        UsageError: It is of version 4, and zstandard is not installed.
+        UsageError: The file has version 4, and zstandard is not installed.
     """
     if data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
@@ -148,7 +148,7 @@ def decode(path: Path, data: bytes) -> Arrays:
         sizes = _checked(path, len(data), (magic, version, n, degree, bits), (4,))
         sections = _streams(path, data, sizes, count, place)
     arrays = _unpack(sections, n, degree, bits, version)
-    next(sections, None)  # checks the end of the last one
+    next(sections, None)  # checks the end of the last section
     half_turn_in_place(arrays, "x")
     return arrays
 
@@ -169,7 +169,7 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
     def read(size: int) -> bytes:
         data = _inflated(path, stream, size)
         if len(data) != size:
-            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has fewer, or its end is cut off")
+            raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has fewer, or its end is cut off")
         return data
 
     for _ in sizes:
@@ -179,11 +179,11 @@ def _parts_of_gzip(path: Path, stream: gzip.GzipFile, n: int, sizes: list[int]) 
     except (EOFError, OSError, zlib.error) as e:
         raise malformed(path, f"its compressed content is damaged ({str(e)[:80]}), or its end is cut off") from e
     if more:
-        raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, it has more")
+        raise malformed(path, f"{n} Gaussians need {sum(sizes)} bytes, but the file has more")
 
 
 def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int, ...]) -> list[int]:
-    """Return the sizes of the sections [bytes]; DataError where the header cannot be true of a file of ``size`` bytes."""
+    """Return the sizes of the sections [bytes]; DataError where the header does not fit a file of ``size`` bytes."""
     magic, version, n, degree, bits = header
     if magic != MAGIC:
         raise malformed(path, "it does not start with the SPZ signature")
@@ -195,7 +195,7 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
         raise malformed(path, f"its coordinates have {bits} fractional bits of 24")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
     if sum(sizes) > MAX_RATIO * size + SMALL:
-        raise malformed(path, f"{n} Gaussians in {size} bytes")
+        raise malformed(path, f"it announces {n} Gaussians in only {size} bytes")
     return sizes
 
 
@@ -221,7 +221,7 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
 
 
 def _decompressed(path: Path, reader: BinaryIO, i: int, whole: int, size: int, *, end: bool = False) -> bytes:
-    """Return the next ``size`` of ``whole`` bytes of the i-th stream; at its end maybe fewer."""
+    """Return the next ``size`` of ``whole`` bytes of the i-th stream; fewer at its end."""
     try:
         data = reader.read(size)
     except _zstandard().ZstdError as e:

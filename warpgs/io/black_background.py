@@ -1,4 +1,4 @@
-"""Objects photographed on black: how they are recognised, and the dark pixels around them as transparency."""
+"""Objects photographed on black: detection, and dark pixels made transparent."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DARK_FRACTION = 0.3
 """Fraction of dark pixels from which on an image with a dark border shows an object on black."""
 
 HOLE = 0.001
-"""Fraction of an image from which on dark pixels that an object encloses are a hole in it, not a part of it."""
+"""Fraction of an image from which on an enclosed dark region is a hole in the object, not a part of it."""
 
 
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:
@@ -30,7 +30,7 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
 def empty_pixels(dark: np.ndarray) -> np.ndarray:
     """Return the dark pixels without an object in front of them, bool [H, W].
 
-    They are joined to the border over others, sideways or up and down, or make up `HOLE` of the image together.
+    Their region of adjacent dark pixels (4 neighbours) touches the border, or is at least `HOLE` of the image.
     """
     import cv2
 
@@ -44,8 +44,8 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
     """Give views that all show an object on black an opacity: 0 for the dark pixels around it and in its holes, else 1.
 
-    Specks and cracks that the object encloses stay opaque. Views of which any has an opacity or a mask, or shows something
-    else, stay as they are.
+    Specks and cracks that the object encloses stay opaque. If any view has an opacity or a mask, or shows something else, all
+    views stay unchanged.
 
     Args:
         views: The views of a scene.
@@ -63,6 +63,6 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
     return done, (
-        f"every image shows an object on black: {empty:.1%} of the pixels, the dark ones around it and in its holes, become "
+        f"every image shows an object on black: the dark pixels around the object and in its holes ({empty:.1%} of all) become "
         f"transparent; --no-black-is-empty keeps them"
     )

@@ -101,7 +101,7 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     model = colmap_folder(folder)
     kind = None if model is None else colmap.complete_kind(model)
     if model is None or kind is None:
-        raise DataError(f"{folder}: holds no cameras and images file of COLMAP. Give cameras.json, transforms.json or a scene")
+        raise DataError(f"{folder}: lacks COLMAP's files cameras and images. Give cameras.json, transforms.json or a scene")
     lenses = colmap.read_cameras(model / f"cameras.{kind}")
     found = _Names()
     for pose in sorted(colmap.read_poses(model / f"images.{kind}").values(), key=lambda p: p.name):

@@ -124,7 +124,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 @contextmanager
 def _understood(path: Path, line: int):
-    """Turn what parsing a line may raise into an error that names file and line."""
+    """Turn errors of parsing a line into a DataError that names file and line."""
     try:
         yield
     except (ValueError, IndexError, OverflowError) as e:
@@ -139,7 +139,7 @@ def _expect(condition: bool, message: str) -> None:
 
 def _store(table: dict, key: int, value: object, where: str) -> None:
     if key in table:
-        raise DataError(f"{where}: number {key} is given twice; write the file again")
+        raise DataError(f"{where}: id {key} is given twice; write the file again")
     table[key] = value
 
 
@@ -166,7 +166,7 @@ def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]])
 
 
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` reads those that are not undistorted, too.
+    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows `NATIVE_MODELS`.
 
     Raises:
         DataError: The file is malformed, or a camera model is not supported.
@@ -318,7 +318,10 @@ def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str)
     if len(lost) == len(names) == len(files):
         pairs = dict(zip(sorted(names), files))
         first = min(names)
-        return pairs, f"images of {images.name} have other names, matched in sorted order ({first} is {pairs[first].name})"
+        return (
+            pairs,
+            f"images of {images.name} matched in sorted order, because their names differ ({first} is {pairs[first].name})",
+        )
     return paths, ""  # the missing file is named when it is read
 
 

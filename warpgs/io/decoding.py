@@ -22,10 +22,10 @@ BYTES_PER_PIXEL = 32
 
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
-    """Return the bytes of an image file; none with so many pixels is larger than what is read.
+    """Return the bytes of an image file; files too large for ``max_pixels`` pixels are rejected.
 
     Raises:
-        DataError: It is missing, cannot be read, or is not a regular file.
+        DataError: The file is missing, cannot be read, or is not a regular file.
     """
     try:
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
@@ -37,7 +37,7 @@ def read_image_start(path: Path, count: int) -> bytes:
     """Return the first bytes of an image file, at most ``count``.
 
     Raises:
-        DataError: It is missing, cannot be read, or is not a regular file.
+        DataError: The file is missing, cannot be read, or is not a regular file.
     """
     try:
         return read_start(path, count)
@@ -95,7 +95,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
 
 def _too_large(path: Path, pixels: int) -> str:
     needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: {needed:.1f} GiB to decode the image are not free; shrink it, or end other programs"
+    return f"{path}: decoding the image needs {needed:.1f} GiB, which are not free; shrink it, or end other programs"
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -103,7 +103,7 @@ def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
 
     Raises:
         DataError: The file is missing, no PNG, too large, or damaged.
-        ResourceError: There is not enough memory for it.
+        ResourceError: There is not enough memory for the image.
     """
     data = read_image_file(path, max_pixels)
     if not data.startswith(png.SIGNATURE):
@@ -120,14 +120,14 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
     Args:
         path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.
         max_pixels: Largest number of pixels that its header may announce.
-        data: Its bytes, where they have been read already.
+        data: Bytes of the file, if they have been read already.
 
     Returns:
         Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
 
     Raises:
-        DataError: The file is missing, no such image, too large, or damaged as far as its format lets one see it.
-        ResourceError: There is not enough memory for it.
+        DataError: The file is missing, of another format, too large, or damaged, as far as its format reveals damage.
+        ResourceError: There is not enough memory for the image.
     """
     raw = _raster(path, read_image_file(path, max_pixels) if data is None else data, max_pixels)
     if raw.dtype in (np.uint8, np.uint16):

@@ -1,7 +1,7 @@
 """EXIF of a photograph and its lens: five tags, read from the first directory and the block of exposure data.
 
-The layout is that of TIFF (CIPA DC-008). No more is read than the values of these tags, whatever a file announces: libraries
-that read all of EXIF copy overlapping values again and again.
+The layout is that of TIFF (CIPA DC-008). Only the values of these tags are read, because libraries that read all of EXIF copy
+overlapping values again and again.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PREFIX = b"Exif\0\0"
 
 @dataclass(frozen=True)
 class Exif:
-    """Values of EXIF; the defaults where it has none."""
+    """Values of EXIF; defaults for missing ones."""
 
     orientation: int = 1
     """Orientation of the stored raster, 1 to 8."""

@@ -70,7 +70,7 @@ def view_name(name: str) -> str:
 
 
 def view_name_of(path: Path, root: Path) -> str:
-    """Return the name of the view of a file: its path below ``root``, links not followed, or one below `outside`."""
+    """Return the name of the view of a file: its path below ``root`` without following links, else a path below `outside`."""
     plain, base = (posixpath.normpath(p.absolute().as_posix()) for p in (path, root))
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 
@@ -139,7 +139,7 @@ class SceneFolder:
     def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
         """Return the mask [H, W] of an image, or None without one.
 
-        It is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
+        The mask is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
         photo.jpg.
         """
         folder = folder or images_root.parent / "masks"
@@ -180,7 +180,7 @@ class SceneFolder:
 
 
 def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return how far a mask file keeps each pixel, float32 [H, W] in [0, 1]; ``keeps`` is the colour that does, white or black.
+    """Return the weight of each pixel by a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels.
 
     Raises:
         DataError: The file cannot be read.

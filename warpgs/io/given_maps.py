@@ -41,7 +41,7 @@ class GivenMaps:
         """List the folders that are named.
 
         Raises:
-            DataError: One is missing, or holds no map.
+            DataError: A folder is missing, or holds no map.
         """
         self.options, self.max_pixels = options, max_pixels
 
@@ -82,8 +82,7 @@ class GivenMaps:
             values = np.where(sure > 0, values, 0)
         if not values.any():
             raise DataError(
-                f"{path}: it has no depth in the pixels that count, after mask, confidence and --downscale; remove the "
-                f"file, because views may have none"
+                f"{path}: no pixel has a depth after mask, confidence and --downscale; remove the file: depth maps are optional"
             )
         return GivenDepth(values, options.depth_kind, sure)
 
@@ -103,7 +102,7 @@ class GivenMaps:
         known = normals.any(-1)
         away = float((along[known] > 0).mean()) if known.any() else 1.0
         if not known.any():
-            raise DataError(f"{path}: no pixel that counts has a normal; remove the file, normals are optional")
+            raise DataError(f"{path}: no pixel inside the mask has a normal; remove the file: normals are optional")
         if away > 0.5:
             other = "opencv" if self.options.normal_axes == "opengl" else "opengl"
             raise DataError(
@@ -117,7 +116,7 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
     """Return notes on the maps of a scene's views.
 
     Raises:
-        DataError: A folder is named, and no view has a map of it.
+        DataError: A folder is given, but no view has a map in it.
     """
     notes = []
     flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
@@ -134,11 +133,11 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
 
 
 def _about(name: str, views: Sequence[View], options: MapOptions) -> str:
-    """Return words on the values of the maps, for a note."""
+    """Return a description of the values of the maps, for a note."""
     if name == "normals":
         return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
     share = float(np.mean([(v.depth.values > 0).mean() for v in views if v.depth is not None]))
-    unit = "a unit is 0.001 in whole numbers, else 1" if options.depth_unit is None else f"a unit is {options.depth_unit:g}"
+    unit = "a unit is 0.001 for integers, else 1" if options.depth_unit is None else f"a unit is {options.depth_unit:g}"
     words = {
         "metric": f"metric ({unit}; change it with --depth-unit)", "relative": "depth of unknown scale and shift",
         "disparity": "inverse depth of unknown scale and shift",

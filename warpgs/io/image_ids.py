@@ -9,7 +9,7 @@ from warpgs.errors import DataError
 
 
 def _numbers(names: list[str]) -> list[int] | None:
-    """Return the number that distinguishes each name: the first group of digits that is different in all names; else None."""
+    """Return the number that distinguishes each name: the first group of digits that differs between all names; or None."""
     groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
     for place in range(min(map(len, groups), default=0)):
         values = [int(g[place]) for g in groups]
@@ -26,7 +26,7 @@ def named_by_dtu(names: list[str]) -> bool:
 def image_ids(names: list[str]) -> list[int] | None:
     """Return the ids of image files from their names, counted from 0; None if no number distinguishes the names.
 
-    DTU's own names `rect_001_3_r5000.png` count from 1 and so name id 0; all others are taken as they are.
+    DTU's own names `rect_001_3_r5000.png` count from 1 so 1 is id 0; other numbers are used unchanged.
     """
     values = _numbers(names)
     if values is None:

@@ -17,7 +17,7 @@ from warpgs.scene import GivenDepth
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
-"""First words of the note on an image that `load_image` brought to its longest side."""
+"""Beginning of the note on an image that `load_image` reduced to its longest side."""
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", ".heic", ".heif", ".hif")
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
@@ -193,7 +193,7 @@ def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float,
 
 
 def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
-    """Keep the pixels and say which camera took them; pixels that the lens does not reach leave the mask."""
+    """Keep the pixels and record the camera model; pixels that the lens does not reach leave the mask."""
     height, width = loaded.image.shape[:2]
     model, count = ("fisheye", 4) if lens.fisheye else ("opencv", 8)
     distortion = np.zeros(count)
@@ -229,9 +229,9 @@ def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> L
 
 
 def _fit_mask(path: Path, mask: np.ndarray, stored: tuple[int, int], upright: tuple[int, int], orientation: int) -> np.ndarray:
-    """Return the mask at the upright size (height, width); a mask that lies like the stored raster is turned with it.
+    """Return the mask at the upright size (height, width), rotated if it has the orientation of the stored raster.
 
-    It is resampled as gray, and stays bool where it is.
+    A mask is resampled as gray; a bool mask stays bool.
     """
     if stored != upright and mask.shape == stored:
         mask = turn_upright(mask, orientation)
@@ -315,10 +315,10 @@ def load_image(
         lens: Its intrinsics, at any size; they are scaled to the image. Or a function that makes them from the width and
             height [px] of the stored raster, for formats that do not store the image size.
         downscale: Factor by which both sides shrink (area resampling).
-        mask: How far a pixel is kept, in [0, 1], [H, W] at the size of the file or of the same aspect.
+        mask: Weight of each pixel, in [0, 1], [H, W] at the size of the file or of the same aspect.
         background: Colour in [0, 1] behind transparent pixels.
         max_pixels: Largest number of pixels that the file may have.
-        cutout: What the mask does not keep is transparent, gray in part; else pixels kept by half or less do not count.
+        cutout: True to make masked-out pixels transparent, gray ones partly; False to ignore pixels kept by half or less.
         max_side: Longest side that the image keeps [px] after ``downscale``; 0 for no limit.
         native: Keep the distortion of the lens instead of undoing it.
 
@@ -327,7 +327,7 @@ def load_image(
 
     Raises:
         DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel counts.
-        UsageError: ``downscale`` or ``max_side`` leaves next to nothing.
+        UsageError: ``downscale`` or ``max_side`` leaves a side below `MIN_SIDE`.
     """
     image, alpha = decode(path, max_pixels)
     stored = image.shape[:2]

@@ -23,11 +23,11 @@ def read_rows(path: Path) -> np.ndarray:
     """Return the array of poses_bounds.npy, float64, shape [N, 17].
 
     Raises:
-        DataError: The file holds anything else.
+        DataError: The file does not hold such an array.
     """
     try:
         open_input(path).close()
-        # mapped, because that holds the announced shape against the file's size before memory is taken
+        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
         rows = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as e:  # numpy raises a dozen types on malformed files
         raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); copy it again") from e

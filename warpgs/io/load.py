@@ -71,7 +71,7 @@ def load_scene(
         lenses: Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (images are unchanged, and
             ``Camera.model`` is opencv or fisheye with ``Camera.distortion``). Fisheyes need native.
         depths: Folder of depth maps, 16-bit PNG or NPY, with the names of the images (docs/scenes.md, "Depth and normals");
-            None for those named in transforms.json, ``none`` to ignore these.
+            None for the maps named in transforms.json, ``none`` to ignore these.
         normals: Folder of normal maps, as for ``depths``.
         depth_kind: Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths up to a scale and a
             shift of each view) or disparity (inverse lengths up to a scale and a shift).
@@ -186,7 +186,7 @@ def _finished(
     if points is not None:
         points = normalize_points(points, n, str(root))
     if score_masks is not None or (root / FOLDER).is_dir():
-        # links of a folder that the user names must stay in it, those of the scene's own folder in the scene
+        # links in a folder that the user names must stay inside it; links in the scene's own folder, inside the scene
         masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
         plain = replace(options, mask_keeps="white", maps=NO_MAPS)
         views, note = add_score_masks(views, masks, SceneFolder(bound, plain))

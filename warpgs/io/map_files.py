@@ -18,7 +18,7 @@ SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
 """Suffixes of other files that may hold maps, which a message names."""
 NONE = "none"
-"""Word instead of a folder, to ignore maps."""
+"""Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
 """End of the stem of a map of confidence."""
 MILLIMETRES = 0.001
@@ -39,9 +39,9 @@ class MapOptions:
     """Given maps of depth and normals, and the meaning of their numbers."""
 
     depths: Path | None = None
-    """Folder of depth maps; None for those that the scene names, ``none`` to ignore these."""
+    """Folder of depth maps; None for the maps that the scene names, ``none`` to ignore these."""
     normals: Path | None = None
-    """Folder of normal maps; None for those that the scene names, ``none`` to ignore these."""
+    """Folder of normal maps; None for the maps that the scene names, ``none`` to ignore these."""
     depth_kind: str = "metric"
     """Meaning of the depth maps, one of `DEPTH_KINDS`."""
     depth_unit: float | None = None
@@ -90,15 +90,15 @@ class MapFolder:
                 raise DataError(f"{file}: {self._files[key].name} is for the same image; remove one of them")
             self._files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
         if not any(not key.endswith(CONFIDENCE) for key in self._files):
-            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "put"
-            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named as the images are")
+            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "add"
+            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
         self.taken: set[str] = set()
         """Keys of the maps that images requested."""
 
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for a missing one.
 
-        A map has the path of the image below any folder above it, so `a/b.jpg` has `a/b.png` or `b.png`; the longest counts.
+        A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match counts.
         """
         tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
         for tail in tails:
@@ -131,7 +131,7 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
 def _read_array(path: Path, max_pixels: int) -> np.ndarray:
     try:
         open_input(path).close()
-        # mapped, because that holds the announced shape against the file's size before memory is taken
+        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
@@ -169,7 +169,7 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
 
 
 def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return a depth map in units of the cameras, or in any unit where it is relative; float32 [H, W], 0 for missing values.
+    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values.
 
     Raises:
         DataError: The file is not a map, or its values cannot be depths.
@@ -195,9 +195,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
         with np.errstate(over="ignore"):
             values = values * np.float32(unit)
     if not values.any():
-        raise DataError(
-            f"{path}: contains no depth, all values are 0 or not finite; remove the file, because views may have none"
-        )
+        raise DataError(f"{path}: contains no depth, all values are 0 or not finite; remove the file: maps are optional")
     if not values.max() < MAX_DEPTH:
         raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; use 0 for missing values")
     return values
@@ -206,7 +204,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
 def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
-    Integers are divided by the largest of their type; the three levels 0, 1 and 2 by 2.
+    Integers are divided by the largest value of their type; maps with only the levels 0, 1 and 2 are divided by 2.
 
     Raises:
         DataError: The file is not a map, of another shape, or not in [0, 1].
@@ -221,7 +219,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
         largest = int(raw.max())
         values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
     if not ((values >= 0) & (values <= 1)).all():
-        raise DataError(f"{path}: confidence must be in [0, 1], and goes from {values.min():.4g} to {values.max():.4g}")
+        raise DataError(f"{path}: confidence must be in [0, 1], but ranges from {values.min():.4g} to {values.max():.4g}")
     return values
 
 
@@ -244,7 +242,7 @@ def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) 
         lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
     known = usable & (lengths >= NO_NORMAL)
     if not known.any():
-        raise DataError(f"{path}: contains no normals; remove the file, because views may have none")
+        raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
     stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
     if not stray <= MAX_STRAY:
         raise DataError(

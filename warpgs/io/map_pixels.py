@@ -16,8 +16,8 @@ SAME_SURFACE = 0.05
 def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
     """Return a map [H, W] or [H, W, C] at another size; 0 marks missing values.
 
-    A pixel of a smaller map has the value known nearest to its centre, so that few points stay what they are. A larger map is
-    interpolated between known neighbours on one surface, and else takes the nearest value.
+    In a reduced map, a pixel takes the known value nearest to its centre, which keeps sparse depths. An enlarged map is
+    interpolated between known neighbours on one surface; elsewhere a pixel takes the nearest value.
     """
     import cv2
 
@@ -60,7 +60,9 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
     rows, columns = values.shape[:2]
     if loaded.orientation in (5, 6, 7, 8) and _same_aspect(values.shape, (width, height)):
         if values.ndim == 3:
-            raise DataError(f"{path}: its image is turned by its EXIF tag, and the normals with it; save both upright")
+            raise DataError(
+                f"{path}: its image is rotated by an EXIF tag, and normals are not rotated with it; save both upright"
+            )
         values = turn_upright(values, loaded.orientation)
     elif not _same_aspect(values.shape, (height, width)):
         raise DataError(

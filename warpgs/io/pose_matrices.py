@@ -51,7 +51,7 @@ def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.
     Args:
         matrix: Camera to world, shape [3, 4] or [4, 4].
         where: File and image, for errors.
-        opengl: The camera looks along -z with +y up (OpenGL, Blender); the two axes are turned round.
+        opengl: True if the camera looks along -z with +y up (OpenGL, Blender); y and z are then negated.
 
     Raises:
         DataError: The matrix is not rigid or not finite.

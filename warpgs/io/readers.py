@@ -137,7 +137,7 @@ def all_readers() -> list[Reader]:
 def find_reader(choice: str | type[Reader] | Reader) -> Reader:
     """Return the reader of a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader object.
 
-    A string with a colon imports the module or file, which runs its code: never pass one that a file of others names.
+    A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
 
     Raises:
         UsageError: There is no such reader, or it does not derive from `Reader`.

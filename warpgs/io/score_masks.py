@@ -54,13 +54,13 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     Args:
         views: The scene's views, at their final size.
         folder: The folder with the masks; white keeps a pixel.
-        scene: What opens them.
+        scene: The scene folder that opens the masks.
 
     Returns:
         The views with ``score_mask`` set, inside the view's own mask where it has one, and a note for the user.
 
     Raises:
-        DataError: There is no mask, one is missing (the message names the ids) or does not fit, or it cannot be known whether
+        DataError: No masks are found, one is missing (the message names the ids) or does not fit, or it cannot be known whether
             the images count from 0 or from 1.
     """
     inner = folder / "mask"

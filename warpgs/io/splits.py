@@ -19,12 +19,12 @@ DTU_TRAIN = (25, 22, 28, 40, 44, 48, 0, 8, 13)
 """Training ids of pixelNeRF's DTU protocol; the first 3, 6 or 9 are used."""
 DTU_TEST = (1, 2, 9, 10, 11, 12, 14, 15, 23, 24, 26, 27, 29, 30, 31, 32, 33, 34, 35, 41, 42, 43, 45, 46, 47)
 DTU_VIEWS = 49
-"""Number of views that the ids count in: the first 49 of a scan; some scans have 64."""
+"""Number of views to which the ids refer: the first 49 of a scan; some scans have 64."""
 BLENDER_TRAIN = (2, 16, 26, 55, 73, 76, 86, 93)
 """Training ids of DietNeRF's 8-view Blender protocol; tests are every 8th of the test frames."""
 
 MAX_COMPARED = 200
-"""Longest name for which near ones are looked for."""
+"""Longest name for which similar names are suggested."""
 SPECS = "llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;test=NAMES"
 
 
@@ -108,7 +108,7 @@ class _Names:
         raise DataError(f"split {self.spec}: no view {wanted!r}; the nearest names are {some}")
 
     def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
-        """Return the names by their last ``count`` parts, for those that have more; by the whole name for 0."""
+        """Return the names by their last ``count`` parts, only names that have more parts; by the whole name for 0."""
         if (bare, count) not in self._ends:
             table: dict[str, list[str]] = {}
             for name in self.names:
@@ -203,7 +203,7 @@ def held_out_split(scene: Scene) -> tuple[str, str]:
 def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
     """Return pairs (held-out view, training view) with the same camera: a copy of the training image would score as well.
 
-    Two cameras are the same where no entry of their poses differs by a thousandth, lengths in extents of the camera set.
+    Two cameras count as the same if no entry of their poses differs by a thousandth; lengths are in extents of the camera set.
     """
     extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
     unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])

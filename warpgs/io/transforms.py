@@ -44,7 +44,7 @@ def is_blender(root: Path) -> bool:
 
 
 def _reject_constant(name: str):
-    raise ValueError(f"{name} is not a number that a camera can have")
+    raise ValueError(f"{name} is not a finite number")
 
 
 def read_json(path: Path) -> dict:
@@ -124,10 +124,10 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
         unread = [k for k in UNSUPPORTED_TERMS if not (fisheye and k in ("k4", "is_fisheye"))]
         other = [k for k in (*unread, *(("p1", "p2") if fisheye else ())) if frame.get(k, shared.get(k))]
         if other:
-            raise ValueError(
-                f"{other[0]} belongs to {'another lens than a fisheye' if fisheye else 'a fisheye or rational lens'}, which is "
-                f"not supported. Undistort the images{kept if other[0] == 'is_fisheye' else ''}"
+            why = (
+                "is not supported for a fisheye" if fisheye else "belongs to a fisheye or rational lens, which is not supported"
             )
+            raise ValueError(f"{other[0]} {why}. Undistort the images{kept if other[0] == 'is_fisheye' else ''}")
     except ValueError as e:
         raise DataError(f"{where}: {e}") from e
     fx = f[0] if f[0] is not None else f[1]
@@ -142,7 +142,7 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     """Return the transform_matrix of a frame, shape [3, 4] or [4, 4].
 
     Raises:
-        DataError: It is missing, or not made of rows of numbers.
+        DataError: The matrix is missing or not made of rows of numbers.
     """
     try:
         # through object, so that ragged rows and huge integers are caught here and strings are not parsed
@@ -191,15 +191,13 @@ class _Reading:
                 return None
             found = self.scene.inside(self.child(file.parent, frame[key], f"{where}, {key}"))
             if found.suffix.lower() not in MAPS:
-                raise DataError(
-                    f"{where}: {key} is {found.name}, and maps are read as {' or '.join(MAPS)}; --{flag} none skips it"
-                )
+                raise DataError(f"{where}: {key} is {found.name}, but maps must be {' or '.join(MAPS)}; --{flag} none skips it")
             return found
 
         try:
             unit = _number(frame, shared, "depth_unit_scale_factor")
             if unit is not None and not unit > 0:
-                raise ValueError(f"depth_unit_scale_factor is {unit}, not above 0")
+                raise ValueError(f"depth_unit_scale_factor is {unit}; it must be above 0")
         except ValueError as e:
             raise DataError(f"{where}: {e}") from e
         return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)

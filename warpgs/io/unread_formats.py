@@ -1,7 +1,7 @@
 """Unsupported formats of photographs, and remedies.
 
-HEIC is read where cameras are found (`warpgs.poses.heic`). RAW is left to a converter, where colour and exposure are chosen for
-all photographs alike.
+HEIC is supported only for finding poses (`warpgs.poses.heic`). RAW is left to a converter, in which the user chooses the same
+colour and exposure for all photographs.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ from warpgs.io.image_formats.avif import kind
 
 RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
 """Suffixes of RAW files of cameras; many begin like a TIFF, and their first image is a small preview."""
-HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all of them to JPEG"
-RAW = "a RAW file, which is not supported; convert all of them to JPEG or 16-bit PNG, with the same settings and white balance"
+HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all HEIC files to JPEG"
+RAW = (
+    "a RAW file, which is not supported; convert all RAW files to JPEG or 16-bit PNG, with the same settings and white balance"
+)
 
 
 def unread_format(path: Path, head: bytes) -> str | None:
@@ -21,7 +23,7 @@ def unread_format(path: Path, head: bytes) -> str | None:
 
     Args:
         path: Name of the file; only RAW is detected by suffix.
-        head: Its first bytes; a damaged file is known by them as well.
+        head: First bytes of the file; they identify damaged files, too.
     """
     if path.suffix.lower() in RAW_SUFFIXES or kind(head) == "RAW":
         return RAW

@@ -1,4 +1,4 @@
-"""Advice on photographs and their poses: why one has no pose, and what to photograph next."""
+"""Advice on photographs and their poses: why a photograph has no pose, and what to photograph next."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from warpgs.poses.mapping import Mapping
 
 MIN_KEYPOINTS = 100
-"""Keypoints below which a photograph shows too little to find again: a blank wall, darkness, blur."""
+"""Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
 MIN_MATCHES = 15
-"""Matches that agree with one motion of the camera which a pair needs."""
+"""Number of matches that a pair needs; they agree with one motion of the camera."""
 WEAK_MATCHES = 60
 """Matches below which the link between two photographs is called weak: a few wrong ones bend the poses."""
 WIDE_ANGLE = 30.0
-"""Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few places again."""
+"""Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few matches."""
 MAX_ADVICE = 8
 """Number of pieces of advice that are given, the most urgent first."""
 
 
 def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
-    """Return the photographs that one matches, each with the number of matches, the most first."""
+    """Return the photographs that photograph ``i`` matches, each with the number of matches, most matches first."""
     return sorted(found.links.get(i, ()), key=lambda link: (-link[1], link[0]))
 
 
@@ -30,7 +30,7 @@ def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
     """Return why a photograph has no pose, in words that follow its name."""
     keypoints = found.keypoints[i]
     if keypoints < MIN_KEYPOINTS:
-        return f"has {keypoints} keypoints, too few to find again: a blank wall, darkness or blur"
+        return f"has {keypoints} keypoints, too few to match: a blank wall, darkness or blur"
     best = partners(found, i)
     if not best:
         return f"has {keypoints:,} keypoints and matches no other photograph"
@@ -50,7 +50,7 @@ def axis_angle(found: Mapping, i: int, j: int) -> float:
 
 
 def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
-    """Return the pairs of views that join all by the smallest angles (a minimum spanning tree), with the angle of each."""
+    """Return the pairs of views that connect all views by the smallest angles (a minimum spanning tree), with their angles."""
     last, *left = list(found.views) or [-1]
     nearest: dict[int, tuple[float, int]] = dict.fromkeys(left, (math.inf, -1))
     tree = []
@@ -74,7 +74,7 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
             elif best:
                 said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
             else:
-                said.append(f"take photographs from {names[i]} to the others, each overlapping the last by two thirds")
+                said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
     tree = neighbours(found)
     for i, j, angle in sorted(tree, key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:
@@ -84,4 +84,4 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
         if best and best[0][0] < WEAK_MATCHES:
             said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}: they share {best[0][0]} matches only")
     more = len(said) - MAX_ADVICE
-    return said[:MAX_ADVICE] + ([f"and {more} more places like these, once these are done"] if more > 0 else [])
+    return said[:MAX_ADVICE] + ([f"and {more} more; do these first"] if more > 0 else [])

@@ -92,10 +92,10 @@ def find_poses(
     Args:
         source: Folder of images, or a video file.
         out: Scene folder to make; new or empty.
-        frames: Frames that are taken of a video.
+        frames: Number of frames to take from a video.
         threads: CPU threads; 0 for as many as there are cores.
         max_pixels: Largest number of pixels that an image may have.
-        allow_outside: Let links lead to photographs outside the folder.
+        allow_outside: True to allow links to photographs outside the folder.
         matcher: ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose;
             None for SIFT only.
         progress: Called with lines for the user.
@@ -140,9 +140,10 @@ def _with_network(
     network: Matcher, found: Mapping, photographs: list[Photograph], names: list[str], kind: str, work: Path,
     progress: Callable[[str], object], threads: int,
 ) -> tuple[Mapping, list[str]]:  # fmt: skip
-    """Return the model by the network's matches if it has more photographs than SIFT's, and notes; it is asked where some lack.
+    """Return the model from the network's matches if it has more photographs than SIFT's, and notes.
 
-    The model lies in ``work``/model. Arguments are those of `find_model`.
+    The network runs only if SIFT leaves photographs without a pose. The model lies in ``work``/model. Arguments are those of
+    `find_model`.
     """
     count = len(found.views)
     if count == len(photographs):
@@ -158,17 +159,17 @@ def _with_network(
     (second / "model").rename(work / "model")
     notes = [f"keypoints and matches by {network.title}: {len(other.views)} poses; SIFT, which is more accurate, finds {count}"]
     if turned:
-        notes.append(f"matched after quarter turns: {', '.join(photographs[i].name for i in turned)}")
+        notes.append(f"matched after rotation by 90 or 180 degrees: {', '.join(photographs[i].name for i in turned)}")
     return other, notes
 
 
 def _something_else(folder: Path) -> str:
-    """Return what a folder holds instead of photographs, and what to give in its place; empty where it may hold some."""
+    """Return a message on a folder of a run or of scenes, with the fix; empty for a folder that may hold photographs."""
     if (folder / "config.json").is_file() and (folder / "renders").is_dir():
         return "is the folder of a run; give the scene that it was fitted to"
     scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
     if scenes:
-        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one of them, or all to `warpgs farm`"
+        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one scene, or use `warpgs farm` for all"
     return ""
 
 
@@ -199,7 +200,8 @@ def _prepared(
         root = work / "frames"
         make_folder(root)
         total = write_frames(source, root, frames, progress)
-        notes.append(f"{min(frames, total)} of {total} frames are used: the sharpest of as many equal parts of the video")
+        taken = min(frames, total)
+        notes.append(f"{taken} of {total} frames are used: the sharpest frame of each of {taken} equal parts of the video")
     root = image_root(root)
     paths, unread = find_photographs(root), unread_note(root)
     notes += folder_notes(root)
@@ -264,14 +266,15 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     if 2 * blank >= count:
         most = max(found.keypoints)
         why = (
-            f"{blank} of {count} show almost nothing that can be matched (at most {most:,} keypoints): a blank wall, "
-            "darkness or blur. Take sharp photographs of textured things, in good light"
+            f"{blank} of {count} photographs show almost nothing that can be matched (at most {most:,} keypoints): a blank "
+            "wall, darkness or blur. Take sharp photographs of textured things, in good light"
         )
     elif not largest:
-        why = f"no two of {count} show the same place. Take photographs that overlap by two thirds, in small steps"
+        why = f"no two of {count} photographs show the same place. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (
-            f"at most {len(found.views)} of {count} fit together, and {MIN_PHOTOGRAPHS} are needed. Take photographs that "
-            f"overlap by two thirds, moving the camera, not only turning it. So far {_links(found, photographs)}"
+            f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "
+            f"photographs that overlap by two thirds, moving the camera, not only turning it. "
+            f"So far {_links(found, photographs)}"
         )
     raise DataError(f"{source}: no poses: {why}")

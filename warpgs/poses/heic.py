@@ -29,7 +29,7 @@ def is_heic(path: Path) -> bool:
     """Return whether a file begins as a HEIC file does.
 
     Raises:
-        DataError: It cannot be read.
+        DataError: The file cannot be read.
     """
     return kind(read_image_start(path, BRANDS_END)) == "HEIC"
 
@@ -54,8 +54,8 @@ def to_jpeg(
         return {}
     if importlib.util.find_spec("pi_heif") is None:
         raise UsageError(
-            f"{paths[0]}: is a HEIC photograph, which pi-heif reads, and that is not installed; `pip install 'warpgs[poses]'`, "
-            "or convert all of them to JPEG"
+            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; `pip install 'warpgs[poses]'`, "
+            "or convert all HEIC files to JPEG"
         )
     copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
     for copy in copies.values():
@@ -99,7 +99,7 @@ def _coded_again(source: Path, max_pixels: int) -> bytes:
 
 
 def main(path: str) -> None:
-    """Copy the files that a job names; print a line of JSON before each, and one with the error of the first that fails."""
+    """Copy the files of a job; print a line of JSON before each file, and one with the first error."""
     job: dict[str, Any] = json.loads(Path(path).read_text("utf-8"))
     for i, (source, target) in enumerate(job["files"]):
         answer(json.dumps({"file": i}))

@@ -20,13 +20,13 @@ from warpgs.runtime.processor import usable_cores
 from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 
 EXHAUSTIVE = 60
-"""Most photographs of which all pairs are matched; of more, pairs are chosen."""
+"""Largest number of photographs of which all pairs are matched; of more photographs, only chosen pairs."""
 JOB = "job.json"
 """Name of the file with the worker's input."""
 LEARNED = "learned.npz"
 """Name of the file with keypoints and matches of a network."""
 LAST_WORDS = 500
-"""Letters of pycolmap's last message that are shown where it fails."""
+"""Number of letters of pycolmap's last message that an error shows."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class FoundCamera:
 
 @dataclass(frozen=True)
 class Mapping:
-    """Result of structure from motion; photographs are known by their number in the order of their names."""
+    """Result of structure from motion; photographs are indexed in the order of their names."""
 
     keypoints: tuple[int, ...]
     """Number of keypoints of each photograph."""

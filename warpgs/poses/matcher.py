@@ -27,9 +27,9 @@ OUTPUTS = ("keypoints", "scores", "descriptors")
 SIDE = 1024
 """Longer side at which the network sees a photograph [px]."""
 MULTIPLE = 32
-"""Both sides are multiples of this [px], the coarsest stride of such networks."""
+"""Divisor of both sides [px], the coarsest stride of such networks."""
 MAX_KEYPOINTS = 4096
-"""Most keypoints of a photograph, those of the highest score."""
+"""Largest number of keypoints of a photograph; those with the highest scores are kept."""
 MAX_CHANNELS = 256
 """Longest descriptor."""
 MIN_COSINE = 0.82
@@ -75,10 +75,10 @@ class Matcher:
         """Return the keypoints of an image.
 
         Args:
-            image: The image as it is, uint8 RGB [H, W, 3].
-            turns: Quarter turns to the left after which the network sees it.
-            side: Longer side at which the network sees it [px], unless its graph fixes the size.
-            most: Largest number of keypoints, those of the highest score.
+            image: The image before rotation, uint8 RGB [H, W, 3].
+            turns: Quarter turns to the left by which the image is rotated first.
+            side: Longer side at which the network sees the image [px], unless its graph fixes the size.
+            most: Largest number of keypoints; those with the highest scores are kept.
 
         Raises:
             DataError: onnxruntime cannot run the network, or its outputs are not those of a matcher.
@@ -172,7 +172,7 @@ def mutual_matches(a: Features, b: Features) -> np.ndarray:
 
 
 def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
-    """Return the quarter turns to the left after which photographs have the same side up, most of them none.
+    """Return the quarter turns to the left after which photographs have the same side up; for most photographs 0.
 
     Each pair is matched with the second photograph in all four turns. The pairs with the most matches, a maximum spanning tree,
     decide.
@@ -210,7 +210,7 @@ def write_matches(
         images: Copies of the photographs that are matched, PNG.
         out: File to write, .npz.
         kind: photographs or video.
-        exhaustive: Most photographs of which all pairs are matched.
+        exhaustive: Largest number of photographs of which all pairs are matched.
         progress: Called with lines for the user.
 
     Returns:

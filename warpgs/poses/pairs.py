@@ -1,8 +1,8 @@
 """Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 
-Photographs look alike where their SIFT descriptors fall upon the same words of a small vocabulary, which is made from the
-descriptors themselves (tf-idf of visual words: Sivic and Zisserman, "Video Google", 2003). Sums of products of integers
-below 2^24 are exact in float32, so the order of additions changes no bit.
+Photographs look alike if their SIFT descriptors belong to the same visual words. The small vocabulary of words is made from the
+descriptors themselves (tf-idf: Sivic and Zisserman, "Video Google", 2003). Sums of products of integers below 2^24 are exact in
+float32, so the order of additions changes no bit.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ SAMPLES = 20_000
 ROUNDS = 8
 """Rounds of k-means."""
 NEIGHBOURS = {"photographs": 2, "video": 10}
-"""Photographs before and after one in the order of their names that it is matched with, by kind of source."""
+"""Number of photographs before and after a photograph, in the order of names, that it is matched with, by kind of source."""
 LOOKALIKES = {"photographs": 20, "video": 5}
-"""Most similar photographs that one is matched with, by kind of source."""
+"""Number of most similar photographs that a photograph is matched with, by kind of source."""
 
 
 def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
@@ -69,7 +69,7 @@ def choose_pairs(descriptors: list[np.ndarray], kind: str, seed: int = 0) -> lis
 
     Args:
         descriptors: SIFT descriptors of each photograph in the order of their names, uint8 [K, 128].
-        kind: photographs or video, which decides how many neighbours in order and how many look-alikes one has.
+        kind: photographs or video, which determines `NEIGHBOURS` and `LOOKALIKES`.
         seed: Seed of the vocabulary.
     """
     count, alike = len(descriptors), similarity(descriptors, seed)

@@ -25,7 +25,7 @@ MASK_FOLDERS = ("mask", "masks", "idrmasks")
 RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
 """Files that identify, with a config.json, the folder of a run."""
 SHOWN_FOLDERS = 10
-"""Folders of photographs that a note names."""
+"""Largest number of folders of photographs that a note names."""
 MATCHING_SIDE = 2000
 """Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
 DIAGONAL_35MM = math.hypot(36, 24)
@@ -57,13 +57,13 @@ class Photograph:
 
 
 def image_root(folder: Path) -> Path:
-    """Return the folder with the photographs: ``images`` in it where that holds some, else the folder itself."""
+    """Return the folder with the photographs: its subfolder ``images`` if that holds photographs, else the folder itself."""
     inner = folder / "images"
     return inner if inner.is_dir() and list_images(inner) else folder
 
 
 def _is_run(folder: Path) -> bool:
-    """Return whether a folder is one that `warpgs fit` fills, by its files."""
+    """Return whether the files of a folder are those of a run."""
     if (folder / "scene" / "poses.json").is_file():  # a fit that has found poses only
         return True
     return (folder / "config.json").is_file() and any((folder / name).is_file() for name in RUN_FILES)
@@ -145,7 +145,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
     data = read_image_file(path, max_pixels)
     name, colors = path.relative_to(root).as_posix(), decode(path, max_pixels, data)[0]
-    exif = read_exif(data)  # of a file that has been found to be an image within the limits
+    exif = read_exif(data)  # decode has checked that the file is an image within the limits
     image = turn_upright(colors, exif.orientation)
     del colors
     height, width = image.shape[:2]
@@ -169,14 +169,14 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
     else as PNG of 8 bits.
 
     Raises:
-        DataError: The file is no longer the one that was matched.
+        DataError: The file has changed since it was matched.
         ResourceError: The disk is full.
     """
     import cv2
 
     data = read_image_file(photograph.path, max_pixels)
     if hashlib.sha256(data).hexdigest() != photograph.digest:
-        raise DataError(f"{photograph.path}: the file changed while its pose was sought; start again")
+        raise DataError(f"{photograph.path}: the file has changed since it was read; start again")
     kind, target = _format(data), folder / PurePosixPath(photograph.name)
     make_folder(target.parent)
     if photograph.orientation == 1 and kind in ("JPEG", "PNG"):

@@ -1,4 +1,4 @@
-"""Records of found poses: poses.json for programs, poses.txt for people, and reading the former back."""
+"""Records of found poses: poses.json for programs, which is read again, and poses.txt for people."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ JSON, TEXT = "poses.json", "poses.txt"
 FORMAT = 1
 """Number of the format of poses.json."""
 SHOWN_PARTNERS = 5
-"""Matched photographs that the record names for each."""
+"""Largest number of matched photographs that the record names for a photograph."""
 FEW = 5
-"""Most photographs with which a focal length without EXIF is called uncertain (decision 017)."""
+"""Largest number of photographs for which a focal length without EXIF is called uncertain (decision 017)."""
 _PHOTOGRAPH = schema.fields(
     {
         "name": schema.text, "sha256": schema.text, "registered": schema.flag, "keypoints": schema.whole(0),
@@ -56,8 +56,8 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         remarks.append(f"the focal length is taken from EXIF, because {len(found.views)} photographs cannot improve it")
     elif found.kept_focal is False:
         remarks.append(
-            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; it was estimated "
-            "from them instead. Such an estimate is often 5 % off, at worst 20 % or more"
+            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; the focal length "
+            "was estimated instead. Such an estimate is often 5 % off, at worst 20 % or more"
         )
     elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
         remarks.append(
@@ -66,7 +66,8 @@ def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, no
         )
     if found.method == "global":
         remarks.append(
-            "global mapping joined more photographs than incremental mapping; its results differ a little from run to run"
+            "global mapping is used, because it joined more photographs than incremental mapping; results of global mapping "
+            "differ a little from run to run"
         )
     return {
         "format": FORMAT, "source_sha256": digest, "photographs": rows,
@@ -120,7 +121,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read poses.json of a scene whose poses were found.
 
     Raises:
-        DataError: It is missing, or not whole.
+        DataError: The record is missing or incomplete.
     """
     path = folder / JSON
     try:

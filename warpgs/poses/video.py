@@ -15,7 +15,7 @@ from warpgs.runtime.file_names import utf8_name
 from warpgs.runtime.native_output import hidden_stderr
 
 SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-"""Endings of video files."""
+"""Suffixes of video files."""
 SHARPNESS_SIDE = 640
 """Longer side at which frames are compared for sharpness [px]: small enough to average out noise and compression artefacts."""
 MAX_FRAMES = 100_000
@@ -31,7 +31,7 @@ BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a path is a file that ends like a video."""
+    """Return whether a path is a file with the suffix of a video."""
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
@@ -76,7 +76,7 @@ def _check_container(path: Path) -> None:
 
 
 def sharpness(frame: np.ndarray) -> float:
-    """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size that noise is averaged away at."""
+    """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size at which noise averages out."""
     import cv2
 
     gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)

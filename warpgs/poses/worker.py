@@ -23,7 +23,8 @@ from warpgs.runtime.terminal import answer
 SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
-"""Matches that agree with one motion of the camera which a pair needs, and points that a new photograph must see."""
+"""Number of matches that a pair needs, all in agreement with one motion of the camera, and of points that a new photograph must
+see."""
 MIN_RATIO = 0.6
 """Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
 (decision 017)."""
@@ -35,7 +36,8 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 KEEP_FOCAL = 4
 """Most photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""
 MAX_RATIO = 1.05
-"""Mean reprojection error with EXIF's focal length over that with a free one, up to which EXIF's is kept (decision 017)."""
+"""Largest ratio of mean reprojection errors, with EXIF's focal length and with a free one, at which EXIF's is kept (decision
+017)."""
 
 
 def _say(**values: Any) -> None:
@@ -69,7 +71,7 @@ def extract(pycolmap: Any, job: dict[str, Any]) -> None:
 
 
 def numbers_of(database: Any, job: dict[str, Any]) -> list[int]:
-    """Return the database's number of each photograph, in the order of the job."""
+    """Return the database's id of each photograph, in the order of the job."""
     numbers = {image.name: image.image_id for image in database.read_all_images()}
     return [numbers[name] for name in job["names"]]
 
@@ -165,7 +167,7 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether models with EXIF's focal length hold as many photographs as free ones, at nearly the same error."""
+    """Return whether models with EXIF's focal length hold no fewer photographs than free ones, at nearly the same error."""
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))
@@ -175,7 +177,7 @@ def believes_exif(kept: list[Any], free: list[Any]) -> bool:
 
 def map_globally(pycolmap: Any, job: dict[str, Any]) -> list[Any]:
     """Return the models in which all poses are found at once."""
-    _say(progress="finding poses: all at once")
+    _say(progress="finding poses: all photographs at once")
     if not pycolmap.calibrate_view_graph(job["database"]):
         return []
     options = pycolmap.GlobalPipelineOptions()

@@ -17,7 +17,7 @@ MAX_BYTES = 2**30
 MAX_FPS = 50
 """Frames per second above which browsers slow an animated image down to 10."""
 QUALITY = 80
-"""Quality of WebP, of 100."""
+"""Quality of WebP, from 0 to 100."""
 PALETTE_PIXELS = 2**18
 """Pixels of all frames that a GIF's palette is chosen from."""
 
@@ -48,7 +48,7 @@ def _durations(count: int, fps: int, unit: int) -> list[int]:
 
 
 def _with_one_palette(pixels: list[np.ndarray]) -> list:
-    """Return frames as Pillow images with one palette, so that colours do not flicker, and dithered, so that none is banded."""
+    """Return frames as Pillow images with one palette, so that colours do not flicker, and with dithering against banding."""
     from PIL import Image
 
     step = max(1, round((sum(p.shape[0] * p.shape[1] for p in pixels) / PALETTE_PIXELS) ** 0.5))
@@ -60,7 +60,7 @@ def _with_one_palette(pixels: list[np.ndarray]) -> list:
 def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
     """Write frames [H, W, 3] in [0, 1], all of one size, as an animated WebP or GIF; returns their number.
 
-    Frames equal to the one before them become one that is shown longer.
+    Equal frames in a row become one frame that is shown longer.
 
     Raises:
         DataError: There are no frames, or they differ in size.

@@ -62,7 +62,7 @@ def _dotted(image, centers: np.ndarray):
 def contact_sheet(
     title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
 ) -> np.ndarray:
-    """Arrange labelled tiles in rows, with a colour bar at each map and lines of text in the place after the last.
+    """Arrange labelled tiles in rows, with a colour bar at each map and lines of text after the last tile.
 
     Args:
         title: Headline.
@@ -70,7 +70,7 @@ def contact_sheet(
         tiles: At least one; all of one shape [H, W].
         columns: Tiles per row.
         tile_width: Width of a tile [px].
-        text: Factor on the sizes of letters, for a sheet that is shown smaller than it is.
+        text: Factor on the font sizes, for a sheet that is shown at a reduced size.
 
     Returns:
         The sheet, colours in [0, 1], float32, shape [rows, columns, 3].

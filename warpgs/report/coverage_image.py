@@ -18,7 +18,7 @@ def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> n
     Args:
         image: Colours in [0, 1], shape [H, W, 3]; values outside are clamped.
         unseen: True where no training view saw the point, bool, shape [H, W].
-        once: True where one did, bool, shape [H, W].
+        once: True where one training view saw it, bool, shape [H, W].
 
     Returns:
         Colours in [0, 1], float32, shape [H, W, 3].

@@ -60,7 +60,7 @@ class EventLog:
         """Append the event of one step; NaN and infinity become null.
 
         Raises:
-            ResourceError: The disk does not take it.
+            ResourceError: The file cannot be written.
         """
         try:
             self._file.write(_line({"step": step, **values}))
@@ -71,7 +71,7 @@ class EventLog:
         """Sync everything written to the disk, so that the log never lags behind a checkpoint.
 
         Raises:
-            ResourceError: The disk does not take it.
+            ResourceError: The file cannot be written.
         """
         try:
             self._file.flush()

@@ -26,7 +26,7 @@ CARDS = """
 .card.failed{border-color:#c0392b}
 """
 SHORT = 120
-"""Letters of a message on a card; the table of failures has all of it."""
+"""Largest number of letters of a message on a card; the table of failures shows the whole message."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _failures(cards: list[JobCard]) -> str:
     for card in cards:
         if card.row.state == "failed":
             name = rf"(?<!\w){re.escape(card.row.name)}(?!\w)"
-            message = re.sub(name, "SCENE", card.row.message)  # messages about each one's files are one
+            message = re.sub(name, "SCENE", card.row.message)  # messages that differ only in the job's name count as one
             by_message[message].append(card.row.name)
     rows = "".join(
         f"<tr><td>{html.escape(message)}</td><td>{len(names)}</td><td>{html.escape(', '.join(names[:20]))}</td></tr>"

@@ -50,7 +50,7 @@ def row_values(row: JobRow) -> tuple[str, ...]:
 
 
 class FarmTable:
-    """Context manager that shows how many jobs wait, run, are done and failed, the running ones, the last ones, time left."""
+    """Context manager that shows the numbers of jobs by state, the running jobs, the last finished jobs, and the time left."""
 
     def __init__(self, *, live: bool | None = None):
         """Prepare; ``live`` None shows the table where stdout is a terminal."""

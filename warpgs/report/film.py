@@ -38,7 +38,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     if suffix in ANIMATIONS:
         return write_animation(path, frames, fps)
     if suffix not in VIDEOS:
-        raise UsageError(f"{path}: a film is one of {', '.join(SUFFIXES)}, not {suffix or 'a file without suffix'}")
+        raise UsageError(f"{path}: a film must end in one of {', '.join(SUFFIXES)}, got {suffix or 'no suffix'}")
     sizes: list[tuple[int, int]] = []
 
     def check(film: Path) -> None:

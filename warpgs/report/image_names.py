@@ -1,4 +1,4 @@
-"""Names of the image files of views: each view has its own, on every system."""
+"""Names of the image files of views, unique on every system."""
 
 from __future__ import annotations
 
@@ -49,7 +49,9 @@ def renaming_notes(names: dict[str, str]) -> list[str]:
     if not changed:
         return []
     words = ", ".join(changed[:3]) + (f", and {len(changed) - 3} more" if len(changed) > 3 else "")
-    return [f"names of views that are alike, long, or not allowed on every system are changed for images: {words}"]
+    return [
+        f"images of some views have other names, because view names are alike, long, or not allowed on every system: {words}"
+    ]
 
 
 def _own_name(view: str) -> str:

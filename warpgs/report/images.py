@@ -8,7 +8,8 @@ from warpgs.errors import ResourceError
 
 GRAY = (0.5, 0.5, 0.5)
 PAGE_WIDTH = 1280
-"""Largest width of an image on a page [px]: it fills about half of that, and screens of phones have two pixels for one."""
+"""Largest width of an image on a page [px]: a page shows it at about half this width, and phone screens have two device pixels
+per CSS pixel."""
 MAX_WEBP_SIDE = 16383
 """Largest side of a WebP image [px]."""
 
@@ -29,7 +30,7 @@ def png(image: np.ndarray) -> bytes:
 
 
 def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) -> bytes:
-    """Encode an image for a page: as WebP, with losses that are hard to see, a tenth of a PNG of a photograph.
+    """Encode an image for a page as WebP: losses are hard to see, and a photograph takes a tenth of its PNG.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3], or the contents of an image file.
@@ -56,7 +57,7 @@ def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) 
 
 
 def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
-    """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where nothing is seen.
+    """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where ``alpha`` is 0.
 
     Over ``background`` they give the image again; over another colour, the scene in front of that colour.
     """

@@ -38,9 +38,9 @@ def run_pyvista(code: str, *arguments: str) -> tuple[bool, str]:
 
 
 def remedy_for(why: str) -> str:
-    """Return how to help against the reason that `run_pyvista` gave."""
+    """Return the fix for a reason that `run_pyvista` returned."""
     if disk_is_full(folder := system_folder(), why):
-        return f"free some disk space for temporary files in {folder}, or name another folder by the variable TMPDIR"
+        return f"free some disk space for temporary files in {folder}, or set the variable TMPDIR to another folder"
     return "`pip install pyvista`" if "No module named" in why else REMEDY
 
 
@@ -112,7 +112,7 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
-    """Return a mask [N] of the points in the box of nine tenths of them, enlarged by ``margin`` of its size at each side."""
+    """Return a mask [N] of points in the box of nine tenths of all points, enlarged by ``margin`` of its size at each side."""
     low, high = np.percentile(points, [5, 95], axis=0)
     return ((points >= low - margin * (high - low)) & (points <= high + margin * (high - low))).all(1)
 

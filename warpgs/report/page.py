@@ -87,7 +87,7 @@ class CoverageReport:
     """Section of the page on coverage."""
 
     words: str
-    """Sentences on how much that is."""
+    """Sentences on the coverage."""
     legend: str
     """Meaning of the patterns in the images."""
     images: list[tuple[str, bytes]]
@@ -186,11 +186,11 @@ class Page:
     overview: bytes | None
     """Image of cameras and points, or None."""
     protocol: dict[str, str]
-    """Settings in which two scores must agree to be compared, and the definition of each figure, by name."""
+    """Settings that must be equal for scores to be comparable, and the definition of each figure, by name."""
     details: dict
     """Configuration, versions and data, shown as JSON on request; paths are reduced to the last name."""
     coverage: CoverageReport | None = None
-    """Scores of held-out views by what training views saw, or None."""
+    """Scores of held-out views by coverage, or None."""
     held_out: bool = True
     """True where the views are held out; False where the fit was trained on them."""
 

@@ -34,25 +34,25 @@ def duration(seconds: float) -> str:
 
 def is_live() -> bool:
     """Return whether stdout is a terminal in which a line can be overwritten."""
-    stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich stands before it
+    stdout = getattr(sys.stdout, "rich_proxied_file", sys.stdout)  # while a line is shown, rich wraps stdout
     return stdout is not None and stdout.isatty() and os.environ.get("TERM") != "dumb"
 
 
 class _StatusLine:
-    """The line at the bottom of the terminal: spinner, stage, bar, how far, and for how long. One in a process."""
+    """The line at the bottom of the terminal: spinner, stage, bar, progress, time. A process has one."""
 
     def __init__(self) -> None:
         """Begin without a line."""
         self.lock, self.display, self.task, self.stage = threading.RLock(), None, None, ""
 
     def show(self, line: str) -> None:
-        """Show a line, such as ``finding depth: view 7 of 24``; the words before the colon name the stage."""
+        """Show a line, such as ``finding depth: view 7 of 24``; the text before the colon names the stage."""
         stage, _, detail = printable(line).rpartition(": ")
         stage, detail = (stage, detail) if stage else (detail, "")
         counted = COUNTED.search(detail)
         done, total = (float(n.replace(",", "")) for n in counted.groups()) if counted else (0.0, None)
         if total is not None:
-            done = min(done, 0.999 * total)  # the line of a finished task stands still, and this stage may go on
+            done = min(done, 0.999 * total)  # rich stops the line of a finished task, and this stage may go on
         with self.lock:
             if self.display is None:
                 self.display = self._started()
@@ -60,7 +60,7 @@ class _StatusLine:
                 if self.task is not None:
                     self.display.remove_task(self.task)
                 self.task, self.stage = self.display.add_task(stage, total=total, completed=done, detail=detail), stage
-                self.display.refresh()  # before work that may hold up the thread which draws
+                self.display.refresh()  # now, because the next work may block the drawing thread
             else:
                 self.display.update(self.task, total=total, completed=done, detail=detail)
 
@@ -83,7 +83,7 @@ class _StatusLine:
             TextColumn("{task.description}", markup=False), BarColumn(24), TextColumn("{task.fields[detail]}", markup=False),
             TimeElapsedColumn(),
         )  # fmt: skip
-        own = sys.stderr is not None and sys.stderr.isatty()  # else errors go where they were sent, and do not meet the line
+        own = sys.stderr is not None and sys.stderr.isatty()  # redirected errors do not disturb the line
         display = Display(*columns, console=console, transient=True, refresh_per_second=8, redirect_stderr=own)
         display.start()
         return display
@@ -91,15 +91,15 @@ class _StatusLine:
 
 _STATUS = _StatusLine()
 _PANELS: list[Progress] = []
-"""The panel of a fit's steps that has the terminal now, if any."""
+"""Panel of a fit's steps that occupies the terminal now, if any."""
 
 
 class Stages:
     """Lines about the current work, such as ``finding depth: view 7 of 24``.
 
-    What stands before the last colon names a stage; where numbers follow, ``7 of 24``, there is a bar. In a terminal one line
-    is written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`.
-    Elsewhere the first line of a stage is shown at once, and then one every few seconds; the same line is shown once.
+    The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line is
+    written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`. Elsewhere
+    the first line of a stage is shown at once, and then one every few seconds; the same line is shown once.
     """
 
     def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
@@ -116,7 +116,7 @@ class Stages:
         self.clear()
 
     def __call__(self, line: str) -> None:
-        """Show a line; a plain one only unless its stage had one a moment ago."""
+        """Show a line; a plain line is skipped if its stage had one a moment ago."""
         if self.live and _PANELS:
             _PANELS[-1].doing = line
         elif self.live:
@@ -145,7 +145,7 @@ def waiting() -> Stages:
 class Progress:
     """Context manager that shows step, loss, PSNR, number of Gaussians, time per step and time left.
 
-    Times exclude steps that compiled kernels; none is shown before the first other step.
+    Times exclude steps that compile kernels; no time is shown before the first step without compilation.
     """
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
@@ -183,7 +183,7 @@ class Progress:
             say(self._line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
-        """Show the numbers of one finished step; ``seconds`` that it took, None if later steps will take another time."""
+        """Show the numbers of one finished step; ``seconds`` is its time, None if the time says nothing about later steps."""
         self.step, self.count, self.doing = step, count, ""
         self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
         self.seconds = self.seconds if seconds is None else _mean(self.seconds, seconds)

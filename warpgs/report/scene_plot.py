@@ -82,7 +82,7 @@ class ScenePlot:
     direction: np.ndarray
     """Direction from the scene to the eye, any length, shape [3]."""
     legend: list[tuple[str, str]]
-    """Words and colour (#rrggbb) of each entry besides the cameras."""
+    """Text and colour (#rrggbb) of each entry besides the cameras."""
 
 
 def _frustum_size(cameras: list[Camera], reach: float) -> float:
@@ -95,7 +95,7 @@ def _frustum_size(cameras: list[Camera], reach: float) -> float:
 
 
 def _with_legend(data: bytes, entries: list[tuple[str, str]], size: tuple[int, int], background: str) -> bytes:
-    """Return a PNG of the size wanted: a render, and below it a strip with a square and words for each entry."""
+    """Return a PNG of the size wanted: a render, and below it a strip with a square and text for each entry."""
     from PIL import Image, ImageDraw, ImageFont
 
     canvas = Image.new("RGB", size, background)
@@ -154,7 +154,7 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
 
 
 def _rendered(arrays: dict[str, np.ndarray], words: dict[str, object]) -> bytes:
-    """Return what `PLOT_SCRIPT` renders of arrays and settings, as PNG bytes."""
+    """Run `PLOT_SCRIPT` with arrays and settings; return its render as PNG bytes."""
     try:
         with temporary_folder() as folder:
             source, target = (folder.path / name for name in ("scene.npz", "plot.png"))

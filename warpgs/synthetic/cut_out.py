@@ -1,8 +1,8 @@
 """Objects cut out of their surroundings: ray cast with true alpha, with thin parts and holes, different for every seed.
 
-They are written as a transforms.json folder of RGBA images or, the same views, as a COLMAP folder with soft masks. The world
-has +z up. Cameras go once around the object on the upper hemisphere, rising and falling, so that a held-out view lies between
-two training views.
+The views are written as a transforms.json folder of RGBA images, or as a COLMAP folder with soft masks. The world has +z up.
+Cameras go once around the object on the upper hemisphere, rising and falling, so that a held-out view lies between two training
+views.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
 
 Six images suffice to reconstruct it: everything is smooth and matte, and the training views surround the held-out ones. But
-they cannot be copied: between neighbouring views the pattern moves by more than half its period, so neither a training image
-nor their mean resembles a held-out view pixel by pixel.
+training images cannot be copied: between neighbouring views the pattern moves by more than half its period, so neither a
+training image nor a mean of training images resembles a held-out view pixel by pixel.
 """
 
 from __future__ import annotations
@@ -248,7 +248,7 @@ def colmap_text(cameras: list[Camera], x: np.ndarray, colors: np.ndarray, seen: 
 
 
 def _check(folder: Path, width: int, height: int) -> None:
-    """Raise a UsageError for a demo that cannot be written, before anything is."""
+    """Raise a UsageError for a demo that cannot be written, before any file is written."""
     if min(width, height) < MIN_SIDE:
         raise UsageError(f"a demo image must be at least {MIN_SIDE} px on each side, not {width} x {height}")
     try:
@@ -284,7 +284,7 @@ def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict
     Args:
         folder: Target folder.
         size: Image width and height [px].
-        contents: Makes the contents by relative path, once the disk can be written.
+        contents: Function that returns the contents by relative path; called once the folder is known to be writable.
 
     Raises:
         UsageError: The folder is not empty, or the images are too small.

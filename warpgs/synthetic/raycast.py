@@ -1,8 +1,8 @@
 """A small ray caster in numpy: closed shapes with smooth solid textures under one soft light, no GL, no mesh.
 
-It exists so that the demo scene needs no download and no graphics driver. Every shape computes the first hit of a ray in its
-own frame, the normal there and its radius. So an image, the exact depth of a pixel and the visibility of a point all come from
-the same intersection code. Shading is diffuse: a surface point has one colour from all directions.
+With it the demo scene needs no download and no graphics driver. Every shape computes the first hit of a ray in its own frame,
+the normal there and its radius. So an image, the exact depth of a pixel and the visibility of a point all come from the same
+intersection code. Shading is diffuse: a surface point has one colour from all directions.
 
 Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths in scene units [u].
 """
@@ -71,8 +71,8 @@ class Shape(abc.ABC):
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     """Rotation world_from_local, shape [3, 3]."""
     shading: float = 0.8
-    """Radius of the sphere that stands for the shape where it shades others, over that of its bounding sphere; 0 for thin
-    shapes, which such a sphere would overstate: they shade nothing."""
+    """Radius of the sphere that casts the shadow of the shape, over that of its bounding sphere; 0 for thin shapes, which cast
+    no shadow, because that of a sphere would be too large."""
 
     @property
     def radius(self) -> float:

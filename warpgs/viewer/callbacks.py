@@ -1,4 +1,4 @@
-"""Callbacks of the viewer's controls that end in one line where they fail: viser would print a traceback."""
+"""Callbacks of the viewer's controls that report an error in one line; viser would print a traceback."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from warpgs.runtime.terminal import say
 
 
 def said(error: BaseException) -> str:
-    """Return an error as one line, shortened; with its kind where it is not one of ours."""
+    """Return an error as one line, shortened; with its type unless it is a `WarpgsError`."""
     line = (str(error).strip().splitlines() or [""])[0][:200]
     return line if isinstance(error, WarpgsError) else f"{type(error).__name__}: {line}"
 
 
 def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
-    """Return a callback that prints one line on stderr where another raises an error."""
+    """Return a callback that calls another one, and prints one line on stderr if that raises an error."""
 
     @functools.wraps(callback)
     def call(*args: Any) -> None:

@@ -12,7 +12,7 @@ from warpgs.geometry import look_at, matmul, quaternions, rotation_matrices
 from warpgs.scene import Camera, Gaussians
 
 FIELD_OF_VIEW = math.radians(50)
-"""Vertical field of view of the camera that is made where a model has none [rad]."""
+"""Vertical field of view of the camera that is made for a model without cameras [rad]."""
 
 
 def wxyz_of(camera: Camera) -> np.ndarray:
@@ -31,7 +31,7 @@ def fov_y(camera: Camera, aspect: float = math.inf) -> float:
 
 
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
-    """Return the median depth of the means that a camera sees [u], which a view turns about; 1 where it sees none."""
+    """Return the median depth [u] of the means that a camera sees, or 1 without any; a view turns about this depth."""
     means = gaussians.means.detach().cpu().double().numpy()
     points = matmul(means, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = points[:, 2]

@@ -23,7 +23,7 @@ from warpgs.viewer.page import live_page
 MAX_BROWSERS = 16
 """Largest number of websockets at a time."""
 MAX_CONNECTIONS = 64
-"""Largest number of connections at a time, before anything was asked, too."""
+"""Largest number of connections at a time, including those without a request so far."""
 MESSAGES_PER_SECOND = 200.0
 """Rate of messages of one browser; moving a camera sends 50 a second."""
 MAX_BURST = 2000.0
@@ -33,13 +33,13 @@ _HOOK = threading.Lock()
 
 
 class Rules:
-    """Rules for connections and messages, and the connections that are there."""
+    """Rules for connections and messages, and the open connections."""
 
     def __init__(self) -> None:
         """Begin without controls."""
         self.guard = WebGuard()
         self.control_of: Callable[[str], Any] = lambda uuid: None
-        """Finds a control by its identifier in messages."""
+        """Function that returns a control by its identifier in messages."""
         self.connected: set[Any] = set()
         """Connections of all kinds."""
         self.browsers: set[Any] = set()
@@ -64,7 +64,7 @@ class Rules:
         """Return the answer to a request, None for a websocket that may be opened.
 
         Args:
-            inner: viser's own, which returns files.
+            inner: viser's own function, which returns files.
             protocol: Name of the protocol that a websocket must speak.
             connection: The connection.
             request: The request of websockets.
@@ -98,7 +98,7 @@ class Rules:
 
 
 def connection_class(rules: Rules) -> type:
-    """Return the class of connections that hold to rules."""
+    """Return the class of connections that follow rules."""
     from websockets.asyncio.server import ServerConnection
 
     class Connection(ServerConnection):
@@ -129,7 +129,7 @@ def connection_class(rules: Rules) -> type:
                     continue
                 try:
                     if not self.allowance.take():
-                        raise DataError(f"more than {MESSAGES_PER_SECOND:.0f} messages a second came")
+                        raise DataError(f"more than {MESSAGES_PER_SECOND:.0f} messages a second")
                     checked = rules.checked(frame)
                 except DataError as e:
                     self.refused = True
@@ -157,9 +157,9 @@ def _failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def guarded_server(rules: Rules, bound: socket.socket, protocol: str) -> Iterator[None]:
-    """Have the server that viser starts in the body hold to rules, and listen at a socket of ours.
+    """Make the server that viser starts in the block follow rules, and listen at the socket ``bound``.
 
-    viser takes no such checks of its own, so the function that it starts its server with is replaced while it starts.
+    viser has no option for such checks, so the function that starts its server is replaced in the block.
 
     Args:
         rules: The rules.

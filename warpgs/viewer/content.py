@@ -1,4 +1,4 @@
-"""Contents of the viewer: a model, with the cameras, photographs and layers that are known of it."""
+"""Contents of the viewer: a model, with its known cameras, photographs and layers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Content:
     model: FittedModel
     """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
     stem: Path
-    """Beginning of the paths of files that are saved from the viewer: RUN/ or x. of x.ply."""
+    """Beginning of the paths of files that are saved from the viewer: RUN/ for a run, x. for x.ply."""
     fine: torch.Tensor | None = None
     """True for Gaussians of the fine layer, bool, shape [N]; None without layers."""
     views: Mapping[str, View] = field(default_factory=dict)
@@ -78,7 +78,7 @@ def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, Vie
 
 
 def content_of_file(path: Path, device: str = "cpu") -> Content:
-    """Read a file of Gaussians of any format; it is shown about its own middle, at a size that suits the viewer.
+    """Read a file of Gaussians of any format; it is centred and scaled for the viewer.
 
     Raises:
         DataError: The file holds no Gaussians.

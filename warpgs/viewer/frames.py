@@ -86,7 +86,7 @@ def read_frame(frame: bytes | str) -> dict[str, Any]:
         frame: MessagePack, as viser's page sends it.
 
     Raises:
-        DataError: It is not a message, not one of `MESSAGES`, or a field has an invalid value.
+        DataError: The frame is not a message, not one of `MESSAGES`, or a field has an invalid value.
     """
     import msgspec
 
@@ -119,7 +119,7 @@ def write_frame(message: Mapping[str, Any]) -> bytes:
 
 
 def control_value(value: Any, control: Any) -> Any:
-    """Return the value that a control takes, brought within its limits.
+    """Return the value that a control takes, clamped to its limits.
 
     Args:
         value: Value of a message, as `read_frame` returns it.

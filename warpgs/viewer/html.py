@@ -50,20 +50,21 @@ SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
 )
-"""Script for a page opened from disk, whose blobs browsers refuse as module workers: without the worker that sorts them, the
-Gaussians are blended in the order of the file. Refused here, viser's page starts it from a data: address, which works."""
+"""Script for a page opened from disk. Browsers reject its blobs as module workers; without the worker that sorts them,
+Gaussians are blended in the order of the file. The script rejects the blob itself, so viser's page starts the worker from a
+data: address, which works."""
 WHOLE_IMAGE = (
     "<script>{let fov=OWN;const degrees=180/Math.PI,show=()=>{const c=window.__viserMutable?.camera;"
     "if(!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
     "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
     "show();addEventListener('resize',show)}</script>"
 )
-"""Script that widens the vertical field of view OWN [rad] in a window narrower than the first camera's image, half of which has
-the width WIDE at distance 1: on a phone the sides would be cut off."""
+"""Script that widens the vertical field of view OWN [rad] in a window narrower than the first camera's image, such as a
+phone's: else the sides would be cut off. WIDE is half the width of the image at distance 1."""
 
 
 def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-    """Have pages start at a camera, with that direction up which films have upwards."""
+    """Set the camera at which pages start, with the upward direction of films."""
     forward = np.asarray(camera.viewmat[2, :3])
     server.scene.set_up_direction(up_of(list(cameras), gaussians.means.detach().cpu().double().numpy()))
     server.initial_camera.position = camera.center
@@ -74,7 +75,7 @@ def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gau
 
 
 def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
-    """Return cameras with the one nearest to the mean of their centres first, and the others in their order."""
+    """Return cameras, first the camera nearest to the mean of all centres, then the others in order."""
     if not cameras:
         return []
     centers = np.array([c.center for c in cameras])
@@ -95,12 +96,12 @@ def page_of(
 ) -> tuple[str, list[str]]:
     """Return the page as text, and notes for the user on differences from a render.
 
-    The page holds the Gaussians in units of their own (`packed`), without directions: colours are those of degree 0. It
-    contains no name of a file, a view or a machine, except ``title``.
+    The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of a file, a
+    view or a machine, except ``title``.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, of which the first is where the page starts; none to start before the model.
+        cameras: Cameras; the page starts at the first. Without cameras it starts in front of the model.
         background: Colour behind the scene, in [0, 1].
         title: Title of the page.
 
@@ -148,7 +149,7 @@ def write_html(
     Args:
         path: The file; an existing one is replaced.
         gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras, of which the first is where the page starts; none to start before the model.
+        cameras: Cameras; the page starts at the first. Without cameras it starts in front of the model.
         background: Colour behind the scene, in [0, 1].
         title: Title of the page.
 
@@ -171,7 +172,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
 
     Raises:
         DataError: The folder is not a run, or nothing is left of its model.
-        ResourceError: viser is not installed, another process writes into the file's folder, or it cannot be written.
+        ResourceError: viser is not installed, another process writes into the file's folder, or the file cannot be written.
         UsageError: A filter is invalid.
     """
     require_viser()

@@ -1,4 +1,4 @@
-"""Images that the browser cannot draw, rendered here at its camera: all directions, depth, coverage, error."""
+"""Images that the browser cannot draw, rendered here at the browser's camera: all directions, depth, coverage, error."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from warpgs.viewer.content import Content
 
 GAUSSIANS, RENDER, DEPTH, COVERAGE, ERROR = "Gaussians (browser)", "render", "depth", "coverage", "error"
 MAPS = {
-    RENDER: "colours of all directions, by the rasterizer of the fit",
+    RENDER: "view-dependent colours, by the rasterizer of the fit",
     DEPTH: "near warm, far cold; gray in nearly empty areas",
-    COVERAGE: "striped magenta: no training view saw it; amber: one did",
+    COVERAGE: "striped magenta: seen by no training view; amber: by one",
     ERROR: "difference from the photograph, at a camera that you stepped into; brightest from 0.3",
 }
 """Images by name, with their descriptions."""

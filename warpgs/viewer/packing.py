@@ -15,13 +15,13 @@ from warpgs.scene import Gaussians
 LARGEST_HALF = 65504.0
 """Largest finite number in half precision."""
 MEDIAN_AXIS = 1.0
-"""Length of the median Gaussian's longest axis in the units that covariances are stored in. Squares of axes are exact to 0.05%
-from 6.1e-5 on, the least normal number: so for axes from 1/128 of the median to 255 times it."""
+"""Length of the median Gaussian's longest axis in the units of stored covariances. Squares of axes are exact to 0.05 % if they
+are at least 6.1e-5, the smallest normal number: for axes from 1/128 of the median to 255 times the median."""
 
 
 @dataclass(frozen=True)
 class Packed:
-    """N Gaussians of one colour each, in units of their own, of which one is ``scale`` scene units long."""
+    """N Gaussians of one colour each, in their own units; one such unit is ``scale`` scene units."""
 
     centers: np.ndarray
     """Positions in stored units, float32, shape [N, 3]."""
@@ -34,15 +34,15 @@ class Packed:
     scale: float
     """Scene units [u] per stored unit."""
     shortened: int
-    """Number of Gaussians that are longer than half precision holds, and are shown as long as it does."""
+    """Number of Gaussians that are too long for half precision, and are shown shorter."""
 
 
 def packed(gaussians: Gaussians) -> Packed:
     """Return Gaussians for the browser.
 
-    A covariance in scene units can lie below what half precision resolves: axes of 0.001 u have squares of 1e-6, of which it
-    keeps four bits, and of axes below 0.00017 u nothing is left. Units in which the median axis is 1 keep eleven bits of nearly
-    all of them.
+    Half precision is too coarse for covariances in scene units: an axis of 0.001 u has the square 1e-6, of which four bits
+    remain; the square of an axis below 0.00017 u becomes 0. Units in which the median axis is 1 keep eleven bits of nearly all
+    squares.
 
     Args:
         gaussians: N Gaussians, on any device.

@@ -10,7 +10,7 @@ NO_TEXT_AS_CODE = (
     "eval=nothing;Function=new Proxy(made,{apply:(f,self,args)=>make(args),construct:(f,args)=>make(args)})}"
 )
 """JavaScript before viser's own: messages that hold JavaScript do nothing. The content policy cannot do this, since the code
-that sorts Gaussians makes functions of text, too; but those have parameters."""
+that sorts Gaussians makes functions from text, too; functions with parameters are still allowed."""
 _MARK_LOADED = (
     "document.createElement=function(name,...rest){"
     "const made=Document.prototype.createElement.call(this,name,...rest);"

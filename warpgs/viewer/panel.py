@@ -47,7 +47,7 @@ class Panel:
     """Controls that all browsers share."""
 
     def __init__(self, server: viser.ViserServer, content: Content, window: Shown, maps: bool):
-        """Make the controls that the model has a use for."""
+        """Make the controls that are useful for the model."""
         self.server, self.content, self.window = server, content, window
         self.keyframes: list[dict[str, Any]] = []
         self._lock = threading.Lock()
@@ -57,7 +57,7 @@ class Panel:
         degree = content.model.gaussians().sh_degree
         self._degree = gui.add_slider(
             "SH degree", 0, max(degree, 1), 1, degree, disabled=degree == 0, visible=maps,
-            hint="degree of the colours of a render; those that the browser renders have degree 0",
+            hint="degree of the colours of a render; Gaussians that the browser renders have degree 0",
         )  # fmt: skip
         self._layer = gui.add_dropdown("layer", (ALL, COARSE, FINE), initial_value=ALL, visible=content.fine is not None)
         self._cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
@@ -94,7 +94,7 @@ class Panel:
         return CropBox(np.asarray(self._gizmo.position, np.float64), size, rotation_matrices(np.asarray(self._gizmo.wxyz)))
 
     def tell(self, content: Content) -> None:
-        """Write the current image."""
+        """Write title, number of Gaussians, step and number of cameras."""
         self.content = content
         model = content.model
         parts = [f"{len(model.gaussians()):,} Gaussians"]
@@ -103,7 +103,7 @@ class Panel:
         self._status.content = f"**{_plain(content.title)}**\n\n{', '.join(parts)}"
 
     def explain(self, note: str) -> None:
-        """Write what an image shows."""
+        """Write a note on the image; an empty note is hidden."""
         self._note.content, self._note.visible = _plain(note), bool(note)
 
     def _add_stepping(self) -> None:
@@ -120,7 +120,7 @@ class Panel:
         reset.on_click(guarded(lambda event: self.window.reset(event.client)))
 
     def _add_sampling(self) -> None:
-        """Offer the fit's own image of where fine Gaussians were placed."""
+        """Add the fit's image of the places where fine Gaussians were placed."""
         sheet, run = self.content.sheet, self.content.stem
         if sheet is None:
             return
@@ -137,7 +137,7 @@ class Panel:
         self.server.gui.add_button("show sampling", hint="where the fit placed fine Gaussians").on_click(guarded(show))
 
     def _add_crop(self) -> None:
-        """Offer a box that is moved and turned by its handles, and saved."""
+        """Add a box that the user moves and rotates by its handles, and saves."""
         gui, scene, means = self.server.gui, self.server.scene, self.content.model.gaussians().means.cpu().double().numpy()
         low, high = np.percentile(means, [5, 95], axis=0)
         with gui.add_folder("Crop box", expand_by_default=False):
@@ -167,7 +167,7 @@ class Panel:
         save.on_click(guarded(store))
 
     def _add_keyframes(self) -> None:
-        """Offer to keep the present camera as the next of a path, and to save the path."""
+        """Add controls that append the current camera to a path, and save the path."""
         gui = self.server.gui
         with gui.add_folder("Keyframes", expand_by_default=False):
             seconds = gui.add_number("seconds between", 2.0, min=0.1, max=600.0, step=0.1)
@@ -210,5 +210,5 @@ class Panel:
 
 
 def _plain(text: str) -> str:
-    """Return text in UTF-8 without what Markdown would make of it."""
+    """Return text in UTF-8, with the special characters of Markdown escaped."""
     return "".join(f"\\{c}" if c in "\\`*_{}[]()<>#|!" else c for c in readable(text))

@@ -22,10 +22,10 @@ OTHER_PORT = "give another with --port (fit: --view-port), or 0 for any free one
 
 
 def require_viser() -> None:
-    """Check that viser is there.
+    """Check that viser is installed.
 
     Raises:
-        ResourceError: It is not installed; the message names the package.
+        ResourceError: viser is not installed; the message names the package.
     """
     try:
         version("viser")
@@ -34,7 +34,7 @@ def require_viser() -> None:
 
 
 def _refuses_others(port: int) -> bool:
-    """Return whether the server answers 403 to who asks without the token."""
+    """Return whether the server answers 403 to a request without the token."""
     request = f"GET / HTTP/1.1\r\nHost: {HOST}:{port}\r\n\r\n"
     with socket.create_connection((HOST, port), timeout=10) as stream:
         stream.sendall(request.encode())
@@ -55,7 +55,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
 
     Raises:
         ResourceError: viser is not installed, or its version does not let requests be checked.
-        UsageError: The port is taken, or no port.
+        UsageError: The port is taken or invalid.
     """
     require_viser()
     import viser
@@ -64,7 +64,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
         rules: Rules
 
         def request_share_url(self, verbose: bool = True) -> None:
-            """Refuse to open a tunnel to the world."""
+            """Refuse to open a tunnel to the internet."""
 
     rules, bound = Rules(), loopback_socket(port, OTHER_PORT)
     port = bound.getsockname()[1]

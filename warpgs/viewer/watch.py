@@ -32,13 +32,13 @@ POLL = 1.0
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
-    """Show a run folder or a file of Gaussians until Ctrl-C; checkpoints of a fit that continues are shown as they come.
+    """Show a run folder or a file of Gaussians until Ctrl-C; new checkpoints of a running fit are shown, too.
 
     Args:
-        path: Run folder, of a fit that continues, too; or a file of any registered format.
+        path: Run folder, also while its fit runs; or a file of any registered format.
         port: Port to listen at; 0 for any free one.
         device: Device that renders images: auto, cpu or cuda.
-        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        reader: User-defined reader, as for `warpgs fit --reader`.
 
     Raises:
         DataError: The path is neither a run folder nor a file of Gaussians.
@@ -92,12 +92,12 @@ def _follow(server: viser.ViserServer, path: Path, device: str, reader: str | No
 
 
 def _pause() -> None:
-    """Wait until it is time for another look."""
+    """Wait until the next check."""
     time.sleep(POLL)
 
 
 def _update(window: Window, path: Path, device: str) -> None:
-    """Show the newest checkpoint; report an unreadable one and keep the one before."""
+    """Show the newest checkpoint; report an unreadable one and keep the previous one."""
     try:
         window.show(content_of_run(path, device, window.content.views))
     except WarpgsError as e:
@@ -120,7 +120,7 @@ class LiveView:
         self._thread.start()
 
     def look(self, model: FittedModel) -> None:
-        """Copy a state, which the fit's next step overwrites, at most once in `POLL`; one that was not shown yet is dropped."""
+        """Copy a state before the fit's next step overwrites it, at most once per `POLL`; a state not yet shown is dropped."""
         if time.monotonic() < self._next:
             return
         copy = {n: t.detach().to("cpu", copy=True) for n, t in model.gaussians().tensors().items()}
@@ -129,7 +129,7 @@ class LiveView:
         self._wake.set()
 
     def wait_shown(self, seconds: float) -> bool:
-        """Wait until a state was shown; returns whether one was, within a time [s]."""
+        """Wait up to ``seconds`` until a state was shown; return whether one was."""
         return self._shown.wait(seconds)
 
     def close(self) -> None:
@@ -166,7 +166,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
-    """Give a viewer of a fit that runs in the body; it closes when the fit ends, and `warpgs view` shows the run from then on.
+    """Give a viewer of a fit that runs in the block; it closes when the fit ends, and `warpgs view` shows the run from then on.
 
     Raises:
         ResourceError: viser is not installed.

@@ -78,7 +78,7 @@ class Window:
             self.redraw()
 
     def close(self) -> None:
-        """End the rendering of images; its owner stops the server."""
+        """End the rendering of images; the owner of the window stops the server."""
         self._open = False
         self._wake.set()
         self._thread.join(timeout=10)
@@ -158,7 +158,7 @@ class Window:
         self._wake.set()
 
     def _hide_near(self) -> None:
-        """Hide the cameras about the eye of a browser: their photographs would be all that is seen."""
+        """Hide the cameras near the eye of a browser, because their photographs would fill the view."""
         eyes = [c.camera.position for c in self.server.get_clients().values()]
         for name, frustum in self._frusta.items():
             center = self.content.model.scene_cameras[name].center
@@ -183,7 +183,7 @@ class Window:
                     self.panel.explain(f"no image: {said(e)}")
 
     def _render_for(self, client: viser.ClientHandle) -> None:
-        """Put the image that the panel asks for behind a browser's scene, where the one it has is another."""
+        """Put the image that the panel selects behind a browser's scene, unless it is there already."""
         kind, degree = self.panel.kind(), self.panel.sh_degree()
         state = client.camera
         asked = (kind, degree, tuple(state.position), tuple(state.wxyz), state.fov, state.image_width, state.image_height)

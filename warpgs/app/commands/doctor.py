@@ -20,9 +20,9 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Doctor:
         warm: bool = False
-        """Compile all kernels of a fit for this machine's devices instead of the checks."""
+        """Compile all kernels of a fit for this machine's devices, and skip the checks."""
         repeat: Path | None = None
-        """File not_finite.safetensors of a run: repeat this step and name the non-finite values, instead of the checks."""
+        """File not_finite.safetensors of a run: repeat the saved step, name the non-finite values, and skip the checks."""
         device: str = "auto"
         """Device for --repeat: auto, cpu or cuda."""
 

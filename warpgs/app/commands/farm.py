@@ -12,7 +12,7 @@ from warpgs.pipeline.farm.listing import FARM_FLAGS, ListedJob
 OWN = ("engine", "slots", "per-gpu", "threads", "minutes", "partition", "slurm-folder", "out", "help", "help-all")
 """Flags of the farm itself; all others are those of `warpgs fit`."""
 SWITCHES = ("help", "help-all")
-"""Flags of these that take no value."""
+"""Flags of the farm that take no value."""
 
 
 def run(arguments: list[str], about: str) -> int:
@@ -57,7 +57,7 @@ def run(arguments: list[str], about: str) -> int:
 
 
 def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Divide the words of a command line into those of the farm and those of every fit."""
+    """Divide the arguments of a command line into those of the farm and those of every fit."""
     own: list[str] = []
     shared: list[str] = []
     target = own
@@ -77,7 +77,7 @@ def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
-    """Return the jobs, each with the settings that the words of all and its own make."""
+    """Return the jobs, each with the settings of the shared arguments and of its own."""
     from warpgs.pipeline.farm.job import FarmJob
 
     requests: dict = {}

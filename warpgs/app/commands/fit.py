@@ -1,7 +1,7 @@
 """`warpgs fit`: flags derived from `FitConfig`: names, defaults and help texts are those of its fields.
 
-Defaults depend on the preset; a strategy and loss terms have their own settings. So the few flags that decide which others
-there are, are looked up first. Parses, calls, prints; no logic.
+Defaults depend on the preset; a strategy and loss terms have their own settings. So the flags that determine other flags are
+looked up first. Parses, calls, prints; no logic.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from warpgs.runtime.ranks import join, place
 from warpgs.runtime.terminal import be_quiet, say
 
 CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view": 0, "--view-port": 1, "--lpips-weights": 1}
-"""Flags that go with --resume where all else is as the run was started, and how many values each has."""
+"""Flags that may accompany --resume when a run keeps its settings, and the number of values of each."""
 
 
 def _request_type() -> type:
@@ -53,7 +53,7 @@ def _request_type() -> type:
         time_budget: float | None = None
         """Choose the number of steps so that the fit finishes in this time [s]; not with --steps."""
         view: bool = False
-        """Show the model in a browser while it trains, at the printed address; the result has the same bytes."""
+        """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
         view_port: int = 8080
         """Port of --view; 0 for any free one."""
 
@@ -61,7 +61,7 @@ def _request_type() -> type:
 
 
 def _load(registry: Registry[Any], name: str) -> type[Any]:
-    """Return the class of a plug-in, importing code of the user's own where it is named by module or file."""
+    """Return the class of a plug-in; the user's own code, named by module or file, is imported."""
     return load_own(registry.kind, name, lambda: registry.load(name))
 
 
@@ -70,7 +70,7 @@ Parts = dict[str, Any]
 
 
 def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
-    """Return the parts of a registry that a command line names after a flag, with default settings; ``base`` without it."""
+    """Return the parts of a registry that a flag names, with default settings; ``base`` if the flag is not given."""
     given = word_after(arguments, flag)
     if given is None:
         return {flag_group(p.name): p for p in base}
@@ -82,12 +82,14 @@ def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple
         try:
             parts[flag_group(name)] = kind()
         except TypeError as e:
-            raise UsageError(f"the {registry.kind} {name!r} has a setting without a default ({e}); give every field one") from e
+            raise UsageError(
+                f"the {registry.kind} {name!r} has a setting without a default ({e}); give every field a default"
+            ) from e
     return parts
 
 
 def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
-    """Return the view modules that a command line names; each of ours has a flag of its name, too."""
+    """Return the view modules that a command line names; built-in modules also have a flag each."""
     modules = _parts(VIEW_MODULES, "--view-modules", arguments, base.view_modules)
     for name in VIEW_MODULES.names():
         flag = name.replace("_", "-")
@@ -171,7 +173,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
 
 
 def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
-    """Return the settings that parsed flags stand for."""
+    """Return the settings of parsed flags."""
 
     def settings(name: str, part: Any) -> Any:
         return settings_of(type(part), getattr(a, f"{name}_settings"))
@@ -184,18 +186,18 @@ def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
 
 
 def _check_time_budget(a: Any, arguments: list[str]) -> None:
-    """Raise UsageError where a time budget is given that cannot be kept, or with the steps that it chooses."""
+    """Raise UsageError for an invalid time budget, or one that is given together with --steps or --resume."""
     if a.time_budget is None:
         return
     if a.resume or word_after(arguments, "--steps"):
         raise UsageError(
-            "--time-budget chooses the number of steps; leave out --steps. To continue such a run, use only --out RUN --resume"
+            "--time-budget chooses the number of steps; leave out --steps. To continue a run, give only --out RUN --resume"
         )
     check_budget(a.time_budget)
 
 
 def _names_a_run_alone(arguments: list[str]) -> bool:
-    """Return whether words ask to continue a run, and give nothing that it was started with."""
+    """Return whether arguments continue a run without giving any of its settings."""
     words = [w for a in arguments for w in a.split("=", 1)]
     while words:
         if words[0] not in CONTINUING:
@@ -205,7 +207,7 @@ def _names_a_run_alone(arguments: list[str]) -> bool:
 
 
 def _continued(arguments: list[str], about: str) -> FitRequest:
-    """Return the request that continues a run as it was started."""
+    """Return the request that continues a run with its original settings."""
     from warpgs.pipeline.runs.folder import stored_request
 
     @dataclass(frozen=True, kw_only=True)
@@ -223,7 +225,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         view_port: int = 8080
         """Port of --view; 0 for any free one."""
         lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; a run does not store it, and without it LPIPS is not measured."""
+        """File of `warpgs convert-lpips`, which a run does not store; give it again to measure LPIPS."""
 
     a = parse_flags(Continue, arguments, "warpgs fit", about)
     check_range("--threads", a.threads, 0, MAX_THREADS)
@@ -237,7 +239,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
 
 
 def request_of(arguments: list[str], about: str) -> FitRequest:
-    """Return the request that the words of a command line make.
+    """Return the request for the arguments of a command line.
 
     Raises:
         UsageError: A flag is wrong, or a plug-in cannot be loaded.

@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
         points: str = "gaussians"
         """gaussians, or start (the points of the scene's reconstruction)."""
         color: str = "own"
-        """own, or coverage (how many training views see each Gaussian)."""
+        """own (colour of the Gaussian or point), or coverage (how many training views see each Gaussian)."""
         background: str = "white"
         """white or black."""
         size: tuple[int, int] = (1600, 1000)

@@ -19,7 +19,7 @@ def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` heads its help.
 
     Raises:
-        UsageError: It is neither show nor export.
+        UsageError: The first argument is neither show nor export.
     """
     kinds = {"show": _show, "export": _export}
     if not arguments or arguments[0] not in kinds:

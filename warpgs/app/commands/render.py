@@ -61,7 +61,7 @@ def run(arguments: list[str], about: str) -> int:
 
     settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
     if a.run.is_dir() and (a.cameras is not None or a.rule is not None or a.antialiased):
-        raise UsageError("--cameras, --rule and --antialiased are for files of Gaussians; a run has its own")
+        raise UsageError("--cameras, --rule and --antialiased are for files of Gaussians; leave them out for a run")
     given = (a.cameras, a.rule) if a.run.is_file() or a.cameras is not None else None
     for line in render(
         a.run, a.path, a.out, settings, a.device,

@@ -22,7 +22,7 @@ def study_flags() -> type:
         out: Path
         """Folder of the study; repeat the command to continue an interrupted study."""
         seeds: int = 5
-        """Runs of each setting on each scene, with seeds from 0 on."""
+        """Number of runs of each setting on each scene; seeds count from 0."""
         steps: int | None = None
         """Optimisation steps of every run. Default: as in `warpgs fit`."""
         device: str = "auto"

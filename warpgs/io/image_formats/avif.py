@@ -24,7 +24,7 @@ HEAD = 12
 BRANDS_END = 32
 """End of the bytes in which the compatible brands are looked for."""
 BROKEN = (OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, struct.error)
-"""Errors that Pillow raises about files that make no sense, as changing their bytes at random shows."""
+"""Errors that Pillow raises about malformed files, as fuzzing shows."""
 
 
 def kind(data: bytes) -> str | None:

@@ -1,4 +1,4 @@
-"""JPEG: markers and scans are walked, then libjpeg-turbo decodes strictly: what it would only warn of is rejected.
+"""JPEG: markers and scans are checked, then libjpeg-turbo decodes; its warnings count as errors.
 
 JPEG has no checksum: damage that leaves a valid code of the same length is not seen (docs/decisions/012-files-from-anyone.md).
 """

@@ -1,4 +1,4 @@
-"""PNG: the checksum of every chunk, and that of the compressed pixels; their number must match the header."""
+"""PNG: checks the checksums of chunks and compressed pixels, and compares the number of pixels with the header."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TIFF: the first image's strips or tiles must lie in the file, apart from each other, and hold all their pixels.
+"""TIFF: the strips or tiles of the first image must lie in the file, must not overlap, and must hold all their pixels.
 
 Deflate has a checksum, which is checked. Pillow decodes other compressions, and stops if libtiff reports an error. OpenCV
 decodes pixels of more bits than Pillow supports; for those it stops at errors, too.
@@ -15,7 +15,7 @@ from warpgs.io.image_formats.png import unpacked_size
 TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 """Layouts of the integers that tags may hold, by type."""
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 8: 2, 9: 4, 11: 4, 13: 4}
-"""Bytes of a value by type; those of all others have 8."""
+"""Bytes of a value by type; values of other types have 8."""
 WIDTH, HEIGHT, BITS, COMPRESSION, CHANNELS, PLANES = 256, 257, 258, 259, 277, 284
 ROWS, OFFSETS, COUNTS = 278, 273, 279
 TILE_WIDTH, TILE_HEIGHT, TILE_OFFSETS, TILE_COUNTS = 322, 323, 324, 325
@@ -128,7 +128,7 @@ def _check_by_pillow(data: bytes) -> None:
 
 
 def check(data: bytes) -> None:
-    """Check that all strips or tiles are there, do not overlap, and unpack to as many bytes as they must.
+    """Check that all strips or tiles are there, do not overlap, and unpack to the right number of bytes.
 
     Raises:
         ValueError: A strip or tile is missing, overlaps another, or has the wrong size; or a checksum does not match.

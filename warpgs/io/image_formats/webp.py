@@ -13,7 +13,7 @@ def chunks(data: bytes) -> Iterator[tuple[bytes, memoryview]]:
     """Yield kind and contents of each chunk.
 
     Raises:
-        ValueError: It is not a WebP file, or ends within a chunk.
+        ValueError: The file is not a WebP file, or ends within a chunk.
     """
     if len(data) < 20 or data[8:12] != b"WEBP":
         raise ValueError("it is not a WebP file")
@@ -54,7 +54,7 @@ def check(data: bytes) -> None:
     """Check that all chunks are whole.
 
     Raises:
-        ValueError: One is not, or there are no pixels.
+        ValueError: A chunk is not whole, or there are no pixels.
     """
     if not any(kind in PIXELS for kind, _ in chunks(data)):
         raise ValueError("it holds no pixels")
