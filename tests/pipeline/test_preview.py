@@ -41,7 +41,7 @@ def test_a_sheet_per_training_view(scene, tmp_path, capsys):
     sheet = cv2.imread(str(sheets[0]))
     assert sheet.shape[1] > 1500 and sheet.std() > 20
     assert main(show(scene, "--out", tmp_path / "b", *flags)) == 0
-    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps were there already" in capsys.readouterr().out
+    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps were read from the cache" in capsys.readouterr().out
     for path in sheets:
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b" / path.name)), cv2.imread(str(path)))
 

@@ -109,7 +109,7 @@ def test_weights_of_ones_own(tmp_path):
         build(ExportRequest("fcn-resnet18"))
     path = tmp_path / "w.safetensors"
     path.write_bytes(save({"x": torch.zeros(1)}))
-    with pytest.raises(DataError, match="no weights of fcn-resnet18"):
+    with pytest.raises(DataError, match="not weights of fcn-resnet18"):
         build(ExportRequest("fcn-resnet18", weights=str(path)))
     with pytest.raises(DataError, match="the weights cannot be loaded"):
         build(ExportRequest("dpt", weights=str(tmp_path)))

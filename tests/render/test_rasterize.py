@@ -208,7 +208,7 @@ def test_arguments_of_another_type_or_shape_are_named():
         ),
         (
             ValueError,
-            "camera.K holds numbers that are not finite",
+            "camera.K has non-finite values",
             (gaussians, dataclasses.replace(cam, K=cam.K * torch.tensor([[torch.nan, 1, 1], [1, 1, 1], [1, 1, 1]]))),
         ),
         (
@@ -278,7 +278,7 @@ def test_a_pose_that_scales_or_shears_is_refused():
     for wrong, words in (
         (scaled, r"camera.viewmat\S* scales or shears: R R\^T is off by 0.02"), (sheared, "off by 0.01"),
         (moved, "last row 0, 0, 0, 1"),
-        (unknown, r"camera.viewmat\S* holds numbers that are not finite"), (huge, "R R.* off by inf"),
+        (unknown, r"camera.viewmat\S* has non-finite values"), (huge, "R R.* off by inf"),
     ):  # fmt: skip
         for viewmat in (wrong, torch.from_numpy(wrong), np.stack([rotation, wrong])):
             with pytest.raises(ValueError, match=words):

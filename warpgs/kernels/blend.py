@@ -271,7 +271,7 @@ def check_slots(tiles: Tiles) -> None:
         ValueError: The instances have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
-        raise ValueError("tiles have no slots, which gradients and contributions need: make them by bin_tiles(slotted=True)")
+        raise ValueError("gradients and contributions need tiles with slots: make the tiles by bin_tiles(slotted=True)")
 
 
 def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:

@@ -138,10 +138,9 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
         return
     limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances"
     raise ResourceError(
-        f"binning {visible:,} visible Gaussians into tiles makes {total:,} (Gaussian, tile) instances, "
-        f"{total / max(visible, 1):.0f} of {tiles} tiles each on average, which needs {needed / 2**30:.2f} GiB; the limit is "
-        f"{limit}. Many Gaussians are probably far too large: check their scales, or render smaller images, fewer cameras "
-        "at once, or raise the memory budget."
+        f"{visible:,} visible Gaussians touch {total / max(visible, 1):.0f} of {tiles} tiles on average; their {total:,} "
+        f"(Gaussian, tile) instances need {needed / 2**30:.2f} GiB, and the limit is {limit}. Many Gaussians are probably far "
+        "too large: check their scales, or render smaller images, fewer cameras at once, or raise the memory budget."
     )
 
 

@@ -46,8 +46,8 @@ def consistent_depth(
 ) -> ViewDepth:
     """Return the depth of one view where it is geometrically consistent with that of at least one other view.
 
-    A point is projected to each other view and back by the depth found there. It must return nearer than ``max_round_trip``
-    to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
+    A point is projected to each other view and back by the depth found there. It must return to within ``max_round_trip``
+    of its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
 
     Args:
         views: Views by index.
@@ -72,7 +72,7 @@ def consistent_depth(
 def _backend(
     views: Mapping[int, View], planes: Mapping[int, np.ndarray], config: SweepConfig, device: torch.device
 ) -> tuple[Callable[[View, Sequence[View], np.ndarray], np.ndarray], list[str]]:
-    """Return the function that sweeps a view on the device, or on the CPU where that must do it, and messages on that."""
+    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on that."""
     notes: list[str] = []
     if device.type == "cuda":
         needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())
@@ -109,21 +109,21 @@ def sweep_depths(
     views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> list[ViewDepth]:  # fmt: skip
-    """Return the depth of every view by sweeping planes against those that share most of its sight.
+    """Return the depth of every view by sweeping planes against views that see the same surfaces.
 
     At most ``config.max_views`` views are swept, so that the time is bounded. They are compared with their
-    best neighbours among all views, and checked by round trips to one another.
+    nearest neighbours among all views, and checked by round trips to one another.
 
     Args:
         views: The views; a single one has no consistent depth.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
         device: Device of costs and paths; the CPU computes them where a GPU has too little memory, or images are tiny.
-        progress: Called after each view with the number of views swept so far, and of all that will be.
+        progress: Called after each view with the number of views swept so far, and their total.
 
     Returns:
-        One depth per view at its own size; its notes name a reduced size and views without a consistent depth. A view that was
-        not swept has no valid depth; a note names it.
+        One depth per view at its own size; its notes report a reduced size and views without a consistent depth. A view that
+        was not swept has a note, and no valid depth.
     """
     cameras = [v.camera for v in views]
     sight = shared_sight(cameras, bounds)
@@ -145,7 +145,7 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [_unswept(v, f"not swept: {len(swept)} of the {len(views)} views together see most of the scene") for v in views]
+        out = [_unswept(v, f"not swept: {len(swept)} of the {len(views)} views see most of the scene") for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

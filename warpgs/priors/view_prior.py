@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MIN_CONSISTENT = 50
 """Smallest number of pixels with a geometrically consistent depth; below it a view's depth counts as unknown."""
 MAX_OBJECT_FRACTION = 0.9
-"""Largest fraction of the image that an object's region covers; a larger region is what a mask leaves."""
+"""Largest fraction of the image that an object's region covers; a larger region only shows that a mask cuts something off."""
 FLAGS = ("size", "multiple", "mean", "std")
 OUTPUTS = ("auto", "disparity", "depth")
 
@@ -76,16 +76,14 @@ class PriorConfig:
                 if value is not None and value != 0:
                     check_value(key, value, f"--{kind}-{key}")
                     if getattr(self, f"{kind}_model") is None:
-                        raise UsageError(
-                            f"--{kind}-{key} describes a network; name it by --{kind}-model, or leave the flag out"
-                        )
+                        raise UsageError(f"--{kind}-{key} requires --{kind}-model; add it, or leave --{kind}-{key} out")
         if self.depth_guides and self.depth_model is None:
-            raise UsageError("--depth-guides uses a network; name it by --depth-model, or give maps by --depths")
+            raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
         if self.depth_output != "auto" and self.depth_model is None:
-            raise UsageError("--depth-output describes a network; name it by --depth-model, or leave the flag out")
+            raise UsageError("--depth-output requires --depth-model; add it, or leave --depth-output out")
 
     def flags(self, kind: str) -> dict:
-        """Return the flags that describe the input of a network, ``kind`` depth or segmentation, by the rest of their names."""
+        """Return the flags of the input of a network, ``kind`` depth or segmentation, keyed by the rest of their names."""
         return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
 
 
@@ -174,7 +172,7 @@ def _stands_out(region: np.ndarray | None) -> bool:
 
 
 def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], regions, classical: bool, notes: list[str]):
-    """Replace a foreground that is not known by the region of the view; by zeros where it has no region either."""
+    """Replace an unknown foreground by the region of the view, or by zeros if the view has no region."""
     replaced, empty, result = [], [], []
     for (maps, source), view, region in zip(found, views, regions):
         if _stands_out(region) and (classical or not knows_foreground(maps)):
@@ -254,6 +252,6 @@ def view_priors(
     if store is not None:
         notes += store.notes
         if store.found:
-            words = f"priors: {store.found} of {store.found + store.made} maps were there already, in {store.folder}"
+            words = f"priors: {store.found} of {store.found + store.made} maps were read from the cache {store.folder}"
             notes.append(Detail(words))
     return priors, notes

@@ -17,7 +17,7 @@ from warpgs.scene import Camera, Gaussians
 FASTEST_FIRST = ("fast", "balanced", "exact")
 """Rules to choose from; each skips all that the next one skips, and more."""
 DEFAULTS = RasterizeOptions()
-"""Options where none are given."""
+"""Default options."""
 MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"mean": torch.mean, "max": torch.amax}
 """Reductions over the pixels of a view, by name."""
 
@@ -66,6 +66,6 @@ def select_rule(
         else:
             return rule, error
     raise UsageError(
-        f"no rule keeps a {measure} error of {max_error:g}: float32 alone errs by {error:.1e} under rule exact; allow more, "
-        "or render float64 tensors"
+        f"no rule keeps a {measure} error of {max_error:g}: float32 alone errs by {error:.1e} under rule exact; raise "
+        "max_error, or render float64 tensors"
     )

@@ -72,6 +72,6 @@ def check_camera(camera: Camera) -> type[CameraModel]:
         )
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError(
-            "coefficients of a lens have no gradient, and Camera.distortion requires one: detach it; pose and K have theirs"
+            "distortion coefficients have no gradient: detach Camera.distortion; gradients of the pose and of K are supported"
         )
     return model
