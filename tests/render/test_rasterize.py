@@ -177,7 +177,7 @@ def test_arguments_of_another_type_or_shape_are_named():
         (TypeError, "camera.K must hold real numbers, not complex128", (gaussians, dataclasses.replace(cam, K=1j * np.eye(3)))),
         (
             ValueError,
-            "camera.viewmat holds .* not finite",
+            "camera.viewmat has non-finite values",
             (gaussians, dataclasses.replace(cam, viewmat=np.full((4, 4), np.nan))),
         ),
         (UsageError, "unknown camera model None", (gaussians, dataclasses.replace(cam, model=None))),

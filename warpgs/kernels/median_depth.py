@@ -123,9 +123,9 @@ def median_depth(
 ) -> torch.Tensor:
     """Return the depth of the Gaussian at which a pixel's transmittance falls to one half or below. Not differentiable.
 
-    That is the median of depth under the blending weights, where they leave no more than half of the background. At an edge it
-    does not mix both surfaces, unlike the mean depth of `blend`. Where alpha, the result of `blend`, stays below 1/2, there is
-    none. Repeats bit for bit with any number of threads.
+    This is the median of depth under the weights of blending and of the background. At an edge it does not mix both surfaces,
+    unlike the mean depth of `blend`. There is none where alpha, the result of `blend`, is below 1/2. Results repeat bit for bit
+    with any number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

@@ -157,7 +157,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
             return made
         return replace(made, why_not=f"its depths are {ratio:.4g} times those that the views confirm")
     if count < MIN_OVERLAP:
-        why_not = f"{count} of its pixels have a known depth, and the fit needs {MIN_OVERLAP}"
+        why_not = f"{count} depths are known at its pixels, and the fit needs at least {MIN_OVERLAP}"
         return Alignment(references=count, why_not=why_not)
     scale, shift = fit_line(values, 1 / wanted if kind == "disparity" else wanted)
     fitted = scale * values + shift

@@ -1,5 +1,5 @@
 // Declarations that the blending bodies share. Upper-case names are replaced by numbers before compilation (blend_cuda.py).
-// A tile is cut into blocks of 8 x 4 pixels, one pixel a lane. Products and sums that decide alpha are spelled with their
+// A tile is cut into blocks of 8 x 4 pixels, one pixel a lane. Products and sums that decide alpha have explicit
 // rounding: the compiler's choice of fused operations may differ between kernels, and both passes must see one alpha.
 constexpr unsigned ALL = 0xffffffffu;
 constexpr int WIDE = SIDE / 8, BLOCKS = WIDE * (SIDE / 4), PIXELS = SIDE * SIDE;

@@ -1,4 +1,4 @@
-// Tiles by rank, so that those with long lists can start first and none of them when the others are done. The rank is 0 for the
+// Tiles by rank, so that tiles with long lists start first, and none of them when the others are done. The rank is 0 for the
 // longest lists, 32 for empty ones: leading zeros of the length. A thread takes one tile. The order among equals differs from run
 // to run; no result depends on it.
 __shared__ int s_places[RANKS];  // tiles of the block by rank, then the place of the first of them among all of that rank
