@@ -60,7 +60,10 @@ def degrees_off(poses: torch.Tensor, true_poses: torch.Tensor) -> float:
 
 
 def scale_loss(log_scales: torch.Tensor) -> torch.Tensor:
-    """Return the mean excess of the axis ratio (longest to shortest) over `MAX_RATIO`, shape [] (PhysGaussian, Xie et al. 2024)."""
+    """Return the mean excess of the axis ratio, longest to shortest, over `MAX_RATIO`, shape [].
+
+    After PhysGaussian (Xie et al. 2024).
+    """
     ratios = (log_scales.amax(1) - log_scales.amin(1)).exp()
     return (ratios.clamp_min(MAX_RATIO) - MAX_RATIO).mean()
 

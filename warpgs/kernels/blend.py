@@ -305,7 +305,7 @@ def blend(
     """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; ``rule`` sets order and early stop).
 
     Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
-    Derivation of the backward pass: docs/blend.md. It repeats bit for bit, on a CPU with any number of threads, and on CUDA.
+    Derivation of the backward pass: docs/blend.md. Results repeat bit for bit, on CUDA and on any number of CPU threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

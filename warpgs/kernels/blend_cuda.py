@@ -38,7 +38,7 @@ RANKS = 33
 ORDER_THREADS = 256
 """Threads of a block of the kernel that puts tiles in order."""
 STRIDE = 12
-"""Floats from one instance's sums to the next with three channels: as many as a projected Gaussian has, so that rows are
+"""Stride of the sums of an instance, in floats, with three channels: the size of a projected Gaussian, so that rows are
 16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
 and two of magnitudes.
 Each further channel has one more."""

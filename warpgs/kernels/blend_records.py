@@ -13,7 +13,7 @@ COLORS = 3
 VALUES = 10
 """Gradient values of an instance with a colour: those of a projected Gaussian but for its last two, which are the box."""
 WIDTHS = (COLORS, 7, 11)
-"""Numbers of channels that kernels are compiled for: with nine other values a projected Gaussian fills whole 16-byte loads."""
+"""Numbers of channels for which kernels are compiled: with nine other values a projected Gaussian fills whole 16-byte loads."""
 
 
 @functools.cache

@@ -170,7 +170,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         turned = wp.bool(True)
         sized = wp.bool(True)
         if wp.static(parameters == "covariances"):
-            e.axes = rotation * factor(q, log_scale)  # NaN where there is none, which is culled below
+            e.axes = rotation * factor(q, log_scale)  # NaN without a factor; culled below
         else:
             e.quat_length = r.quat_length(q)
             turned = e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)

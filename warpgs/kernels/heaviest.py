@@ -1,7 +1,7 @@
 """The k heaviest Gaussians of each pixel with their blending weights, and the number of Gaussians that were blended.
 
-A separate pass, so that `blend` does not become slower. It decides alpha by the same operations as blending does. The list of a
-pixel is kept sorted in the result itself; a Gaussian that is heavier than the last one is inserted.
+This is a separate pass, so that `blend` does not become slower. It computes alpha by the same operations as `blend`. The list
+of a pixel is kept sorted in the result itself; a Gaussian that is heavier than the last one is inserted.
 """
 
 import functools

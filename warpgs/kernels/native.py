@@ -51,7 +51,7 @@ def make_functions():
 
     @wp.func_native(source("native_holder.cu"))
     def holder(running_sum: int, item: int) -> int:
-        """Return the first lane of the warp whose running sum exceeds ``item``; the last lane where none does."""
+        """Return the first lane of the warp whose running sum exceeds ``item``, or the last lane."""
         ...
 
     return SimpleNamespace(

@@ -10,8 +10,8 @@ from warpgs.runtime import interop
 SMALLEST = 1e-12
 """Smallest size [u]: that of a Gaussian at a camera, or in no camera's image."""
 COLUMNS = 9
-"""Numbers of a camera: centre [u] (3), axis of view in the world (3), focal length [px], cosine of the angle between the axis
-and the border of the image, and 1 if the size of a pixel grows with distance (fisheye), 0 if with depth."""
+"""Number of values of a camera: centre [u] (3), axis of view in the world (3), focal length [px], cosine of the angle between
+the axis and the border of the image, and 1 if the size of a pixel grows with distance (fisheye), 0 if with depth."""
 
 
 @functools.cache

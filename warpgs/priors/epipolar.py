@@ -177,7 +177,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
         Depths [u], shape [N], 0 where no candidate is valid; and sensitivities [u/px], shape [N], infinite there.
 
     Raises:
-        UsageError: There is no such mode.
+        UsageError: The mode is unknown.
     """
     if mode not in BLENDS:
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")

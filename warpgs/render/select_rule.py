@@ -43,7 +43,7 @@ def select_rule(
         The name of the rule, and its measured error: the largest of the views.
 
     Raises:
-        UsageError: No rule keeps the limit, there is no view or no list of them, the limit is not a positive number, or the
+        UsageError: No rule keeps the limit, ``cameras`` is empty or not a list, the limit is not a positive number, or the
             measure is unknown.
     """
     if not (isinstance(max_error, Real) and 0 < max_error < math.inf):

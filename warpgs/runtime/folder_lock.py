@@ -153,7 +153,7 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
 
     Raises:
         FolderHeldError: Another process holds it.
-        ResourceError: It cannot be locked.
+        ResourceError: The file cannot be locked.
     """
     try:
         if lock_descriptor(file.fileno(), blocking=False):

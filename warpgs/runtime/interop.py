@@ -63,7 +63,7 @@ def real_of(tensor: torch.Tensor) -> type:
     """Return the Warp scalar type of a tensor, float32 or float64.
 
     Raises:
-        TypeError: The tensor is of another type.
+        TypeError: The tensor has another type.
     """
     if tensor.dtype not in REALS:
         raise TypeError(f"kernels take float32 or float64 tensors, not {tensor.dtype}")
