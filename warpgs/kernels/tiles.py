@@ -76,8 +76,8 @@ class InstanceMemory:
     budget: int | None = None
     """Bytes; None for four fifths of the free memory."""
     capacity: int | None = None
-    """Number of instances to allocate for, without asking the device how many there are, so that the work can be captured as a
-    CUDA graph; None for as many as there are. Unused entries have a number that no tile has."""
+    """Number of instances to allocate for. The actual number is then not read from the device, so the work can be captured as a
+    CUDA graph. None for the actual number. Unused entries have a number that no tile has."""
     overflow: torch.Tensor | None = None
     """Set to 1 where there are more instances than the capacity: the lists are then cut short and must not be used. Int32,
     shape [1]; needed with a capacity."""

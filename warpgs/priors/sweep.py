@@ -1,8 +1,8 @@
 """Depth by sweeping planes: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
 
-Poses are known, so a match is sought along the epipolar line only: one plane per inverse depth (Collins 1996), zero-mean
-normalised correlation over a window, semi-global aggregation (Hirschmüller 2008), a parabola between planes, and depths kept
-where another view's own sweep agrees. Compared with optical flow in docs/decisions/007-coarse-start.md.
+Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996). The method
+is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a parabola between planes.
+Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares it with optical flow.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ SAMPLES = 4
 DEPTHS = 3
 """Depths at each of them."""
 LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
-"""Angles between two rays to a point [deg]: below the first depth is uncertain, from the second on a surface looks different
-to both views, and at the third they are taken to share nothing."""
+"""Angles between two rays to a point [deg]. Below the first, depth is uncertain. Above the second, a surface looks different to
+both views. From the third on, the views are assumed to share nothing."""
 
 
 class Sight(NamedTuple):

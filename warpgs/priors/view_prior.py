@@ -219,7 +219,7 @@ def view_priors(
         views: The training views.
         config: Networks and their inputs.
         depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
-            only where no depth network is named.
+            only if no depth network is given.
         regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.

@@ -357,8 +357,8 @@ def call_key(
 def _can_capture(device: torch.device) -> bool:
     """Return whether calls can be captured now, on this device.
 
-    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors:
-    checkpointing, which has such hooks, needs the same number of saved tensors each time. Nor are they captured where torch
+    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors.
+    Checkpointing has such hooks, and needs the same number of saved tensors each time. Nor are they captured where torch
     allocates each tensor from the driver, or Warp checks for errors after each kernel.
     """
     if _UNCACHED or wp.config.verify_cuda:

@@ -236,9 +236,9 @@ def rasterize(
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other, a
             transform of torch.func is active, or a second derivative is requested.
-        ValueError: A shape or device is wrong (the message names argument, expected and found); an array of ``camera``, unless
-            it is on a GPU, holds a non-finite number, ``K`` has a skew, ``viewmat`` scales or shears, or either has a wrong
-            last row; the near or far plane is out of range; a pixel is outside the image; or lists differ in length.
+        ValueError: A shape or device is wrong (the message names argument, expected and found); the near or far plane is out
+            of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
+            has a non-finite number, ``K`` has a skew, ``viewmat`` scales or shears, or either has a wrong last row.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")

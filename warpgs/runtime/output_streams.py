@@ -151,8 +151,8 @@ def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
     """Replace stdout and stderr by streams whose writes do not raise.
 
     Args:
-        is_product: True if stdout is the command's only result. Then a failure to write fails the command, except
-            if the reader of a pipe has closed it; otherwise the command continues with one line on stderr.
+        is_product: True if stdout is the command's only result. Then a failure to write fails the command,
+            unless the reader of a pipe has closed it. Otherwise the command continues with one line on stderr.
     """
     open_missing_descriptors()
     before = sys.stdout, sys.stderr
