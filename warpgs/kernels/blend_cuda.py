@@ -22,8 +22,8 @@ from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128, 256)
 """Instances for one warp of the backward pass. Small images use the first number, to have enough warps. Larger images use
-the next ones, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each multiple
-of this number, so that several warps can share a long list. Multiples of 32."""
+the next ones, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each
+multiple of this number, so that several warps can share a long list. Multiples of 32."""
 MAX_TILES = (4096, 16384)
 """Numbers of tiles up to which the first and the second of `CHUNKS` are taken (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
