@@ -267,7 +267,7 @@ def _unknown(view: View) -> ViewDepth:
 def _remedy(views: Sequence[View], made: Sequence[Alignment | None]) -> str:
     """Return what a user can do where no map can be used."""
     if any(v.depth is not None and v.depth.kind == "metric" for v in views):
-        return "Set --depth-unit to the length of the maps' unit, or use --depth-kind relative if the unit is unknown"
+        return "Set --depth-unit to the length of the maps' unit, or use --depth-kind relative if the cameras have another unit"
     return "Check --depth-kind, start from a sweep (--init.source sweep), or leave out --depths"
 
 

@@ -60,7 +60,7 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
     own = list(tensor.shape[1:])
     if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
         raise ValueError(
-            f"camera.{name} must have shape {own} or {[cameras, *own]} for the {cameras} poses, not {list(array.shape)}"
+            f"camera.{name} must have shape {own} or {[cameras, *own]} to match camera.viewmat, not {list(array.shape)}"
         )
     return tensor if tensor.shape[0] == cameras else tensor.expand(cameras, *own).contiguous()
 
