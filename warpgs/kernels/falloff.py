@@ -83,7 +83,8 @@ def make_functions(real):
     def apart(product: real) -> real:
         """Return the product, rounded, so that the compiler cannot fuse it with a sum.
 
-        A product that the compiler moves out of a loop is rounded in any case. Otherwise two passes could see different alphas.
+        A product that the compiler moves out of a loop is rounded in any case. If others were fused, two passes could see
+        different alphas.
         """
         return wp.where(real(1.0e30) < product, real(1.0e30), product)
 

@@ -18,7 +18,7 @@ NO_SURFACE = (
 )
 """Message for a grid without a surface."""
 MIN_PART = 0.002
-"""Smallest fraction of all triangles in a connected part that is kept; smaller parts float in front of surfaces."""
+"""Smallest fraction of all triangles that a connected part needs to be kept; smaller parts float in front of surfaces."""
 
 
 def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:

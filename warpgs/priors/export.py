@@ -44,8 +44,8 @@ class ExportRequest:
     random_weights: bool = False
     """Use a small untrained network, to test the export only."""
     size: int = 384
-    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map is stretched back. xfeat accepts
-    any size."""
+    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map is stretched back. Not used
+    for xfeat, which accepts sides of 96 to 4096 px."""
 
     def __post_init__(self):
         if self.model not in MODELS:

@@ -31,7 +31,7 @@ class Preprocessing:
     mean: tuple[float, float, float]
     """Colour subtracted from colours in [0, 1], red first."""
     std: tuple[float, float, float]
-    """Divisor of the difference, red first."""
+    """Divisor of colours less ``mean``, red first."""
     output: str
     """Meaning of the output: disparity, depth or classes."""
 

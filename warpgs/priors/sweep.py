@@ -145,7 +145,7 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [_unswept(v, f"not swept: {len(swept)} of the {len(views)} views see most of the scene") for v in views]
+        out = [_unswept(v, f"not swept: {len(swept)} of the {len(views)} views together see most of the scene") for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

@@ -35,32 +35,33 @@ Colors = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Networks for priors, and their inputs; classical methods without networks."""
+    """Networks for priors, and their inputs; without networks, classical methods are used."""
 
     depth_model: str | None = None
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
     depth_output: str = "auto"
     """Output of the depth network: disparity (inverse depth), depth, or auto: as in FILE.onnx.json, else disparity."""
     depth_guides: bool = False
-    """Use the depth network's map like a map of --depths, to place Gaussians and guide the fit, in views without one."""
+    """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
     depth_size: int = 0
-    """Shorter side of its input [px], if the network leaves it free; 0 for the value of FILE.onnx.json, else 384."""
+    """Shorter side of the depth network's input [px], unless fixed; 0 for the value of FILE.onnx.json, else 384."""
     depth_multiple: int = 0
-    """Divisor of both sides of its input [px]; 0 for the value of FILE.onnx.json, else 32. Depth Anything needs 14."""
+    """Divisor of both sides of the depth network's input [px]; 0 for the value of FILE.onnx.json, else 32.
+    Depth Anything needs 14."""
     depth_mean: Colors | None = None
     """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     depth_std: Colors | None = None
-    """Divisor of the difference. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
+    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
     segmentation_size: int = 0
-    """Shorter side of its input [px], if the network leaves it free; 0 for the value of FILE.onnx.json, else 512."""
+    """Shorter side of the segmentation network's input [px], unless fixed; 0 for the value of FILE.onnx.json, else 512."""
     segmentation_multiple: int = 0
-    """Divisor of both sides of its input [px]; 0 for the value of FILE.onnx.json, else 32."""
+    """Divisor of both sides of the segmentation network's input [px]; 0 for the value of FILE.onnx.json, else 32."""
     segmentation_mean: Colors | None = None
     """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else ImageNet's 0.485 0.456 0.406."""
     segmentation_std: Colors | None = None
-    """Divisor of the difference. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
+    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
     onnx_provider: str = "cpu"
     """Device of the networks: cpu or cuda."""
     cache: bool = True
