@@ -23,7 +23,7 @@ def rings(size: int) -> torch.Tensor:
 
 
 def random_gaussians(count: int, generator: torch.Generator) -> warpgs.Gaussians:
-    """Return grey Gaussians on a plane one unit before the camera; they require gradients."""
+    """Return grey Gaussians on a plane one unit in front of the camera; they require gradients."""
     xy = torch.rand(count, 2, generator=generator) - 0.5
     tensors = {
         "means": torch.cat([xy, torch.ones(count, 1)], 1),
@@ -41,9 +41,9 @@ def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in PSNR [dB]."""
+    """Run the example; return the gain in PSNR [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--image", type=Path, help="image to fit; coloured rings where not given")
+    parser.add_argument("--image", type=Path, help="image to fit; default: coloured rings")
     parser.add_argument("--out", type=Path, default=Path("fitted.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps")
     parser.add_argument("--count", type=int, default=1000, help="number of Gaussians")

@@ -1,4 +1,4 @@
-"""Load a scene, fit it, look at it from new places, and keep the model.
+"""Load a scene, fit it, render it from new viewpoints, and save the model.
 
     python examples/02_fit_scene.py path/to/scene --out result
 
@@ -14,9 +14,9 @@ import warpgs
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in held-out PSNR over the mean training image [dB]."""
+    """Run the example; return the gain in held-out PSNR over the mean training image [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; a synthetic one where not given")
+    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
     parser.add_argument("--out", type=Path, default=Path("result"), help="folder to write")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps")
     parser.add_argument("--frames", type=int, default=24, help="frames of the film")
@@ -35,7 +35,7 @@ def main(arguments: list[str] | None = None) -> float:
     result = warpgs.fit(scene, config, split=split, on_step=lambda report: None)
 
     files = warpgs.render_path(result, "turntable", out=a.out / "turntable", frames=a.frames)
-    # a fit works in scene units; files for other programs are in those of the scene's own files
+    # a fit works in scene units; files for other programs have the units of the scene's files
     warpgs.write_ply(a.out / "scene.ply", result.gaussians("file"), units="file")
     warpgs.save(a.out / "model.safetensors", result.gaussians(), result.normalization, units="scene")
     again = warpgs.load(a.out / "model.safetensors").gaussians("file")

@@ -2,8 +2,8 @@
 
     python examples/03_camera_pose.py --out pose.png
 
-A cloud of Gaussians is rendered from a known place; then the camera is moved and finds its way back. Prints the error of the
-pose before and after; writes the image, the render from the wrong pose and that from the pose found, side by side.
+A cloud of Gaussians is rendered from a known pose. The camera is moved, and its pose is then optimised. Prints the error of the
+pose before and after; writes the image and the renders from the first and the final pose side by side.
 """
 
 import argparse
@@ -18,7 +18,7 @@ SIZE = 96
 
 
 def cloud(count: int, generator: torch.Generator) -> warpgs.Gaussians:
-    """Return coloured Gaussians in a deep box before the camera: near and far ones tell a turn from a shift."""
+    """Return coloured Gaussians in a deep box in front of the camera: their parallax separates rotation from translation."""
     return warpgs.Gaussians(
         means=torch.tensor([4.0, 4.0, 5.0]) * torch.rand(count, 3, generator=generator) + torch.tensor([-2.0, -2.0, 1.5]),
         quats=torch.randn(count, 4, generator=generator),
@@ -45,7 +45,7 @@ def pose_error(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the final distance as a fraction of the first."""
+    """Run the example; return the final distance as a fraction of the first."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=200, help="optimisation steps")

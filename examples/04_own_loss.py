@@ -3,8 +3,8 @@
     python examples/04_own_loss.py path/to/scene --out smooth.png
     warpgs fit path/to/scene --out run --loss-terms examples/04_own_loss.py:DepthSmoothness --depth-smoothness.weight 0.5
 
-The class below is the whole term; the second command takes it from this file, its setting as a flag. Here a scene is fitted
-with and without it. Prints roughness and held-out PSNR of both; writes the depth maps of a view side by side.
+The class below is the whole term. The second command loads it from this file, with its setting as a flag. The first command
+fits a scene with and without the term, prints roughness and held-out PSNR of both fits, and writes the depth maps of a view.
 """
 
 import argparse
@@ -55,9 +55,9 @@ class DepthSmoothness(warpgs.LossTerm):
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the roughness with the term as a fraction of that without."""
+    """Run the example; return the roughness with the term as a fraction of the roughness without."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; a synthetic one where not given")
+    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
     parser.add_argument("--out", type=Path, default=Path("smooth.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps of each fit")
     parser.add_argument("--weight", type=float, default=0.5, help="weight of the term")

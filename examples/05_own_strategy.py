@@ -3,8 +3,9 @@
     python examples/05_own_strategy.py path/to/scene --out sprout.png
     warpgs fit path/to/scene --out run --strategy examples/05_own_strategy.py:Sprout --sprout.growth 0.2
 
-The class below is the whole strategy; the second command takes it from this file, its settings as flags. Here a scene is fitted
-with it and without any growth. Prints sizes and PSNR of both; writes the image and the two renders side by side.
+The class below is the whole strategy. The second command loads it from this file, with its settings as flags. The first command
+fits a scene with the strategy and without growth. It prints the numbers of Gaussians and the PSNR of both fits, and writes the
+image and the two renders side by side.
 """
 
 import argparse
@@ -29,21 +30,21 @@ class SproutConfig:
     """Settings of the strategy."""
 
     every: int = 10
-    """Steps between two changes of the set."""
+    """Steps between two changes of the set of Gaussians."""
     growth: float = 0.1
-    """Gaussians added at a time, as a fraction of those there are."""
+    """Gaussians added at a time, as a fraction of their current number."""
     min_opacity: float = 0.02
     """Gaussians below this opacity are removed."""
 
 
 @register("sprout")
 class Sprout(warpgs.Strategy):
-    """Adds Gaussians beside those whose projected means have the largest gradients; removes the transparent."""
+    """Adds Gaussians beside those whose projected means have the largest gradients; removes transparent ones."""
 
     Config = SproutConfig
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the one number that is kept of each Gaussian: its gradients, summed since the last change."""
+        """Return the one value that is kept for each Gaussian: the sum of its gradient norms since the last change."""
         return {"pull": Column(0.0, inherited=False)}
 
     def statistics(
@@ -51,23 +52,23 @@ class Sprout(warpgs.Strategy):
     ) -> Mapping[str, torch.Tensor]:
         """Return the gradient norms of the projected means, ``v_projected`` [1, N, 12], which are added to their sums.
 
-        This is part of a step, which on CUDA is recorded as a graph: it works on tensors alone.
+        On CUDA the whole step is captured as a graph, so this method may only use tensors.
         """
         norms = v_projected[0, :, :2].norm(dim=1)
         return {"pull": torch.where(visible[0], norms, 0)}
 
     def due(self, step: int) -> bool:
-        """Return whether the set changes after a step; the last fifth of the fit is left alone."""
+        """Return whether the set changes after a step; never in the last fifth of the fit."""
         return step % self.config.every == 0 and step <= 0.8 * self.context.steps
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Add and remove."""
+        """Add and remove Gaussians."""
         t = self.context
         g, pull = t.gaussians, t.table.columns["pull"]
         count = max(0, min(int(self.config.growth * len(g)), t.capacity - len(g)))
         parents = pull.topk(count).indices
         added = {name: tensor[parents] for name, tensor in g.tensors().items()}
-        noise = torch.randn(count, 3, generator=t.generator).to(t.device)  # from the fit's generator: the seed decides
+        noise = torch.randn(count, 3, generator=t.generator).to(t.device)  # repeatable: the fit's generator
         added["means"] = added["means"] + 0.5 * noise * added["log_scales"].exp()
         opacities = g.logit_opacities.sigmoid()
         keep = torch.nonzero(opacities >= min(self.config.min_opacity, float(opacities.max()))).squeeze(1)
@@ -76,9 +77,9 @@ class Sprout(warpgs.Strategy):
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in training PSNR over a fit that never grows [dB]."""
+    """Run the example; return the gain in training PSNR over a fit that never grows [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; a synthetic one where not given")
+    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
     parser.add_argument("--out", type=Path, default=Path("sprout.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps of each fit")
     parser.add_argument("--start", type=int, default=400, help="Gaussians at the start")

@@ -48,7 +48,7 @@ class ShotsReader(Reader):
     description = "shots.csv with images beside it"
 
     def probe(self, folder: Path) -> Probe | None:
-        """Return the file that makes the format; None where it is not there."""
+        """Return the file that identifies the format; None if it is missing."""
         return Probe("shots.csv") if (folder / "shots.csv").is_file() else None
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
@@ -71,7 +71,7 @@ def parse(row: list[str], where: str) -> tuple[str, np.ndarray, np.ndarray, floa
     """Return name, position [3], target [3] and focal length [px] of a row.
 
     Raises:
-        DataError: The row does not hold a name and seven finite numbers, or the camera looks nowhere.
+        DataError: The row does not hold a name and seven finite numbers, or the camera has no direction, or a vertical one.
     """
     try:
         name, *numbers = (word.strip() for word in row)
@@ -79,7 +79,7 @@ def parse(row: list[str], where: str) -> tuple[str, np.ndarray, np.ndarray, floa
     except ValueError as e:
         raise DataError(f"{where}: cannot be understood ({e}); write a name and seven numbers") from e
     if len(values) != 7 or not np.isfinite(values).all():
-        raise DataError(f"{where}: needs a name and seven finite numbers, has {len(values)}; write the line again")
+        raise DataError(f"{where}: found {len(values)} numbers; write a name and seven finite numbers")
     position, target = values[:3], values[3:6]
     direction = target - position
     if not np.linalg.norm(np.cross(direction, UP)) > 1e-9:
@@ -98,7 +98,7 @@ def write_shots(folder: Path, count: int = 8, width: int = 64, height: int = 48)
     shapes, light, focal = still_life(), raycast.Light(), 0.95 * width
     lines = []
     for i, camera in enumerate(camera_path(count, width, height)):
-        # numbers as the file has them, so that image and pose agree to the last digit
+        # rounded as in the file, so that image and pose agree exactly
         position = camera.center.round(6)
         target = (position + 5 * camera.viewmat[2, :3]).round(6)
         viewmat = look_at(position, target, UP)
@@ -112,14 +112,14 @@ def check(scene: Scene) -> float:
     """Render every view again from the pose that was read.
 
     Returns:
-        The smallest PSNR [dB] between image and rendering: about 59 dB, the rounding to 8 bits, where position, direction,
-        focal length and axes all are right.
+        The smallest PSNR [dB] between image and rendering: about 59 dB, from rounding to 8 bits, if position, direction,
+        focal length and axes are right.
     """
     shapes, light, worst = still_life(), raycast.Light(), math.inf
     n = scene.normalization
     for view in scene.views:
         viewmat = np.array(view.camera.viewmat)
-        # back from scene units to those of the file
+        # back from scene units to file units
         viewmat[:3, 3] = viewmat[:3, 3] / n.scale - viewmat[:3, :3] @ n.offset
         rgb = raycast.render(shapes, light, np.asarray(view.camera.K), viewmat, view.camera.width, view.camera.height)
         worst = min(worst, -10 * math.log10(float(np.mean((rgb - view.image) ** 2))))
@@ -133,7 +133,7 @@ def main(arguments: list[str] | None = None) -> float:
         SystemExit: The poses that were read do not fit the images.
     """
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, help="folder to keep the scene in; without it a temporary one is used")
+    parser.add_argument("--out", type=Path, help="folder to keep the scene in; default: a temporary folder")
     out = parser.parse_args(arguments).out
     with tempfile.TemporaryDirectory() as temporary:
         folder = out or Path(temporary)

@@ -2,8 +2,8 @@
 
     python examples/07_rasterizer_in_another_trainer.py path/to/scene --out render.png
 
-Starts from the scene's points, or from random ones where it has none. Prints the PSNR of a held-out view before and after;
-writes its image beside the render, and the Gaussians as render.ply in the units of the scene's files.
+Starts from the scene's points, or from random points if there are none. Prints the PSNR of a held-out view before and after;
+writes the view's image beside the render, and the Gaussians as render.ply in the units of the scene's files.
 """
 
 import argparse
@@ -41,9 +41,9 @@ def initial_gaussians(scene: warpgs.Scene, count: int, device: torch.device) -> 
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in PSNR on a held-out view [dB]."""
+    """Run the example; return the gain in PSNR on a held-out view [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; a synthetic one where not given")
+    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
     parser.add_argument("--out", type=Path, default=Path("render.png"), help="PNG to write; a PLY file comes beside it")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps")
     parser.add_argument("--count", type=int, default=2000, help="largest number of Gaussians")
@@ -77,7 +77,7 @@ def main(arguments: list[str] | None = None) -> float:
     with torch.no_grad():
         result = warpgs.rasterize(gaussians, held_out.camera).rgb.clamp(0, 1).cpu().numpy()
     Image.fromarray((np.concatenate([held_out.image, result], 1) * 255).round().astype(np.uint8)).save(a.out)
-    # the loop works in scene units, as the cameras are; the normalization leads back to those of the scene's files
+    # the loop and the cameras use scene units; the normalization converts to the units of the scene's files
     warpgs.write_ply(a.out.with_suffix(".ply"), gaussians, scene.normalization, units="scene")
     print(
         f"{len(gaussians)} Gaussians, {a.steps} steps: held-out PSNR {first:.2f} -> {last:.2f} dB; image and render in {a.out}"

@@ -2,7 +2,7 @@
 
     python examples/08_feature_field.py --out features.png
 
-Prints the cosine similarity of the features before and after; writes the three main directions of both images as colours.
+Prints the cosine similarity of the features before and after; writes the three principal components of both images as colours.
 """
 
 import argparse
@@ -17,7 +17,7 @@ CHANNELS = 16
 
 
 def feature_image(size: int) -> torch.Tensor:
-    """Return waves of many directions and lengths, signed, of unit length at each pixel, shape [size, size, CHANNELS]."""
+    """Return waves of many directions and wavelengths, as unit vectors at each pixel, shape [size, size, CHANNELS]."""
     generator = torch.Generator().manual_seed(1)
     y, x = torch.meshgrid(torch.linspace(-1, 1, size), torch.linspace(-1, 1, size), indexing="ij")
     frequencies, phases = 8 * torch.randn(2, CHANNELS, generator=generator), 6.28 * torch.rand(CHANNELS, generator=generator)
@@ -26,7 +26,7 @@ def feature_image(size: int) -> torch.Tensor:
 
 
 def random_gaussians(count: int) -> warpgs.Gaussians:
-    """Return Gaussians on a plane one unit before the camera; their spherical harmonics are never read."""
+    """Return Gaussians on a plane one unit in front of the camera; their spherical harmonics are never read."""
     xy = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) - 0.5
     return warpgs.Gaussians(
         means=torch.cat([xy, torch.ones(count, 1)], 1).requires_grad_(),
@@ -38,7 +38,7 @@ def random_gaussians(count: int) -> warpgs.Gaussians:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in cosine similarity."""
+    """Run the example; return the gain in cosine similarity."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("features.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=200, help="optimisation steps")

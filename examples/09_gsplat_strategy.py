@@ -4,7 +4,7 @@
     python examples/09_gsplat_strategy.py --strategy DefaultStrategy --out fitted.png
 
 Fits an image of coloured rings, and prints the PSNR before and after and the number of Gaussians. `MCMCStrategy` calls CUDA
-kernels of gsplat itself, so it needs a GPU and a CUDA toolkit; `DefaultStrategy` runs on a CPU, too.
+kernels of gsplat, so it needs a GPU and a CUDA toolkit; `DefaultStrategy` runs on a CPU, too.
 """
 
 import argparse
@@ -35,7 +35,7 @@ def render(
     info = {
         "means2d": found.means2d,
         "radii": found.projected.detach()[..., 10:12].ceil(),  # half sides of the boxes [px], 0 where culled
-        "gaussian_ids": None,  # read in packed mode alone
+        "gaussian_ids": None,  # only read in packed mode
         "width": camera.width,
         "height": camera.height,
         "n_cameras": len(found.projected),
@@ -44,7 +44,7 @@ def render(
 
 
 def initial_parameters(count: int) -> dict[str, torch.nn.Parameter]:
-    """Return grey Gaussians on a plane one unit before the camera, under gsplat's names."""
+    """Return grey Gaussians on a plane one unit in front of the camera, under gsplat's names."""
     xy = torch.rand(count, 2, generator=torch.Generator().manual_seed(0)) - 0.5
     tensors = {
         "means": torch.cat([xy, torch.ones(count, 1)], 1),
@@ -59,7 +59,7 @@ def initial_parameters(count: int) -> dict[str, torch.nn.Parameter]:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in PSNR [dB]."""
+    """Run the example; return the gain in PSNR [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--strategy", choices=OPTIONS, default="DefaultStrategy", help="class of gsplat")
     parser.add_argument("--out", type=Path, default=Path("fitted.png"), help="PNG to write")

@@ -1,9 +1,9 @@
-"""Three depths and two kinds of normals of a small scene: a ball of flat Gaussians before a wall.
+"""Three depths and two kinds of normals of a small scene: a ball of flat Gaussians in front of a wall.
 
     python examples/10_depth_and_normals.py --out depth_and_normals.png
 
 Writes one row of images: expected, accumulated and median depth, the normals of the Gaussians, and those of the expected depth.
-Prints the mean angle between both normals of the ball and those of a sphere.
+Prints, for both kinds, the mean angle between the normals of the ball and those of a sphere.
 """
 
 import argparse
@@ -21,7 +21,7 @@ CENTER = torch.tensor([0.0, 0.0, 3.0])
 
 
 def discs(points: torch.Tensor, normals: torch.Tensor, radius: float) -> dict[str, torch.Tensor]:
-    """Return flat Gaussians [N, ...] at points [N, 3], perpendicular to unit normals [N, 3], by the fields of `Gaussians`."""
+    """Return flat Gaussians [N, ...] at points [N, 3], perpendicular to unit normals [N, 3], by field name."""
     n = len(points)
     x, y, z = normals.unbind(1)
     return {
@@ -46,7 +46,7 @@ def ball_and_wall(count: int) -> warpgs.Gaussians:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the mean angle between rendered normals of the Gaussians and a sphere's [degrees]."""
+    """Run the example; return the mean angle between rendered normals of the Gaussians and a sphere's [degrees]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("depth_and_normals.png"), help="PNG to write")
     parser.add_argument("--count", type=int, default=4000, help="number of Gaussians on the ball")

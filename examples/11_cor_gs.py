@@ -38,11 +38,12 @@ from PIL import Image
 SSIM_WEIGHT = 0.2
 """Weight of SSIM in every photometric loss, as in 3DGS."""
 CHUNK = 2**24
-"""Distances that are held at a time."""
+"""Largest number of distances in memory at a time."""
 SPARE, MIN_INSTANCES = 2, 100_000
-"""Capacity for (Gaussian, tile) instances of a captured render: times the most of a training view, plus a few."""
+"""Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times that of the heaviest training view, and
+`MIN_INSTANCES` more."""
 OF_TWIN = {"twin": schema.fields(GradientGrowth.STATE)}
-"""Schema of what a checkpoint holds of the second model beside its tensors."""
+"""Schema of the second model in a checkpoint, without its tensors."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ class CorConfig:
     every: int = 500
     """Steps between two co-prunings."""
     distance: float = 1.0
-    """Distance to the nearest Gaussian of the other model, over the scene's extent, above which a Gaussian is removed."""
+    """Largest distance to the nearest Gaussian of the other model, in extents of the scene; Gaussians beyond it are removed."""
     noise: float = 0.3
-    """Standard deviation of a random camera's position, over the distance of two neighbouring cameras."""
+    """Standard deviation of a random camera's position, as a fraction of the distance to the nearest camera."""
 
 
 def nearest(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
@@ -90,7 +91,7 @@ def random_cameras(views: list[TrainingView], noise: float, count: int, generato
 
 @register("cor_gs")
 class CorGS(CloneSplit):
-    """Two models of one scene, pruned and regularised where they disagree; the first of them is the result.
+    """Two models of one scene, pruned and regularised where they disagree; the first one is the result.
 
     A step is captured as a CUDA graph: all random numbers are sampled at the start, and looked up by the number of the step.
     """
@@ -170,7 +171,7 @@ class CorGS(CloneSplit):
         if phase:
             size = (image.shape[1], image.shape[0])
             self.statistics_of_twin = self.twin_growth.statistics(v_projected, found.visible, size)
-        ended: torch.Tensor = torch.where(self.overflow[0] != 0, torch.nan, 0 * loss.detach())  # which ends the fit
+        ended: torch.Tensor = torch.where(self.overflow[0] != 0, torch.nan, 0 * loss.detach())  # NaN ends the fit
         total: torch.Tensor = term + ended
         return total
 
@@ -208,14 +209,14 @@ class CorGS(CloneSplit):
         self._measure()
 
     def _matched(self) -> list[torch.Tensor]:
-        """Return which Gaussians of each model have a neighbour in the other one, bool, shape [N]; all, where none has."""
+        """Return which Gaussians of each model have a neighbour in the other one, bool, shape [N]; if none has, all."""
         means = [t.params["means"].detach() for t in (self.context.table, self.twin.table)]
         most = self.config.distance * self.context.extent
         near = [nearest(a, b) <= most for a, b in (means, means[::-1])]
         return [m if bool(m.any()) else ~m for m in near]
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return the second model, [N, ...] each, the number of its steps [1], and what both growths need."""
+        """Return the second model, [N, ...] each, the number of its steps [1], and the states of both growths."""
         tensors, plain = super().state()
         twin = {f"twin.{n}": t for n, t in self.twin.table.state().items()}
         return tensors | twin | {"taken": self.taken}, plain | {"twin": self.twin_growth.state()}
@@ -236,9 +237,9 @@ def _kept(table: Table, rows: torch.Tensor) -> DensityUpdate:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in held-out PSNR over 3DGS [dB]."""
+    """Run the example; return the gain in held-out PSNR over 3DGS [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; a synthetic one where not given")
+    parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
     parser.add_argument("--split", default="llff:3", help="as in warpgs fit")
     parser.add_argument("--out", type=Path, default=Path("cor_gs.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=1000, help="optimisation steps of each fit")

@@ -1,11 +1,11 @@
-"""A trainer in the manner of nerfstudio's splatfacto around the rasterizer: dataparser, densification, cameras, in plain torch.
+"""A trainer like nerfstudio's splatfacto, around the rasterizer: dataparser, densification, cameras, in plain torch.
 
     python examples/12_splatfacto.py path/to/scene --out splatfacto.png --pose-noise 0.5
 
 `warpgs.load_scene` is the dataparser. Gaussians are split, duplicated and culled by absgrad (`Render.means2d.absgrad`), random
 backgrounds and `scale_loss` keep them from becoming fog and needles, and each training camera has a correction of its own.
-Prints the number of Gaussians and the PSNR of a held-out view before and after, and how far the cameras are off with
-``--pose-noise``; writes the image beside the render.
+Prints the number of Gaussians, the PSNR of a held-out view and the pose error of the training cameras, before and after; writes
+the image beside the render.
 """
 
 import argparse
@@ -53,22 +53,25 @@ def moved(viewmat: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
 
 
 def degrees_off(poses: torch.Tensor, true_poses: torch.Tensor) -> float:
-    """Return the mean angle [degrees] between view matrices [V, 4, 4], less the turn that all have in common."""
-    turns = poses[:, :3, :3].mT @ true_poses[:, :3, :3]  # of the world: a turn that all share, the Gaussians follow
+    """Return the mean angle [degrees] between view matrices [V, 4, 4], without their common rotation."""
+    turns = poses[:, :3, :3].mT @ true_poses[:, :3, :3]  # in world axes: the Gaussians follow a common rotation
     u, _, v = torch.linalg.svd(turns.mean(0))
     return float(torch.rad2deg(2 * torch.arcsin((turns - u @ v).norm(dim=(1, 2)).div(8**0.5).clamp_max(1))).mean())
 
 
 def scale_loss(log_scales: torch.Tensor) -> torch.Tensor:
-    """Return the mean excess of longest over shortest axis above `MAX_RATIO`, shape [] (PhysGaussian, Xie et al. 2024)."""
+    """Return the mean excess of the axis ratio, longest to shortest, over `MAX_RATIO`, shape [].
+
+    After PhysGaussian (Xie et al. 2024).
+    """
     ratios = (log_scales.amax(1) - log_scales.amin(1)).exp()
     return (ratios.clamp_min(MAX_RATIO) - MAX_RATIO).mean()
 
 
 def densify(params: dict[str, torch.Tensor], optimizer: torch.optim.Adam, pull: torch.Tensor, size: float) -> None:
-    """Add copies of small and halves of large Gaussians whose absgrad ``pull`` [N] is high, and remove the transparent.
+    """Add copies of small and halves of large Gaussians whose absgrad ``pull`` [N] is high, and remove transparent ones.
 
-    Rows that stay keep their moments of Adam; new ones begin without. ``size`` is that of the scene [u].
+    Kept rows keep their Adam moments; those of new rows are 0. ``size`` is the size of the scene [u].
     """
     g = {name: p.detach() for name, p in params.items() if name != "twists"}
     grows = pull > GROW_ABSGRAD
@@ -94,14 +97,14 @@ def densify(params: dict[str, torch.Tensor], optimizer: torch.optim.Adam, pull: 
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; returns the gain in PSNR on a held-out view [dB]."""
+    """Run the example; return the gain in PSNR on a held-out view [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scene", type=Path, nargs="?", help="scene folder with points; a synthetic one where not given")
+    parser.add_argument("scene", type=Path, nargs="?", help="scene folder with points; default: a synthetic scene")
     parser.add_argument("--out", type=Path, default=Path("splatfacto.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=400, help="optimisation steps")
     parser.add_argument("--count", type=int, default=1000, help="largest number of Gaussians at the start")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
-    parser.add_argument("--pose-noise", type=float, default=0.0, help="turn each training camera by so many degrees at first")
+    parser.add_argument("--pose-noise", type=float, default=0.0, help="first rotation error of each training camera [degrees]")
     a = parser.parse_args(arguments)
 
     torch.manual_seed(0)
@@ -138,7 +141,7 @@ def main(arguments: list[str] | None = None) -> float:
         seen_from = warpgs.Camera(moved(poses[i], params["twists"][i]), camera.K, camera.width, camera.height)
         options = warpgs.RasterizeOptions(absgrad=True, background=torch.rand(3), sh_degree=min(step // 100, 1))
         render = warpgs.rasterize(gaussians(), seen_from, options)
-        means2d = render.means2d  # read before the backward pass, which leaves absgrad on it
+        means2d = render.means2d  # read before the backward pass, which sets absgrad on it
         loss = 0.8 * (render.rgb - images[i]).abs().mean() + 0.2 * (1 - ssim(render.rgb, images[i]).mean())
         loss = loss + 0.1 * scale_loss(params["log_scales"]) + 1e-2 * params["twists"].square().mean()
         optimizer.zero_grad()

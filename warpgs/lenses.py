@@ -21,15 +21,15 @@ MODELS = ("pinhole", "orthographic", "opencv", "fisheye")
 CENTRAL = ("pinhole", "opencv", "fisheye")
 """Camera models with a centre of projection, which a pinhole of the same K can replace."""
 NEWTON_STEPS = 30
-"""Steps of Newton's method to invert the distortion; five reach float64's precision for usual lenses, further steps are
-bisections."""
+"""Steps of Newton's method to invert the distortion. Five reach float64's precision for usual lenses. For a fisheye, a step
+that leaves the bracket is replaced by a bisection."""
 
 
 def check_known(model: str) -> None:
     """Check that a camera model is known here.
 
     Raises:
-        UsageError: Only the kernels support it.
+        UsageError: Only the kernels support the model.
     """
     if model not in MODELS:
         raise UsageError(
@@ -80,7 +80,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
 def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
     """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN if not on the lens.
 
-    An orthographic camera has them at (u, v, 1) for every depth.
+    For an orthographic camera they are (u, v, 1), and positions (u, v, z) of any depth have the same point.
 
     Raises:
         UsageError: The model is unknown here.
@@ -116,7 +116,7 @@ def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
 def on_lens(model: str, distortion: Array | None, positions: Array, samples: int = 64) -> Array:
     """Return a mask [...], True where the lens is not folded between its axis and positions in the camera [..., 3].
 
-    The fold is searched at ``samples`` points along the way. Positions behind a pinhole count as folded, those of an
+    The lens is tested at ``samples`` points along the way. Positions behind a pinhole count as folded, positions in an
     orthographic camera never do.
     """
     library, z = _library(positions), positions[..., 2]

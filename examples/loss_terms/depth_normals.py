@@ -3,8 +3,8 @@
     warpgs fit scene --out run --loss-terms examples/loss_terms/depth_normals.py:NormalSmoothness --normal-smoothness.weight 0.1
 
 The normals come from rendered depth (`warpgs.geometry.depth_normals`). The term is the mean of 1 - cos of the angle between
-neighbours, weighted down at edges of the image as in Godard et al. 2017, eq. 5. It grows over the first steps, in which depth
-is still noise.
+neighbours, weighted down at edges of the image as in Godard et al. 2017, eq. 5. Its weight grows over the first steps, in
+which depth is still noise.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import torch
 MIN_ALPHA = 0.5
 """Opacity above which a pixel shows a surface."""
 EDGE = 10.0
-"""Factor of the colour difference between neighbours, in the exponent of their weight."""
+"""Factor of the colour difference between neighbours in the exponent of the weight."""
 
 
 def unevenness(normals: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return the weighted mean of 1 - cos of the angle between neighbours, shape [], in [0, 2]; 0 without any.
+    """Return the weighted mean of 1 - cos of the angle between neighbours, shape [], in [0, 2]; 0 without neighbours.
 
     ``normals`` have length 1, or 0 where there is none, shape [H, W, 3]; ``image`` has shape [H, W, 3].
     """

@@ -25,7 +25,7 @@ MIN_ALPHA = 0.5
 """Opacity above which the depth of a pixel counts: elsewhere the background contributes more."""
 FLAT = 1e-3
 """Standard deviation at or below which a map counts as constant, for a disparity in [0, 1] and for mean depth over depth, whose
-values lie around 1. The gradient of a correlation grows with the inverse of it."""
+values lie around 1. The gradient of a correlation grows with the inverse of this deviation."""
 
 
 def centred(values: torch.Tensor, fraction: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -38,11 +38,11 @@ def centred(values: torch.Tensor, fraction: torch.Tensor, pixels: torch.Tensor) 
 def depth_disagreement(
     depth: torch.Tensor, alpha: torch.Tensor, disparity: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """Compute 1 minus Pearson's correlation of rendered inverse depth with a disparity, which may have any scale and offset.
+    """Compute 1 minus Pearson's correlation of rendered inverse depth with a disparity of any scale and offset.
 
     The pixels that count have alpha above `MIN_ALPHA` and are kept by the mask. Differentiable in ``depth`` alone. Where either
-    map is constant over them (`FLAT`), and where none counts, there is no correlation: then it is 0 and has no gradient. The
-    unit of depth does not matter from 1e-30 to 1e30 u: maps are scaled to values around 1 and centred before squaring.
+    map is constant over them (`FLAT`), and where none counts, there is no correlation: then the result is 0, without gradient.
+    The unit of depth does not matter from 1e-30 to 1e30 u: maps are scaled to values around 1 and centred before squaring.
 
     Args:
         depth: Expected z-depth [u], positive where alpha is, shape [H, W].
@@ -51,9 +51,9 @@ def depth_disagreement(
         mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
 
     Returns:
-        A number in [0, 2], shape []; NaN where a pixel that counts has one.
+        A number in [0, 2], shape []; NaN if a pixel that counts is NaN.
     """
-    counts = ~(alpha <= MIN_ALPHA)  # of a NaN too: it must not vanish
+    counts = ~(alpha <= MIN_ALPHA)  # NaN counts, too: it must not vanish
     counts = counts if mask is None else counts & (mask > 0)
     fraction = counts.to(depth.dtype)
     pixels = fraction.sum().clamp_min(1)
@@ -91,7 +91,7 @@ class DepthCorrelation(warpgs.LossTerm):
         return {"disparity": torch.as_tensor(prior.disparity, dtype=torch.float32, device=view.image.device)}
 
     def active(self, step: int, steps: int) -> bool:
-        """Return whether the step is one of the first ``until`` of all."""
+        """Return whether the step lies in the first fraction ``until`` of all steps."""
         return step <= self.until * steps
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:

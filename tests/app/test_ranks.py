@@ -66,7 +66,7 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
     assert [code for code, _, _ in found] == [4] * (first - 1) + [-signal.SIGKILL]
     lines = [line for _, _, errors in found for line in errors.splitlines() if line.startswith("warpgs")]
     assert lines == [
-        f"warpgs: rank {first - 1} of {first} is gone, and this fit ends with it; --resume continues from the last checkpoint, "
+        f"warpgs: rank {first - 1} of {first} was lost, so this fit stops; --resume continues from the last checkpoint, "
         "with any number of ranks"
     ]
 

@@ -169,7 +169,7 @@ def test_depth_by_a_network_takes_the_same_way():
         scaled, weight, q = (m.numpy() for m in view.maps["given_depth"].unbind(-1))
         at = weight > 0
         assert at.mean() > 0.9 and np.median(np.abs(q[at] / scaled[at] / true[at] - 1)) < 0.005
-    with pytest.raises(UsageError, match="--depth-guides uses a network"):
+    with pytest.raises(UsageError, match="--depth-guides requires --depth-model"):
         PriorConfig(depth_guides=True)
 
 

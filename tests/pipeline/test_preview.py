@@ -41,7 +41,7 @@ def test_a_sheet_per_training_view(scene, tmp_path, capsys):
     sheet = cv2.imread(str(sheets[0]))
     assert sheet.shape[1] > 1500 and sheet.std() > 20
     assert main(show(scene, "--out", tmp_path / "b", *flags)) == 0
-    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps were there already" in capsys.readouterr().out
+    assert f"{2 * len(sheets)} of {2 * len(sheets)} maps were read from the cache" in capsys.readouterr().out
     for path in sheets:
         np.testing.assert_array_equal(cv2.imread(str(tmp_path / "b" / path.name)), cv2.imread(str(path)))
 
@@ -71,7 +71,7 @@ def test_mistakes_get_one_line(scene, tmp_path, capsys):
     assert "give show or export" in failure(capsys, 2, "priors", "draw")
     assert "source 'lidar' is not one of sweep, flow" in failure(capsys, 2, *show(scene, "--out", out, "--source", "lidar"))
     assert "--threads must be a number from 0" in failure(capsys, 2, *show(scene, "--out", out, "--threads", -1))
-    assert "name it by --depth-model" in failure(capsys, 2, *show(scene, "--out", out, "--depth-size", 64))
+    assert "requires --depth-model" in failure(capsys, 2, *show(scene, "--out", out, "--depth-size", 64))
     (tmp_path / "x.onnx").write_text("no network")
     assert "not an ONNX model" in failure(capsys, 3, *show(scene, "--out", out, "--depth-model", tmp_path / "x.onnx"))
     assert "cannot be read" in failure(capsys, 3, *show(scene, "--out", out, "--segmentation-model", tmp_path / "none.onnx"))

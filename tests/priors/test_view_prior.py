@@ -79,7 +79,7 @@ def test_maps_are_kept_and_found_again(tmp_path):
     first, notes = view_priors(views, config, cache=folder)
     assert len(list(folder.iterdir())) == 4 and not any("there already" in n for n in notes)
     second, notes = view_priors(views, config, cache=folder)
-    assert f"priors: 4 of 4 maps were there already, in {folder}" in notes
+    assert f"priors: 4 of 4 maps were read from the cache {folder}" in notes
     for f, s in zip(first, second):
         for name in ("disparity", "confidence", "boundary", "foreground"):
             np.testing.assert_array_equal(getattr(f, name), getattr(s, name))
@@ -180,9 +180,9 @@ def test_a_network_of_the_other_kind_is_refused(tmp_path):
         ({"depth_model": "x", "depth_size": -3}, "--depth-size: size must be a whole number"),
         ({"depth_model": "x", "depth_mean": (0.5, float("nan"), 0)}, "--depth-mean: mean must be three numbers"),
         ({"segmentation_model": "x", "segmentation_std": (1, 0, 1)}, "--segmentation-std: std must be three numbers above 0"),
-        ({"depth_size": 32}, "--depth-size describes a network; name it by --depth-model"),
-        ({"segmentation_mean": (0, 0, 0)}, "--segmentation-mean describes a network"),
-        ({"depth_output": "depth"}, "--depth-output describes a network"),
+        ({"depth_size": 32}, "--depth-size requires --depth-model; add it"),
+        ({"segmentation_mean": (0, 0, 0)}, "--segmentation-mean requires --segmentation-model"),
+        ({"depth_output": "depth"}, "--depth-output requires --depth-model"),
     ],
 )
 def test_settings_are_checked(fields, message):

@@ -163,7 +163,7 @@ def test_wrong_channels_are_named():
         ),
         (ValueError, r"background must have shape \[3\] .*, not \[2, 8\]", {"features": values, "background": behind}),
         (ValueError, r"feature_background .*\[8\]", {"features": values, "feature_background": behind[:, :3]}),
-        (UsageError, "feature_background is behind features", {"feature_background": behind}),
+        (UsageError, "feature_background requires features", {"feature_background": behind}),
     ]:
         with pytest.raises(kind, match=words):
             rasterize(gaussians, cam, RasterizeOptions(**options))

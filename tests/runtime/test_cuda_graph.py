@@ -110,7 +110,7 @@ def test_a_failed_capture_warns_once_and_the_function_still_runs():
 
     own = Refusing(CPU)
     work = GraphedFunction(doubled, own)
-    with pytest.warns(UserWarning, match="not captured from here on.*operation not permitted"):
+    with pytest.warns(UserWarning, match="no longer captured as CUDA graphs.*operation not permitted"):
         (out,), block = work(torch.ones(4))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

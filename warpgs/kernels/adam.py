@@ -143,10 +143,10 @@ def adam_scheduled(
         exp_avg: Running mean of the gradient, same shape, contiguous.
         exp_avg_sq: Running mean of its square, same shape, contiguous.
         lrs: Result of `scheduled_lrs`, float32, shape [3].
-        skip: Nothing changes where this is not 0, int32, shape [1].
-        head: How many numbers of a row take the first learning rate; 0 for none.
+        skip: Flag, int32, shape [1]; nothing is updated if it is not 0.
+        head: Count of numbers of a row that take the first learning rate; 0 for none.
         betas: Decay of the two running means.
-        eps: Added to the root.
+        eps: Number added to the root.
     """
     if param.numel() == 0:
         return

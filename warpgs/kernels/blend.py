@@ -20,14 +20,14 @@ from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
-    """Return the bytes of images, of what blending leaves for its gradient, and of gradient slots at each moment of a step."""
+    """Return the bytes of images, of data for the backward pass, and of gradient slots at each moment of a step."""
     slots, states = blend_cuda.instance_bytes(sizes) if sizes.cuda else (FLOAT * VALUES * sizes.instances, 0)
     images = (COLORS + 2) * FLOAT * sizes.pixels  # colour, alpha, depth
     kept = 3 * FLOAT * sizes.pixels + states  # transmittance, weight, end
     lean = not (sizes.depth or sizes.cutout)  # only colour has a gradient
     upstream = (COLORS if lean else COLORS + 2) * FLOAT * sizes.pixels
     order = blend_cuda.order_bytes(sizes) if sizes.cuda else 0  # gone before the loss, which takes more
-    whole = images + upstream if sizes.chunked else 0  # images of the frame stand beside those of a chunk
+    whole = images + upstream if sizes.chunked else 0  # images of the frame exist beside those of a chunk
     return {
         BINNING: whole, LOSS: images + (0 if sizes.chunked else kept), BLENDING: kept + slots + images + (whole or upstream),
         PROJECTION: images + upstream, SAMPLING: 3 * images + order,
@@ -116,7 +116,7 @@ def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.Vie
 
 
 def _span(image: torch.Tensor, real) -> tuple[interop.View, int]:
-    """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the distance of its pixels there."""
+    """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the stride of its pixels."""
     found = interop.span(image, real)
     return found, found.row_stride()
 
@@ -141,8 +141,8 @@ def composite(
         settings: Settings.
         save: True where gradients will be taken.
         allocator: Provider of the results' memory.
-        image: Memory of the channels, shape [C, H, W, D], which may be a slice of those of an image, or, on CUDA in float32,
-            of the first ones alone; None for new memory.
+        image: Memory of the channels, shape [C, H, W, D]; it may be a slice of the channels of an image. On CUDA in float32 it
+            may have fewer than D channels: then only the first ones are written. None for new memory.
 
     Returns:
         ``rgb`` [C, H, W, D], or ``image``; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last
@@ -214,7 +214,7 @@ def composite_gradients(
         tiles: Their tiles.
         backgrounds: Channels behind everything, shape [C, D].
         settings: Settings as given to `composite`.
-        saved: Results of `composite` without ``alpha``. Of ``rgb`` only the channels that ``v_images`` has are read.
+        saved: Results of `composite` without ``alpha``. Only the channels of ``rgb`` that ``v_images`` has are read.
         v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The first
             may be a slice of the channels of an image, and on CUDA in float32 have fewer than D: the others are 0.
         allocator: Provider of the gradient's memory.
@@ -260,7 +260,7 @@ class _Blend(torch.autograd.Function):
 
 
 def without_gradients(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return tensors of any shape [...]; detached where autograd is off, since leaves would ask for gradients there, too."""
+    """Return tensors of any shape [...]; detached where autograd is off, since leaves would request gradients."""
     return tensors if torch.is_grad_enabled() else tuple(t.detach() for t in tensors)
 
 
@@ -271,11 +271,11 @@ def check_slots(tiles: Tiles) -> None:
         ValueError: The instances have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
-        raise ValueError("tiles have no slots, which gradients and contributions need: make them by bin_tiles(slotted=True)")
+        raise ValueError("gradients and contributions need tiles with slots: make the tiles by bin_tiles(slotted=True)")
 
 
 def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
-    """Check that tiles were made for an image of ``width`` x ``height`` px and go with projected Gaussians [C, N, 12].
+    """Check that tiles were made for an image of ``width`` x ``height`` px and for projected Gaussians [C, N, 12].
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
@@ -302,10 +302,10 @@ def blend(
     origin: tuple[int, int] = (0, 0),
     absgrad: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; order and early stop as ``rule`` says).
+    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; ``rule`` sets order and early stop).
 
     Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
-    Derivation of the backward pass: docs/blend.md. Repeats bit for bit, on a CPU with any number of threads and on CUDA.
+    Derivation of the backward pass: docs/blend.md. Results repeat bit for bit, on CUDA and on any number of CPU threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

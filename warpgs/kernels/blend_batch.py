@@ -17,8 +17,8 @@ TOGETHER = 16
 def make_batches(real, tile_size: int, channels: int):
     """Make the record of a batch and its functions, for one scalar type, tile size and number of channels.
 
-    A tile lies in columns as wide as a strip, one beside the other. The strips of a column that a Gaussian reaches are
-    neighbours, since an ellipse is convex: the first row and one past the last say which they are.
+    A tile is stored in columns as wide as a strip, one after the other. The strips of a column that a Gaussian reaches are
+    contiguous, since an ellipse is convex. They are stored as their first row and one past the last.
     """
     f = make_functions(real)
     record = wp.types.vector(9 + channels, real)
@@ -61,7 +61,7 @@ def make_batches(real, tile_size: int, channels: int):
         dy: row_reals  # from the mean [px]
         e12: row_reals  # u12 dy
         e22: row_reals  # square of e2
-        ramp: strip_reals  # what the pixels of a strip add to e1 of the first
+        ramp: strip_reals  # e1 of the pixels of a strip, less that of the first pixel
 
     @wp.func(inline=True)
     def at(entry: wp.ref[real]) -> real:
@@ -116,7 +116,7 @@ def make_batches(real, tile_size: int, channels: int):
         left: wp.int32, top: wp.int32, last: wp.int32, count: wp.int32, until: wp.ref[strip_ints],
         b: wp.ref[Batch],
     ):  # fmt: skip
-        """Find the rows that the Gaussians reach; an instance does not see strips whose ``until`` is not above its number."""
+        """Find the rows that the Gaussians reach; an instance skips strips whose ``until`` is not above its number."""
         e12 = lane_reals()
         e22 = lane_reals()
         group = int(0)

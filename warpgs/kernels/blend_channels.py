@@ -1,7 +1,7 @@
 """Compositing of any number of channels: each Gaussian has D values instead of a colour.
 
 The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). More channels take several passes over the same
-instances, and no memory but that of the image and the gradient (docs/blend.md, section 3).
+instances, and no more memory than the image and the gradient (docs/blend.md, section 3).
 """
 
 import functools
@@ -33,7 +33,7 @@ GEOMETRY = 6
 
 
 def width_of(channels: int, widths: tuple[int, ...] = WIDTHS) -> int:
-    """Return the number of channels of a pass: the fewest of ``widths`` that keep the number of passes at its least."""
+    """Return the number of channels of a pass: the smallest of ``widths`` with the least number of passes."""
     passes = -(-channels // widths[-1])
     return next(width for width in widths if width * passes >= channels)
 
@@ -42,7 +42,8 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
     """Return the number of channels of a pass over projected Gaussians [C, N, 12].
 
     The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an H100
-    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA takes the narrowest, but for magnitudes, which need one pass.
+    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except for magnitudes, which need one
+    pass.
     """
     narrow = projected.is_cuda and not is_native(projected) and not absgrad
     return width_of(channels, WIDTHS[:1] if narrow else WIDTHS)
@@ -50,7 +51,7 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
 
 @functools.cache
 def make_kernels(real, width: int):
-    """Make the kernels that give Gaussians the channels of a pass, ``width`` of them, and take the gradient apart again."""
+    """Make the kernels that give Gaussians the channels of a pass, ``width`` of them, and split the gradient again."""
     module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
     geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
     own, rest = wp.constant(width), wp.constant(GEOMETRY + width)
@@ -102,7 +103,7 @@ class _Group(NamedTuple):
     channels: slice
     """Their place among all D."""
     projected: torch.Tensor
-    """Projected Gaussians that have them instead of a colour, shape [C, N, 9 + G]. All groups share the memory."""
+    """Projected Gaussians that have these channels instead of a colour, shape [C, N, 9 + G]. All groups share the memory."""
     backgrounds: torch.Tensor
     """Background of the channels, shape [C, G]: zeros fill up the last group."""
 
@@ -113,7 +114,7 @@ def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
 
 
 def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
-    """Return the gradient of a pass [..., F] as its kernels take it: the generic ones read ``width`` channels."""
+    """Return the gradient of a pass [..., F] as its kernels take it: generic kernels read ``width`` channels."""
     return v_image if native or v_image.shape[-1] == width else _padded(v_image, width)
 
 
@@ -216,7 +217,7 @@ def blend_channels(
         rule: Cut-offs.
         deterministic: Sum gradients in a fixed order, see `blend`.
         origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: Sum magnitudes, see `blend`; of several passes (more than 11 channels) those of each.
+        absgrad: Sum magnitudes, see `blend`; with more than 11 channels, magnitudes of each pass are summed.
 
     Returns:
         The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.

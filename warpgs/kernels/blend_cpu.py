@@ -1,4 +1,4 @@
-"""Blending kernels in plain Warp, one task per tile: those of the CPU, and of float64 on every device.
+"""Blending kernels in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 
 A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches and are
 kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
@@ -17,7 +17,7 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 BATCH = 64
-"""Gaussians that the forward pass takes at a time, strip by strip; a power of 2, since indices are bounded by its bits."""
+"""Gaussians that the forward pass processes at a time, strip by strip; a power of 2, since indices are bounded by its bits."""
 TOGETHER = 16
 """Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
 
@@ -26,8 +26,8 @@ TOGETHER = 16
 def make_forward(real, tile_size: int, channels: int):
     """Make the forward kernel for one scalar type, tile size and number of channels."""
     f = make_functions(real)
-    # Vectors rather than local arrays: the compiler must see that they do not overlap. One row longer than the tile, so that
-    # they do not lie 4096 bytes apart, where a load is taken to wait for a store to the other.
+    # Vectors rather than local arrays: the compiler must see that they do not overlap. They are one row longer than
+    # the tile, so that they are not 4096 bytes apart: there a load of one would wait for a store to the other (4K aliasing).
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
@@ -55,7 +55,7 @@ def make_forward(real, tile_size: int, channels: int):
     together = wp.constant(TOGETHER)
     smallest = wp.constant(real(SMALLEST_WEIGHT))
 
-    # Loops over channels are unrolled, because of the static number, and so stand apart from the loops that must not be.
+    # Loops over channels have a static length and are unrolled, so they are kept apart from loops that must stay rolled.
     @wp.func(inline=True)
     def at(entry: wp.ref[real]) -> real:
         """Return an entry of a vector that is taken by reference; Warp would copy the vector otherwise."""

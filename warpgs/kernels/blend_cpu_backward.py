@@ -1,8 +1,8 @@
-"""The backward blending kernel in plain Warp, one task per tile: that of the CPU, and of float64 on every device.
+"""The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 
 The kernel walks the Gaussians of its tile back to front. A Gaussian's whole effect on a pixel is one number
-d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3). Loops over channels are unrolled, because of their static number, and so
-stand apart from the loops that must not be.
+d = c . v_rgb + z v_z + v_w (docs/blend.md, section 3). Loops over channels have a static length and are unrolled,
+so they are kept apart from loops that must stay rolled.
 """
 
 import functools
@@ -313,7 +313,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         tile_size: Side of a tile [px].
         channels: Number of channels.
         absgrad: As in `BlendSettings`.
-        deep: False where depth and alpha have no gradient; what belongs to them is then not read.
+        deep: False where depth and alpha have no gradient; their data is then not read.
     """
     f = make_functions(real)
     r = make_records(real, tile_size, channels, absgrad)
@@ -349,7 +349,7 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         shades = r.Shades()
         held = r.Held()
         first = ranges[tile, 0]
-        # One value of each cache line in a loop of its own, so that many loads are under way at once; it is overwritten.
+        # One value of each cache line in a loop of its own, so that many loads are under way at once; this is overwritten.
         corner = (place[0] * settings.height + place[2]) * settings.width + place[1]
         across = wp.min(side, settings.width - place[1])
         for row in range(side):

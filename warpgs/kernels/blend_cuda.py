@@ -1,7 +1,7 @@
 """Blending kernels for CUDA in float32, with native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
 
 Warp has no shuffles, no ballots and no 16-byte loads, so the bodies are CUDA. They compute what the generic kernels of
-blend_cpu.py compute (docs/blend.md); tests hold them against each other.
+blend_cpu.py compute (docs/blend.md); tests compare both.
 """
 
 import functools
@@ -21,24 +21,24 @@ from warpgs.runtime.cuda_source import source
 from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128, 256)
-"""Instances for one warp of the backward pass: the first number in small images, for enough warps; the next ones in larger
-images, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each multiple
-of this, so that several warps can share a long list. Multiples of 32."""
+"""Instances for one warp of the backward pass. Small images use the first number, to have enough warps. Larger images use
+the next ones, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each
+multiple of this number, so that several warps can share a long list. Multiples of 32."""
 MAX_TILES = (4096, 16384)
-"""Tiles up to which the first and the second of these numbers are taken (docs/decisions/005-cuda-blending.md)."""
+"""Numbers of tiles up to which the first and the second of `CHUNKS` are taken (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
-"""Floats of that state with three channels: transmittance, colour and depth sum so far. One more for each further channel."""
+"""Floats of a saved state with three channels: transmittance, colour and depth sum. One more for each further channel."""
 WARPS = 2
 """Independent warps in a block."""
 LARGE_GAUSSIAN = 8
-"""Tiles per visible Gaussian from which on a warp of the forward pass takes two blocks of pixels instead of one: it loads and
-tests half as many instances, while few of them touch one block alone (docs/decisions/005-cuda-blending.md)."""
+"""Tiles per visible Gaussian from which on a warp of the forward pass takes two blocks of pixels instead of one. This halves
+the instances that are loaded and tested, and few of them touch only one block (docs/decisions/005-cuda-blending.md)."""
 RANKS = 33
 """Ranks of tiles by the number of binary digits of their list's length, 0 to 32."""
 ORDER_THREADS = 256
 """Threads of a block of the kernel that puts tiles in order."""
 STRIDE = 12
-"""Floats from one instance's sums to the next with three channels: as many as a projected Gaussian has, so that rows are
+"""Stride of the sums of an instance, in floats, with three channels: the size of a projected Gaussian, so that rows are
 16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
 and two of magnitudes.
 Each further channel has one more."""
@@ -58,7 +58,7 @@ def _source(name: str, tile_size: int, channels: int, **numbers) -> str:
 
 @functools.cache
 def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
-    """Make the kernel that composites, for one tile size and number of channels, out of `WIDTHS`.
+    """Make the compositing kernel, for one tile size and a number of channels out of `WIDTHS`.
 
     Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
     long for 32-bit sizes.
@@ -157,7 +157,7 @@ def make_backward(
         tile_size: Side of a tile [px].
         with_depth: True for gradients of depth and alpha, too.
         chunk: Instances per warp.
-        atomic: True to add each sum to its Gaussian's at once, in no fixed order, instead of by slots.
+        atomic: True to add each sum to that of its Gaussian atomically, in no fixed order; False to store it in its slot.
         channels: Number of channels, out of `WIDTHS`.
         absgrad: True to sum magnitudes of the mean's gradient, too (`BlendSettings.absgrad`).
     """
@@ -185,7 +185,7 @@ def make_backward(
     name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
     name += ".absgrad" * absgrad
     options = {"enable_backward": False, "grid_stride": False, "module": name}
-    # many chunks need many warps at a time more than registers, unless channels fill the registers
+    # for many chunks, many warps at a time matter more than registers, unless channels fill the registers
     small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
     registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
 
@@ -226,7 +226,7 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk; not the smallest, which takes the most memory, where order is given up for memory."""
+    """Return the instances per chunk; without a fixed order, not the smallest number, which takes the most memory."""
     larger = sum(tiles > most for most in MAX_TILES)
     return CHUNKS[larger if deterministic else max(larger, 1)]
 
@@ -239,7 +239,7 @@ def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
 
 
 def order_bytes(sizes: StepSizes) -> int:
-    """Return the bytes of the order of the tiles, which the forward pass gives back at its end."""
+    """Return the bytes of the order of the tiles, which the forward pass frees at its end."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
     return FLOAT * RANKS * columns * rows
 
@@ -258,7 +258,7 @@ def forward(
 
     Returns:
         rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
-        of instances and `STATE` numbers for each pixel of a tile, of three channels.
+        of instances and, with three channels, `STATE` numbers for each pixel of a tile.
     """
     device, channels = projected.device, backgrounds.shape[1]
     shape = (backgrounds.shape[0], settings.height, settings.width)

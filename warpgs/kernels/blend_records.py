@@ -13,18 +13,18 @@ COLORS = 3
 VALUES = 10
 """Gradient values of an instance with a colour: those of a projected Gaussian but for its last two, which are the box."""
 WIDTHS = (COLORS, 7, 11)
-"""Numbers of channels that kernels are compiled for: with nine other values a projected Gaussian fills whole 16-byte loads."""
+"""Numbers of channels for which kernels are compiled: with nine other values a projected Gaussian fills whole 16-byte loads."""
 
 
 @functools.cache
 def make_records(real, tile_size: int, channels: int, absgrad: bool):
     """Make the records for one scalar type, tile size and number of channels.
 
-    A tile lies in columns as wide as a strip, one beside the other; entries of its pixels follow in that order. Vectors are
-    one row longer than the tile: see `blend_cpu.make_forward`. Channels stand one after the other, in a gradient followed by
-    the two magnitudes if ``absgrad`` is set.
+    A tile is stored in columns as wide as a strip, one after the other; entries of its pixels follow in that order. Vectors
+    are one row longer than the tile: see `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the
+    two magnitudes follow them if ``absgrad`` is set.
     """
-    # Records begin 8 bytes before a cache line, where the compiler puts them: with these, no strip lies in two lines.
+    # The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in two lines.
     lead_reals = wp.types.vector(2, real)
     trail_reals = wp.types.vector(14, real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)

@@ -51,7 +51,7 @@ class BlendSettings:
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - to make it takes 20 us, and steps ask for the same ones again
     def struct(self, tile_size: int, real):
-        """Return what kernels of one scalar type take, for tiles of that many pixels a side. It is never changed."""
+        """Return the struct for kernels of one scalar type and tiles of ``tile_size`` px; callers must not change it."""
         columns, rows = grid(self.width, self.height, tile_size)
         found = make_struct(real)()
         found.origin_x, found.origin_y = self.origin

@@ -1,4 +1,4 @@
-"""Sizes at which Gaussians do not reach a camera: a fraction of the distance to the nearest one."""
+"""Sizes at which Gaussians do not reach a camera: a fraction of the distance to the nearest camera."""
 
 import functools
 
@@ -36,7 +36,7 @@ def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) ->
     """Return the logarithm of a fraction of the distance from each mean to the nearest camera, at least that of `SMALLEST`.
 
     Args:
-        means: Positions [u], float32, shape [N, 3]; distances up to 1e18 u have a square.
+        means: Positions [u], float32, shape [N, 3]; squared distances do not overflow up to 1e18 u.
         centers: Positions of at least one camera [u], float32, shape [C, 3].
         fraction: Positive factor.
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 _MACHINE = wp.config.cpu_compiler_flags or "-march=native"
-# A stack in steps of a cache line: else every access of 64 bytes to a local vector touches two.
+# Align the stack to cache lines: else every access of 64 bytes to a local vector touches two lines.
 _STACK = "-mstackrealign -mstack-alignment=64"
 
 ROLLED = {
@@ -15,4 +15,4 @@ ROLLED = {
 """Module options, for kernels with ``module="unique"`` (elsewhere Warp ignores them)."""
 
 EXACT = {"max_unroll": 0, "cpu_compiler_flags": f"{_MACHINE} -ffp-contract=off {_STACK}"}
-"""The same without fused multiply-add: every operation rounds as it does on any other processor."""
+"""The same options without fused multiply-add: every operation rounds alike on all processors."""

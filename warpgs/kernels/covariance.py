@@ -50,7 +50,7 @@ def make_covariance(real):
         root = wp.sqrt(largest)
         mq = S[p, q] / root
         mr = S[p, r] / root
-        # what the first column leaves of the other two axes
+        # the remainder of the other two axes after the first column
         sqq = S[q, q] - mq * mq
         srr = S[r, r] - mr * mr
         sqr = S[q, r] - mq * mr
@@ -81,7 +81,7 @@ def make_covariance(real):
 
     @wp.func
     def gradient(first: vec3, second: vec3, v11: real, v12: real, v22: real) -> Packed:
-        """Return the gradient of Sigma for those of the entries of the projected one; ``first`` and ``second`` are J R."""
+        """Return the gradient of Sigma from those of the projected covariance; ``first`` and ``second`` are J R."""
         V = v11 * wp.outer(first, first) + v12 * (wp.outer(first, second) + wp.outer(second, first))
         V += v22 * wp.outer(second, second)
         g = Packed()

@@ -1,4 +1,4 @@
-"""Functions that all blending passes of the CPU share, to the bit: tiles, the pixels that a Gaussian reaches, its falloff."""
+"""Functions that all CPU blending passes share, to the bit: tiles, the pixels that a Gaussian reaches, its falloff."""
 
 import functools
 from types import SimpleNamespace
@@ -81,15 +81,16 @@ def make_functions(real):
 
     @wp.func
     def apart(product: real) -> real:
-        """Return the product itself, rounded, so that it is not fused with the sum it goes into.
+        """Return the product, rounded, so that the compiler cannot fuse it with a sum.
 
-        Where a compiler moves it out of a loop it is rounded anyway, and then one pass would see another alpha than the other.
+        A product that the compiler moves out of a loop is rounded in any case. If others were fused, two passes could see
+        different alphas.
         """
         return wp.where(real(1.0e30) < product, real(1.0e30), product)
 
     @wp.func
     def bounds_of(mx: real, my: real, u11: real, u22: real, half_width: real, half_height: real, whole_tiles: wp.int32) -> vec2:
-        """Return how far e1 at the middle of a strip may lie from 0, less the ellipse; and the ellipse, the largest |U d|^2."""
+        """Return how much larger |e1| at the middle of a strip may be than its least there, and the ellipse's |U d|^2."""
         margin = real(0.01) + real(2.0e-6) * (wp.abs(mx) + half_width)
         slack = real(0.01) + real(2.0e-6) * (wp.abs(my) + half_height)
         radius = u22 * (half_height + slack)

@@ -25,8 +25,8 @@ def make_rotations(real):
 
     @wp.func
     def rotation(q: vec4) -> mat33:
-        # q is a unit quaternion wxyz. Every entry is of second degree, so a rounding error of the length only scales the
-        # matrix. With ones on the diagonal it would rotate the matrix, and move a needle's end across its width.
+        # q is a unit quaternion wxyz. Every entry is quadratic in q, so a rounding error of the length only scales the
+        # matrix. With ones on the diagonal, the error would rotate it, and move the end of a needle across its width.
         w = q[0]
         x = q[1]
         y = q[2]
@@ -40,7 +40,7 @@ def make_rotations(real):
 
     @wp.func
     def rotation_backward(q: vec4, v: mat33) -> vec4:
-        # gradient of sum(v * rotation(q)) for free q
+        # gradient of sum(v * rotation(q)) by q, not constrained to unit length
         w = q[0]
         x = q[1]
         y = q[2]
@@ -75,7 +75,7 @@ def make_types(real):
 
 
 SHRINKS = 6
-"""Divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
+"""Number of divisions by 2^16 that take `LARGEST_AXIS` below 2^16 px."""
 
 
 @functools.cache
@@ -170,7 +170,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         turned = wp.bool(True)
         sized = wp.bool(True)
         if wp.static(parameters == "covariances"):
-            e.axes = rotation * factor(q, log_scale)  # NaN where there is none, which is culled below
+            e.axes = rotation * factor(q, log_scale)  # NaN without a factor; culled below
         else:
             e.quat_length = r.quat_length(q)
             turned = e.quat_length >= real(SHORTEST_QUAT) and e.quat_length * real(SHORTEST_QUAT) <= real(1.0)

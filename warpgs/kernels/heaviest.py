@@ -1,7 +1,7 @@
 """The k heaviest Gaussians of each pixel with their blending weights, and the number of Gaussians that were blended.
 
-A separate pass, so that `blend` does not become slower. It decides alpha by the same operations as blending does. The list of a
-pixel is kept sorted in the result itself; a Gaussian that is heavier than the last one is inserted.
+This is a separate pass, so that `blend` does not become slower. It computes alpha by the same operations as `blend`. The list
+of a pixel is kept sorted in the result itself; a Gaussian that is heavier than the last one is inserted.
 """
 
 import functools
@@ -35,7 +35,7 @@ def make_kernel(real, tile_size: int):
     def insert(
         weight: real, i: wp.int32, first: wp.int32, k: wp.int32, weights: wp.array(dtype=real), ids: wp.array(dtype=wp.int32)
     ):
-        """Put a Gaussian into the list of k that begins at ``first``, behind those of its weight."""
+        """Put a Gaussian into the list of k that begins at ``first``, behind those of equal weight."""
         if weight > weights[first + k - 1]:
             j = first + k - 1
             while j > first and weights[j - 1] < weight:
@@ -132,9 +132,9 @@ def make_native(tile_size: int):
 def heaviest(
     projected: torch.Tensor, tiles: Tiles, k: int, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the k Gaussians of largest blending weight alpha * T in each pixel, the heaviest first; the nearer one of a tie.
+    """Return the k Gaussians of largest blending weight alpha * T in each pixel, heaviest first, of equal ones nearest first.
 
-    Not differentiable. Repeats bit for bit with any number of threads.
+    Not differentiable. Results repeat bit for bit with any number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
@@ -146,8 +146,8 @@ def heaviest(
         origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
-        Numbers of Gaussians from 0 to N - 1, int32, shape [C, H, W, k], -1 where fewer than k have a weight above 0; their
-        weights, shape [C, H, W, k], 0 there; and the number of all that were blended, int32, shape [C, H, W].
+        Ids of Gaussians from 0 to N - 1, int32, shape [C, H, W, k], -1 where fewer than k have a weight above 0; their
+        weights, shape [C, H, W, k], 0 where there are fewer; and the number of blended Gaussians, int32, shape [C, H, W].
 
     Raises:
         TypeError: The scalar type is neither float32 nor float64.

@@ -10,11 +10,11 @@ import warp as wp
 from warpgs.runtime import interop
 
 BOX = 32
-"""Points per box, boxes per box of the level above, and most boxes of the highest level. A query enters a box only if it is
-closer than the neighbours found so far."""
+"""Number of points in a box, of boxes in a box of the level above, and at most of boxes of the highest level. A query enters a
+box only if the box is closer than the neighbours found so far."""
 
 MAX_NEIGHBORS = 8
-"""Most neighbours of a query."""
+"""Largest number of neighbours of a query."""
 
 
 @functools.cache
@@ -45,7 +45,7 @@ def make_kernels(real):
 
     @wp.func
     def insert(nearest: vec8, k: wp.int32, squared: real) -> vec8:
-        """Return the k smallest squared distances in ascending order, with one more taken into account."""
+        """Return the k smallest squared distances in ascending order, after inserting one more."""
         if squared < nearest[k - 1]:
             j = k - 1
             while j > 0 and nearest[wp.max(j - 1, 0)] > squared:

@@ -1,7 +1,7 @@
 """Median depth of binned Gaussians: where the transmittance of a pixel falls to one half.
 
-A separate pass, so that `blend` does not become slower. It ends as soon as each pixel of a tile is half covered. It computes
-alpha by the same operations as blending does, so that both agree exactly on the Gaussian at one half.
+This is a separate pass, so that `blend` does not become slower. For a tile, it ends as soon as each pixel is half covered. It
+computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at one half.
 """
 
 import functools
@@ -123,9 +123,9 @@ def median_depth(
 ) -> torch.Tensor:
     """Return the depth of the Gaussian at which a pixel's transmittance falls to one half or below. Not differentiable.
 
-    That is the median of depth under the blending weights, where they leave no more than half of the background. At an edge it
-    does not mix both surfaces, unlike the mean depth of `blend`. Where alpha, the result of `blend`, stays below 1/2, there is
-    none. Repeats bit for bit with any number of threads.
+    This is the median of depth under the weights of blending and of the background. At an edge it does not mix both surfaces,
+    unlike the mean depth of `blend`. There is none where alpha, the result of `blend`, is below 1/2. Results repeat bit for bit
+    with any number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

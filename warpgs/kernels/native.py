@@ -18,7 +18,7 @@ def make_functions():
 
     @wp.func_native(source("native_compact.cu", BLOCK=BLOCK))
     def compact(item: int, wanted: int) -> int:
-        """Return the wanted items of the block's threads, dealt to its first threads in order; -1 for the others.
+        """Return the wanted items of the block's threads, assigned to its first threads in order; -1 for other threads.
 
         All BLOCK threads of the block must call it.
         """
@@ -51,7 +51,7 @@ def make_functions():
 
     @wp.func_native(source("native_holder.cu"))
     def holder(running_sum: int, item: int) -> int:
-        """Return the first lane of the warp whose running sum exceeds ``item``; the last lane where none does."""
+        """Return the first lane of the warp whose running sum exceeds ``item``, or the last lane."""
         ...
 
     return SimpleNamespace(
@@ -75,7 +75,7 @@ def make_color(bases: int):
         sh: wp.array2d(dtype=wp.vec3), n: int, count: int, weights: values, v: wp.vec3, add: int,
         v_sh: wp.array2d(dtype=wp.vec3),
     ) -> values:  # fmt: skip
-        """Return the weights' gradient of `color` for upstream ``v``; store (0 past ``count``) or add that of the row."""
+        """Return the weights' gradient of `color` for upstream ``v``; store (0 past ``count``) or add the row's gradient."""
         ...
 
     return SimpleNamespace(color=color, color_backward=color_backward)

@@ -37,7 +37,7 @@ def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
     """Return the logits of opacities that are multiplied by a factor.
 
     Args:
-        logits: Logits of opacities, float32, shape [N]; a NaN stays one.
+        logits: Logits of opacities, float32, shape [N]; a NaN stays NaN.
         factor: Factor, in (0, 1).
 
     Returns:

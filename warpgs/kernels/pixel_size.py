@@ -1,4 +1,4 @@
-"""Sizes of a pixel at Gaussians: a fraction of it in the training camera that samples each most finely."""
+"""Sizes of a pixel at Gaussians: a fraction of the pixel of the training camera that samples a Gaussian most finely."""
 
 import functools
 
@@ -10,8 +10,8 @@ from warpgs.runtime import interop
 SMALLEST = 1e-12
 """Smallest size [u]: that of a Gaussian at a camera, or in no camera's image."""
 COLUMNS = 9
-"""Numbers of a camera: centre [u] (3), axis of view in the world (3), focal length [px], cosine of the angle between the axis
-and the border of the image, and 1 where pixels are of equal angle, so that their size grows by distance, else 0: by depth."""
+"""Number of values of a camera: centre [u] (3), axis of view in the world (3), focal length [px], cosine of the angle between
+the axis and the border of the image, and 1 if the size of a pixel grows with distance (fisheye), 0 if with depth."""
 
 
 @functools.cache

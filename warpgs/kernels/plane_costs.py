@@ -25,7 +25,7 @@ PLANES = 16
 WHITE = 4095
 """Brightness 1 as an integer: so fine that rounding is far below the noise of 8-bit images."""
 LOW = WHITE + 1
-"""Added to colours while they are interpolated, so that those outside, -`WHITE`, are above 0."""
+"""Added to colours while they are interpolated, so that colours outside, -`WHITE`, are above 0."""
 MIDDLE = 2048
 """Subtracted from colours before they are multiplied, which keeps sums small."""
 MAX_RADIUS = 3
@@ -57,7 +57,7 @@ def make_kernel():
         y: wp.int32, pitch: wp.int32, images: wp.array(dtype=wp.int32), offset: wp.int32, other_width: wp.int32,
         other_height: wp.int32, h: wp.array(dtype=wp.float32), first: wp.int32, ring: wp.array(dtype=wp.int32), into: wp.int32,
     ):  # fmt: skip
-        """Write a row of the other image as the first one would see it, centred colours, below -MIDDLE outside."""
+        """Write a row of the other image as the first camera sees it: centred colours, below -MIDDLE outside."""
         fy = float(y)
         cx = h[first + 1] * fy + h[first + 2]
         cy = h[first + 4] * fy + h[first + 5]
@@ -97,7 +97,7 @@ def make_kernel():
         own: wp.array(dtype=wp.int32), row: wp.int32, ring: wp.array(dtype=wp.int32), slot: wp.int32, sign: wp.int32,
         sums: wp.int32, side: wp.int32, pitch: wp.int32,
     ):  # fmt: skip
-        """Add a row, or take it away, to the sums over the columns of windows, which lie behind the rows in ``ring``."""
+        """Add a row to the sums over the columns of windows, or subtract it; the sums lie behind the rows in ``ring``."""
         s = ints()
         q = ints()
         p = ints()
@@ -234,7 +234,7 @@ def make_kernel():
 
 
 def _packed(gray: np.ndarray) -> np.ndarray:
-    """Return colours with those to their right in the upper half, int32, with a frame of one pixel that is outside."""
+    """Return colours with their right neighbours in the upper half, int32, in a frame of one pixel that is outside."""
     framed = np.ones((gray.shape[0] + 3, gray.shape[1] + 2), np.int32)
     framed[1:-2, 1:-1] = _whole(gray) + LOW
     framed = framed.ravel()
@@ -260,12 +260,12 @@ def plane_costs(
 ) -> torch.Tensor:
     """Return the disagreement of an image with others, each seen by the homographies of D planes.
 
-    The cost of one other image is 0.5 (1 - correlation). Their mean and their smallest count one half each: an image that does
-    not see the point counts, but cannot outvote one that does.
+    The cost of one other image is 0.5 (1 - correlation). The result is half the mean of these costs plus half the smallest: an
+    image that does not see the point contributes, but cannot outvote one that does.
 
     Args:
         gray: Brightness in [0, 1], float32, shape [H, W].
-        others: The same of N other images, of any size.
+        others: Brightness of N other images, of any size.
         homographies: H from pixel centres at integers to those of each other image, positive in front of its camera,
             shape [D, N, 3, 3].
         window: Side of the square in which pixels are correlated [px], odd, at most 2 `MAX_RADIUS` + 1.

@@ -1,6 +1,6 @@
 """Depths of a plane sweep on a CPU: the best plane of each pixel, and whether another view's depth returns to the pixel.
 
-In float64, a thread a pixel; nothing is fused, so that depths are the same bits on any processor.
+In float64, with a task for each pixel. No operations are fused, so depths are the same bits on any processor.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from warpgs.scene import Camera
 BEHIND = 1e-9
 """Depth, in units of the first view's, up to which a point counts as behind a camera."""
 STEP = 1e-3
-"""Step of the inverse depth for the central difference of the sensitivity, as a fraction of it."""
+"""Step of the inverse depth for the central difference of the sensitivity, as a fraction of the inverse depth."""
 
 
 @functools.cache
@@ -131,8 +131,8 @@ def check_round_trip(
         second: Camera of the other view.
         own: Inverse depths of the view [1/u], float64, shape [H, W].
         found: Inverse depths of the other view [1/u], float64, at its size.
-        sensitivity: Change of depth per pixel [u/px], float64, shape [H, W]; set to that of this pair where it is smaller.
-        most: Distance [px] below which the pixel must be met.
+        sensitivity: Change of depth per pixel [u/px], float64, shape [H, W]; lowered to that of this pair where smaller.
+        most: Largest distance [px] between the pixel and the end of the round trip.
         min_parallax: Smallest angle between the two rays [deg].
 
     Returns:

@@ -24,7 +24,7 @@ def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of projected Gaussians with their tile counts, and of gradients, at each moment of a step."""
     one = FLOAT * PROJECTED_SIZE * sizes.count
     projected = one + FLOAT * sizes.count
-    # of chunks, the gradient of one and of all; the last copy is what statistics are computed from
+    # with chunks, the gradient of one and of all; statistics are computed from the last copy
     sums = 2 * one if sizes.chunked else 0
     return {
         BINNING: projected + sums, LOSS: projected, BLENDING: projected + max(one, sums),
@@ -56,7 +56,7 @@ def project_tensors(
         allocator: Provider of the results' memory.
 
     Returns:
-        Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
+        Projected Gaussians, shape [C, N, 12], and the number of tiles that each Gaussian touches, int32, shape [C, N].
     """
     means, real = inputs.means, interop.real_of(inputs.means)
     cameras, count, rule = len(inputs.viewmats), len(means), settings.rule
@@ -118,7 +118,7 @@ def project_gradients(
         allocator: Provider of the gradients' memory.
 
     Returns:
-        One gradient of the shape of each of the seven [...]; None where it is not wanted.
+        Gradients of the seven inputs, in their shapes [...]; None where not wanted.
     """
     real, device = interop.real_of(projected), projected.device
     t, (width, height), rule = make_types(real), settings.size, settings.rule
@@ -170,9 +170,10 @@ def project(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Project N Gaussians into C cameras (EWA, first order).
 
-    Differentiable in the seven tensors. A Gaussian is culled, with zeros for results and gradients, where its depth is
-    below ``rule.near`` or above ``rule.far``, its opacity below the cut, its box outside the image, or a parameter that is
-    read not finite or outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6).
+    Differentiable in the seven tensors. A Gaussian is culled if its depth is below ``rule.near`` or above ``rule.far``, its
+    opacity is below the cut, or its box is outside the image. It is also culled if a parameter that is read is not finite or
+    outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients of
+    culled Gaussians are zero.
     Derivation of the backward pass: docs/project.md.
 
     Args:
@@ -195,8 +196,8 @@ def project(
         distortion: Coefficients of the camera model, shape [C, P]; None for a model without. Not differentiable.
 
     Returns:
-        ``projected`` [C, N, 12], laid out as `PROJECTED_SIZE` says, and ``tile_counts`` [C, N] int32, the number of tiles
-        each touches (0 where culled; no gradient).
+        ``projected`` [C, N, 12], with the layout of `PROJECTED_SIZE`, and ``tile_counts`` [C, N] int32, the number of
+        tiles that each Gaussian touches (0 where culled; no gradient).
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

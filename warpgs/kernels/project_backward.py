@@ -52,7 +52,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         log_scale: vec3
         position: vec3  # of the position in the camera
         turned: mat33  # of camera rotation times Gaussian rotation, or times the factor of the covariance
-        unit: vec4  # no gradient: the quaternion at length 1; not of covariances
+        unit: vec4  # no gradient, but the unit quaternion; unused for covariances
         K: mat33
 
     @wp.func

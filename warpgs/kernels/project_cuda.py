@@ -101,7 +101,7 @@ def make_forward(
         i: int, n: int, view: m.mat44, means: wp.array(dtype=m.vec3), coefficients: wp.array2d(dtype=m.vec3), sh_count: int,
         projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
     ):  # fmt: skip
-        """Write the colour of row i; where it is not finite, Gaussian n is culled after all."""
+        """Write the colour of row i; if the colour is not finite, Gaussian n is culled after all."""
         d = m.direction(means[n], view)
         y = basis(vec3(d[0], d[1], d[2]))
         color = vec3(real(0.5), real(0.5), real(0.5))
@@ -122,7 +122,7 @@ def make_forward(
             tile_counts[i] = 0
             store(projected, i, vec12())
 
-    # a grid-stride loop would need half as many registers more for the arguments
+    # a grid-stride loop would need half as many registers again, for the arguments
     @wp.kernel(enable_backward=False, grid_stride=False, module=module)
     def forward(
         begin: int,
@@ -169,7 +169,7 @@ def make_backward(
 ):  # fmt: skip
     """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
 
-    In float32 the Gaussians that some camera sees are dealt to the first threads of each block.
+    In float32 the Gaussians that some camera sees are assigned to the first threads of each block.
 
     Args:
         real: wp.float32 or wp.float64.

@@ -30,7 +30,7 @@ class ProjectSettings:
     size: tuple[int, int]
     """Width and height of the image [px]."""
     window: tuple[int, int, int, int]
-    """Left, top, width and height [px] of the part that is rendered, from a tile's corner on."""
+    """Left, top, width and height [px] of the part that is rendered; left and top are multiples of ``tile_size``."""
     sh_count: int
     """Spherical-harmonics coefficients a channel that are used."""
     rule: Rule
@@ -46,7 +46,7 @@ class ProjectSettings:
     """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)) (docs/project.md)."""
 
     def variant(self) -> tuple[str, str, bool, int]:
-        """Return what the kernels are compiled for."""
+        """Return the settings that are compiled into the kernels."""
         return self.camera_model, self.parameters, self.antialiased, sh.bases_for(self.sh_count)
 
 
@@ -73,13 +73,13 @@ class ProjectInputs(NamedTuple):
     """Factors of the opacities, at least 0, shape [N]; shape [0] for none. They have no gradient."""
 
     def detached(self) -> Self:
-        """Return the same tensors [...] without their history."""
+        """Return the same tensors [...], detached from autograd."""
         return self._make(t.detach() for t in self)
 
 
 @functools.lru_cache(maxsize=64)
 def nothing(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
-    """Return a tensor without entries [...], the same one each time: to ask for one takes 5 us."""
+    """Return a tensor without entries [...], the same one each time, since making one takes 5 us."""
     with torch.inference_mode(False):  # an inference-mode tensor could not be saved for a backward pass
         return torch.empty(shape, dtype=dtype, device=device)
 

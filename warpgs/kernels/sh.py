@@ -30,7 +30,7 @@ C422 = 0.47308734787878004  # 3/8 sqrt(5/pi)
 C444 = 0.6258357354491761  # 3/16 sqrt(35/pi)
 
 BASES = 16
-"""Number of basis values that kernels hold for degrees 0 to 3; `bases_for` has that of more."""
+"""Number of basis values that kernels hold for degrees 0 to 3; see `bases_for` for degree 4."""
 
 
 def coefficient_count(degree: int) -> int:
@@ -50,7 +50,7 @@ def bases_for(count: int) -> int:
 
 
 def basis(directions: torch.Tensor) -> torch.Tensor:
-    """Return the 25 basis values [N, 25] at unit directions [N, 3], for references; kernels use `make_functions`."""
+    """Return the 25 basis values [N, 25] at unit directions [N, 3], for reference results; kernels use `make_functions`."""
     x, y, z = directions.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     values = [
@@ -129,7 +129,7 @@ def make_functions(real, bases: int = BASES):
 
     @wp.func
     def backward_of_4(d: vec3, w: values) -> vec3:
-        """Return the part of `basis_backward` by the values of degree 4."""
+        """Return the part of `basis_backward` from the values of degree 4."""
         x = d[0]
         y = d[1]
         z = d[2]
@@ -166,7 +166,7 @@ def make_functions(real, bases: int = BASES):
 
     @wp.func
     def basis_backward(d: vec3, w: values) -> vec3:
-        """Return the gradient of sum(w * basis(d)) for a free vector d."""
+        """Return the gradient of sum(w * basis(d)) by d, not constrained to unit length."""
         x = d[0]
         y = d[1]
         z = d[2]

@@ -1,6 +1,7 @@
 """Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
 
-Five sums run through the window, of a, b, a^2, b^2 and (a - b)^2; backward three. Images are flat rows of width * channels.
+The forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window, the backward pass three fields. Images are flat rows of
+width * channels.
 """
 
 import functools
@@ -116,7 +117,7 @@ class _Launcher:
         return interop.view(tensor.view(-1), self.real)
 
     def padded(self, count: int, like: torch.Tensor) -> list[interop.View]:
-        """Return zeros for that many sums at each element, with padding beside each row."""
+        """Return zeros for ``count`` sums at each element, with padding beside each row."""
         return [self.flat(m) for m in like.new_zeros(count, self.rows * (self.columns + 2 * PADDING))]
 
     def launch(self, kernel, inputs: list, outputs: list) -> None:
@@ -124,7 +125,7 @@ class _Launcher:
         interop.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
 
     def launch_blocks(self, kernel, inputs: list, sums: int, outputs: list, like: torch.Tensor) -> None:
-        """Launch a kernel of one task per block of rows, with workspace for that many sums."""
+        """Launch a kernel of one task per block of rows, with workspace for ``sums`` sums."""
         workspace = like.new_empty(self.tasks * sums * (self.columns + 2 * PADDING))
         inputs = [*inputs, self.height, self.blocks, self.columns, self.flat(workspace), *map(self.flat, outputs)]
         interop.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)

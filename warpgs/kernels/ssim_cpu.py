@@ -15,7 +15,7 @@ SIGMA = 1.5
 C1 = 0.01**2
 """(K1 L)^2 of Wang et al. 2004 for a data range L of 1."""
 C2 = 0.03**2
-"""(K2 L)^2 of the same."""
+"""(K2 L)^2 of the same paper."""
 
 
 def _window() -> list[float]:
@@ -64,7 +64,7 @@ def make_functions(real):
 
     @wp.func
     def across(m: wp.array(dtype=real), first: wp.int32, lane: wp.int32) -> real:
-        """Return the weighted sum over the columns of the window; ``first`` + ``lane`` is its leftmost."""
+        """Return the weighted sum over the columns of the window; ``first`` + ``lane`` is the leftmost column."""
         o = at(first, lane)
         s = w5 * (m[o] + m[o + 10 * channels])
         s += w4 * (m[o + channels] + m[o + 9 * channels])
@@ -114,7 +114,7 @@ def make_kernels(real, summed: bool):
     """Make the kernels for a CPU, of one task per block of rows.
 
     The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
-    elements; the last step starts early rather than run over the end, and repeated elements get the same values.
+    elements; the last step starts early, to end with the row, and repeated elements get the same values.
 
     Args:
         real: wp.float32 or wp.float64.
@@ -148,7 +148,7 @@ def make_kernels(real, summed: bool):
             scratch[o + k] = real(0.0)
             scratch[o + PADDING + columns + k] = real(0.0)
 
-    # The eleven rows are spelled out: a loop inside the loop over lanes would keep that from vectorising.
+    # The eleven rows are written out: a loop inside the loop over lanes would keep the latter from vectorising.
 
     @wp.func
     def down_pairs(

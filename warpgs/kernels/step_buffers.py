@@ -1,6 +1,6 @@
-"""Bookkeeping of a captured step: it reads its settings at the start, and stores its loss at the end.
+"""Bookkeeping of a captured step, which reads its settings at the start and stores its loss at the end.
 
-Torch would launch about twenty kernels on a few numbers each, a tenth of a step's time.
+Torch would launch about twenty kernels on a few numbers each, which would take a tenth of a step's time.
 """
 
 import functools
@@ -27,7 +27,7 @@ class Setting(IntEnum):
     MEANS_LR = 2
     """Learning rate of the means [u]."""
     RED = 3
-    """Red of the colour behind the view, less that behind the scene; green and blue follow (`SHIFT`)."""
+    """Red of the view's background minus red of the scene's background; green and blue follow (`SHIFT`)."""
     GREEN = 4
     BLUE = 5
     STEP = 6
@@ -46,7 +46,7 @@ LANES = 16
 SEGMENT = 4096
 """Elements whose errors a task sums on a CPU, a multiple of `LANES`."""
 SHIFT = slice(Setting.RED, Setting.BLUE + 1)
-"""Columns of the colour."""
+"""Columns of the difference of the backgrounds."""
 
 
 @functools.cache
@@ -181,10 +181,10 @@ def begin_step(
 def end_step(
     loss: torch.Tensor, mse: torch.Tensor, counter: torch.Tensor, stop: torch.Tensor, history: torch.Tensor
 ) -> torch.Tensor:
-    """Store a step's result, and count the step unless something stops the batch: then it will be taken again.
+    """Store a step's result, and count the step, unless something stops the batch: then the step is repeated.
 
     Args:
-        loss: Float32, shape []. Where it is not finite, ``stop`` becomes NOT_FINITE.
+        loss: Loss, float32, shape []. If it is not finite, ``stop`` becomes NOT_FINITE.
         mse: Mean squared error, float32, shape [].
         counter: Number of the step, int64, shape [1]; increased by one if the batch continues.
         stop: 0, or the reason to stop, int32, shape [1].

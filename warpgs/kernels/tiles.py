@@ -24,12 +24,12 @@ BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 """Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
 MAX_INSTANCES = interop.MAX_SIZE // 2
-"""Most instances: a radix sort needs one array of twice that size."""
+"""Largest number of instances: a radix sort needs one array of twice that size."""
 
 
 @dataclass(frozen=True)
 class Tiles:
-    """(Gaussian, tile) instances, sorted by tile and within a tile by depth; ties go by Gaussian number.
+    """(Gaussian, tile) instances, sorted by tile and within a tile by depth; equal depths are in the order of Gaussian numbers.
 
     ``i`` below is a flat Gaussian number in [0, C N), a tile number is ``camera * tiles + row * columns + column``.
     """
@@ -41,8 +41,8 @@ class Tiles:
     gaussian_ids: torch.Tensor
     """Flat Gaussian number of each instance, int32, shape [M]."""
     slots: torch.Tensor
-    """Position of an instance before the tile sort, int32, shape [M]: there the instances of a Gaussian are neighbours,
-    so each owns a row that gradients can be written to and then summed in a fixed order, without atomics."""
+    """Position of an instance before the tile sort, int32, shape [M]. Before the sort, the instances of a Gaussian are
+    neighbours. So each owns a row for its gradient, and the rows are summed in a fixed order, without atomics."""
     starts: torch.Tensor
     """First slot of each Gaussian that has any, int32, shape [C * N]."""
     counts: torch.Tensor
@@ -52,10 +52,10 @@ class Tiles:
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
     visible: int = 0
-    """Number of Gaussians that have instances; with a capacity, at most so many."""
+    """Number of Gaussians that have instances; with a capacity, an upper bound."""
 
     def tensors(self) -> tuple[torch.Tensor, ...]:
-        """Return all tensors, with the shapes [...] named there, in the order of the constructor."""
+        """Return all tensors [...], in the order of the constructor."""
         return self.ranges, self.gaussian_ids, self.slots, self.starts, self.counts, self.tile_ids, self.total
 
 
@@ -76,15 +76,15 @@ class InstanceMemory:
     budget: int | None = None
     """Bytes; None for four fifths of the free memory."""
     capacity: int | None = None
-    """Number of instances to allocate for, without asking the device how many there are, so that the work can be captured as a
-    CUDA graph; None for as many as there are. Unused entries are marked as no tile's."""
+    """Number of instances to allocate for. The actual number is then not read from the device, so the work can be captured as a
+    CUDA graph. None for the actual number. Unused entries have a number that no tile has."""
     overflow: torch.Tensor | None = None
     """Set to 1 where there are more instances than the capacity: the lists are then cut short and must not be used. Int32,
     shape [1]; needed with a capacity."""
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
     visible: Visible | None = None
-    """Capacity for visible Gaussians, with one for instances; None to sort all Gaussians."""
+    """Capacity for visible Gaussians, if there is one for instances; None to sort all Gaussians."""
 
 
 AS_NEEDED = InstanceMemory()
@@ -117,7 +117,7 @@ def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
-    """Return the bytes of the lists at each moment of a step; the owners of instances are given up once these are sorted."""
+    """Return the bytes of the lists at each moment of a step; the owners of instances are freed after the sort."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
     ranges = 2 * FLOAT * columns * rows + (FLOAT + 8) * sizes.count  # of each tile; first slots and ends of each Gaussian
     sorting = (2 * 2 * FLOAT + 2 * 8) * sizes.count  # depths and order twice, two running sums of int64
@@ -138,10 +138,9 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
         return
     limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances"
     raise ResourceError(
-        f"binning {visible:,} visible Gaussians into tiles makes {total:,} (Gaussian, tile) instances, "
-        f"{total / max(visible, 1):.0f} of {tiles} tiles each on average, which needs {needed / 2**30:.2f} GiB; the limit is "
-        f"{limit}. Many Gaussians are probably far too large: check their scales, or render smaller images, fewer cameras "
-        "at once, or raise the memory budget."
+        f"{visible:,} visible Gaussians touch {total / max(visible, 1):.0f} of {tiles} tiles on average; their {total:,} "
+        f"(Gaussian, tile) instances need {needed / 2**30:.2f} GiB, and the limit is {limit}. Many Gaussians are probably far "
+        "too large: check their scales, or render smaller images, fewer cameras at once, or raise the memory budget."
     )
 
 
@@ -150,8 +149,8 @@ def _depth_order(
 ) -> tuple[torch.Tensor, int, int]:
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
 
-    With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds. Those
-    that are not come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N],
+    With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds. Invisible
+    ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N],
     ``tiles`` the tiles of an image.
     """
     device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
@@ -215,12 +214,12 @@ def bin_tiles(
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tile_counts: Tiles that each touches, int32, shape [C, N].
-        width: Image width [px].
-        height: Image height [px].
+        tile_counts: Number of tiles that each Gaussian touches, int32, shape [C, N].
+        width: Width of the image or window [px].
+        height: Height of the image or window [px].
         rule: Cut-offs, the same as given to `project`.
         tile_size: Side of a tile [px].
-        origin: Left and top [px] of the window of that width and height which `project` was given; a tile's corner.
+        origin: Left and top [px] of the window given to `project`, multiples of ``tile_size``.
         memory: Memory of the instances; M is its capacity where it has one.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
         listed: Tiles that get their instances, bool, shape [C * tiles]: the others stay empty. None for all.

@@ -15,8 +15,8 @@ EACH = 4
 def make_find_ranges(slotted: bool, native: bool):
     """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`.
 
-    A thread takes `EACH` instances on CUDA (``native``), else one. They lie far apart, so that neighbours of a warp read
-    neighbours.
+    A thread takes `EACH` instances on CUDA (``native``), else one. The instances of a thread lie far apart, so that
+    neighbouring threads read neighbouring instances.
     """
     each = wp.constant(EACH if native else 1)
     ints = wp.types.vector(each, wp.int32)
@@ -90,7 +90,7 @@ def make_emit(real, slotted: bool):
 
     Args:
         real: wp.float32 or wp.float64.
-        slotted: True to write the slot and the owner of each instance; False to write its owner alone, instead of the slot.
+        slotted: True to write the slot and the owner of each instance; False to write only its owner, in place of the slot.
     """
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)

@@ -1,6 +1,6 @@
 """The kernel in plain Warp that writes the (Gaussian, tile) instances on a CPU.
 
-As in `project_cpu`, a task has `LANES` Gaussians; loops that the compiler vectorises find their rows and columns.
+As in `project_cpu`, a task processes `LANES` Gaussians; loops that the compiler vectorises find their rows and columns.
 """
 
 import functools

@@ -13,7 +13,7 @@ from warpgs.runtime.allocator import TORCH, Allocator
 
 
 def _of_sum(native: bool) -> tuple[int, int]:
-    """Return the threads of an entry of the running sums, and the items of each."""
+    """Return the number of threads for an entry of the running sums, and of items for a thread."""
     return (32, EACH) if native else (1, 1)
 
 
@@ -102,7 +102,7 @@ def make_kernels(real, native: bool):
             i = first + k * width
             here = passed + ((upto >> (8 * k)) & 255)
             j = here - 1
-            if touched[k] == 0:  # behind all visible ones, as far as there is room
+            if touched[k] == 0:  # behind all visible ones, within the limit
                 j = all_visible + i - here
             if i <= last and j < limit:
                 keys[j] = key[k]
@@ -126,7 +126,7 @@ def make_kernels(real, native: bool):
 def running_counts(
     counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
 ) -> torch.Tensor:  # fmt: skip
-    """Return running sums of tile counts and visible Gaussians in one, int64, shape [S]: `split_sum` takes the last apart.
+    """Return running sums of tile counts and visible Gaussians in one number, int64, shape [S]; `split_sum` splits the last.
 
     A visible Gaussian adds its tile count and 2^`sum_bits`.
 
@@ -145,7 +145,7 @@ def running_counts(
 
 
 def sum_bits(count: int) -> int:
-    """Return the low bits of a running sum that count instances; the others count up to ``count`` visible Gaussians."""
+    """Return how many low bits of a running sum count instances; the other bits count up to ``count`` visible Gaussians."""
     return 63 - count.bit_length()
 
 

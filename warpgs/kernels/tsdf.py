@@ -1,7 +1,7 @@
 """Fusion of depth maps into a grid of truncated signed distances, and of images into colours of points.
 
 The method of Curless and Levoy 1996 ("A Volumetric Method for Building Complex Models from Range Images"): a grid point keeps
-the weighted mean of its distances before the surface along the rays of all views, cut off at a truncation. Nothing is
+the weighted mean of its truncated distances in front of the surface along the rays of all views. Nothing is
 differentiable.
 """
 
@@ -29,7 +29,7 @@ class DistanceGrid:
     truncation: float
     """Largest distance from a surface that is stored [u]."""
     distances: torch.Tensor
-    """Mean distance before the surface over the truncation, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
+    """Mean distance in front of the surface, in truncations, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
     weights: torch.Tensor
     """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
 
@@ -199,11 +199,11 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
     """Return the cosine of the angle between each pixel's ray and the normal of the surface that it meets.
 
     Args:
-        depth: z-depth [u], infinite where nothing is met, 0 where nothing is known, contiguous, shape [H, W].
-        camera: Pinhole camera, arrays of numpy, of that size.
+        depth: z-depth [u], infinite where there is no surface, 0 where unknown, contiguous, shape [H, W].
+        camera: Pinhole camera of the size of ``depth``, arrays of numpy.
 
     Returns:
-        In [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where nothing is known.
+        In [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where it is unknown.
 
     Raises:
         UsageError: The camera is not a pinhole.
@@ -222,9 +222,9 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
     Args:
         grid: The grid.
         camera: Pinhole camera, arrays of numpy.
-        depth: z-depth [u], infinite where nothing is met, contiguous, shape [H, W]. It is interpolated between the pixels of a
-            surface, and not across its edges.
-        pixel_weights: Weight of each pixel, at least 0, shape [H, W]; 0 where nothing is known.
+        depth: z-depth [u], infinite where there is no surface, contiguous, shape [H, W]. It is interpolated between the pixels
+            of a surface, and not across its edges.
+        pixel_weights: Weight of each pixel, at least 0, shape [H, W]; 0 where depth is unknown.
 
     Raises:
         ResourceError: The grid has more points than kernels can index.
@@ -251,7 +251,7 @@ def gather_colors(
     points: torch.Tensor, tolerance: float, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
     image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Add to each point the colour that one view sees there, in place, where the point lies on the surface that it sees.
+    """Add to each point the colour that one view sees there, in place, where the point lies on the surface that the view sees.
 
     Args:
         points: Positions [u], shape [N, 3].

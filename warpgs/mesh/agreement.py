@@ -19,13 +19,13 @@ from warpgs.priors.view_choice import matching_views, shared_sight
 from warpgs.scene import Camera
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth: that of coverage (decision 019)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth, as for coverage (decision 019)."""
 NEIGHBOURS = 16
-"""Most views that each view is compared with: the nearest that see the same from another angle."""
+"""Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
 MAX_PIXELS = 2**26
 """Most pixels of all stored maps, 256 MiB; with more, every map is thinned alike."""
 BOUNDS = (0.02, 0.98)
-"""Quantiles of a view's depths that lie between its nearest and farthest surface."""
+"""Quantiles of a view's depths that are taken as the depths of its nearest and farthest surface."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class DepthMap:
     step: int
     """Pixels from one stored depth to the next."""
     bounds: tuple[float, float]
-    """Smallest and largest depth [u] of most of the surface."""
+    """Smallest and largest depth [u] of the surface, without outliers (`BOUNDS`)."""
 
 
 def depth_map(view: SurfaceView, views: int) -> DepthMap:
@@ -67,8 +67,8 @@ def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
 def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     """Return a view without the depths that no other view confirms.
 
-    A depth is kept where at least one other view has a surface at that point, nearer than `TOLERANCE`, or where no other view
-    has a surface in that direction, as outside of all other images. So one view alone keeps all.
+    A depth is kept if at least one other view has a surface within `TOLERANCE` of that point. It is also kept if no other view
+    has a surface in that direction, as outside of all other images. So a single view keeps all its depths.
 
     Args:
         view: The view.
@@ -85,11 +85,11 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
 
 
 def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
-    """Return how far the points of a depth map [H, W] lie from the surface that another view has there, as a fraction of depth.
+    """Return the difference in depth of the points of a map [H, W] from another view's surface, as a fraction of the depth.
 
-    Of the four depths around, the nearest to the point counts, since depth varies within a pixel on a slanted surface. Infinite
-    where the pixel has no depth, outside of the other image and where all four have none. Without a product of matrices: its
-    bits would depend on the processor.
+    A point is compared with the nearest of the four depths around its projection, since depth varies within a pixel on a
+    slanted surface. The result is infinite where the pixel has no depth, outside of the other image, and where all four depths
+    are missing. No product of matrices is used: its bits would depend on the processor.
     """
     rotation, translation = relative_pose(camera, other.camera)
     height, width = depth.shape

@@ -19,10 +19,10 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
 
 COLOR_TOLERANCE = 1.0
-"""Distance in truncations up to which a vertex counts as seen by a view that gives it colour."""
+"""Largest distance, in truncations, between a vertex and the surface of a view that gives it colour."""
 
 MIN_FACES = 4
-"""Fewest triangles of a body."""
+"""Smallest number of triangles that enclose a volume."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class MeshOptions:
     """Options of `fuse`."""
 
     voxel: float | None = None
-    """Distance of the grid points [u]; None for one that follows from ``resolution``."""
+    """Distance of the grid points [u]; None to derive it from ``resolution``."""
     resolution: int | None = None
-    """Voxels along the longest side of the grid; None for 256, or fewer where pixels show no more."""
+    """Voxels along the longest side of the grid; None for 256, or fewer if the images resolve less."""
     max_faces: int = 200_000
     """Largest number of triangles; larger meshes are simplified."""
     depth: str = "median"
@@ -42,7 +42,7 @@ class MeshOptions:
         """Check the options, before any view is rendered.
 
         Raises:
-            UsageError: One is out of its range, or two exclude each other.
+            UsageError: An option is out of its range, or two options exclude each other.
         """
         if self.depth not in DEPTHS:
             raise UsageError(f"--depth {self.depth!r} is not one of {', '.join(DEPTHS)}")
@@ -71,7 +71,7 @@ class FusedMesh:
     removed: int
     """Number of small parts that were removed."""
     uncolored: int
-    """Number of vertices that no view saw, and that have the colour of the nearest that was seen."""
+    """Number of vertices that no view saw; each has the colour of the nearest vertex that was seen."""
 
 
 def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor) -> DistanceGrid:
@@ -93,8 +93,8 @@ def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap
         integrate(grid, view.camera, view.depth, view.weights)
     if not confirmed:
         raise DataError(
-            "no depth of a training view is confirmed by another, so nothing is left for a mesh; fit again with more steps, or "
-            "with more photographs that show the same surfaces"
+            "no depth of a training view is confirmed by another view, so there is no surface to mesh; fit again with more "
+            "steps, or with more photographs that show the same surfaces"
         )
     return grid
 
@@ -118,7 +118,7 @@ def fuse(
         planned: Called with the grid, and its memory as text, before the grid is allocated.
 
     Raises:
-        DataError: No camera sees a surface, or none confirms what another sees.
+        DataError: No camera sees a surface, or no depth is confirmed by another camera.
         ResourceError: The grid does not fit into memory.
         UsageError: There is no camera, one has no pinhole of the same K, or an option is out of range.
     """
@@ -151,7 +151,7 @@ def vertex_colors(mesh: Mesh, views: SurfaceViews, truncation: float) -> tuple[n
     Args:
         mesh: The mesh, V vertices.
         views: Surface that each camera sees, at least one.
-        truncation: Largest distance from a surface that the grid of the mesh stored [u].
+        truncation: Truncation of the distances in the grid of the mesh [u].
 
     Returns:
         Colours in [0, 1], float32, shape [V, 3], and the number of vertices that no view sees.

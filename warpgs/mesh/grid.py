@@ -14,15 +14,15 @@ from warpgs.runtime.device_memory import available_bytes
 from warpgs.runtime.interop import MAX_SIZE
 
 RESOLUTION = 256
-"""Voxels along the longest side of the grid, where neither a size nor a number is given."""
+"""Voxels along the longest side of the grid, if neither ``voxel`` nor ``resolution`` is given."""
 MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
 TRUNCATION = 4.0
 """Truncation in voxels."""
 FENCE = 3.0
-"""Multiples of the interquartile range outside the quartiles beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
+"""Distance outside the quartiles, in interquartile ranges, beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
 Data Analysis)."""
 QUANTILES = (0.005, 0.995)
-"""Quantiles of the surface points along an axis between which the grid lies, if the fences are wider."""
+"""Quantiles of the surface points along an axis that bound the grid, where `FENCE` allows a wider one."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14
@@ -76,7 +76,7 @@ def plan_grid(
         footprints: Width of a pixel at each [u], shape [N].
         voxel: Distance of the grid points [u]; None to derive it from ``resolution``.
         resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
-            what the median pixel shows.
+            the median footprint.
 
     Raises:
         DataError: No camera sees a surface.

@@ -1,7 +1,7 @@
 """Depth of a surface along each ray: where the Gaussians of a pixel are densest, and the fraction of their weight there.
 
-The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. So each Gaussian has the depth
-at which its density along the ray is largest.
+The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. So here the depth of a
+Gaussian is that at which its density along the ray is largest.
 """
 
 from __future__ import annotations
@@ -12,25 +12,25 @@ from warpgs.geometry import rotation_matrices
 from warpgs.scene import Camera, Gaussians
 
 CONTRIBUTORS = 32
-"""Heaviest Gaussians of a pixel that are looked at."""
+"""Number of heaviest Gaussians of a pixel that are used."""
 BAND = 0.02
 """Largest difference from the median depth, as a fraction of it, that counts as the same surface."""
 MIN_SHARE = 0.5
-"""Least fraction of the weights within `BAND` of the median where a pixel shows a surface
+"""Smallest fraction of the weights within `BAND` of the median for which a pixel shows a surface
 (docs/decisions/027-mesh-depth.md)."""
 BLOCK = 2**15
 """Pixels at a time: 38 MB for the matrices of their contributors."""
 
 
 def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the map from camera space to the space in which a Gaussian is isotropic, up to its scale, and its position.
+    """Return maps from camera space to spaces in which each Gaussian is isotropic, up to scale, and the Gaussians' means.
 
     Args:
         gaussians: N Gaussians.
         camera: Camera, arrays of numpy.
 
     Returns:
-        Matrices, shape [N, 3, 3], with entries of at most 1: rows are divided by the ratio of that axis to the shortest one.
+        Matrices, shape [N, 3, 3], with entries of at most 1: each row is divided by the ratio of its axis to the shortest axis.
         And the means in camera space [u], shape [N, 3].
     """
     view = torch.as_tensor(camera.viewmat, dtype=gaussians.means.dtype, device=gaussians.means.device)
@@ -60,7 +60,7 @@ def densest_depths(matrices: torch.Tensor, means: torch.Tensor, rays: torch.Tens
 
 
 def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
-    """Return the depth [P] at which half of the weights [P, k] lies no farther; depths [P, k] of weight 0 do not count."""
+    """Return the weighted median [P] of depths [P, k] with weights [P, k]; depths of weight 0 are ignored."""
     order = torch.where(weights > 0, depths, torch.inf).argsort(dim=1, stable=True)
     sums = weights.gather(1, order).cumsum(1)
     half = (2 * sums >= sums[:, -1:]).int().argmax(1, keepdim=True)

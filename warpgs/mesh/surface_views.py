@@ -21,11 +21,11 @@ DEPTHS = ("median", "mean")
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface."""
 EMPTY = 0.02
-"""Opacity below which a pixel shows that nothing is there: five of 255 levels."""
+"""Opacity below which a pixel is empty: five of 255 levels."""
 SAMPLES = 200_000
-"""Pixels of all views that are looked at to find where the surfaces are."""
+"""Number of pixels of all views that are sampled to find the extent of the surfaces."""
 KEPT_PIXELS = 2**24
-"""Most pixels of all views that are rendered once and kept, 320 MiB; with more, every use renders again."""
+"""Largest number of pixels of all views that are kept after one render, 320 MiB; with more, every use renders again."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
 
 
 class SurfaceViews:
-    """Surfaces that all cameras see, in their order, as often as they are asked for.
+    """Surfaces that the cameras see, in the order of the cameras; they can be iterated several times.
 
     Up to `KEPT_PIXELS` pixels are kept; with more, one view is held at a time.
     """
@@ -96,7 +96,7 @@ class SurfaceViews:
         """Yield what each camera sees of the surface.
 
         Args:
-            purpose: Words for the line of progress.
+            purpose: Text for the line of progress.
 
         Raises:
             UsageError: A camera has no pinhole of the same K, or the depth is unknown.
@@ -114,7 +114,7 @@ def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarra
 
     Args:
         view: The view.
-        count: Number of pixels looked at, about.
+        count: Approximate number of pixels to sample.
 
     Returns:
         Positions [u], shape [N, 3], and the width of a pixel there [u], shape [N].

@@ -9,16 +9,16 @@ from warpgs.kernels.tsdf import DistanceGrid
 from warpgs.scene import Mesh
 
 MAX_JUMP = 1.1
-"""Largest difference of the distances at two neighbouring grid points, over the truncation, that a surface may lie between.
-With less, surfaces at grazing angles are left out; with more, false triangles extend behind depth edges. Chosen, as
-the truncation was, on a demo scene of another seed than the one that is reported (docs/decisions/019-thresholds.md)."""
+"""Largest difference of the distances at two neighbouring grid points with a surface between them, in truncations. A smaller
+limit leaves out surfaces at grazing angles; with a larger one, false triangles extend behind depth edges. The limit and the
+truncation were chosen on a demo scene of another seed than the reported one (docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
-    "no surface inside the grid; give a larger --voxel (a smaller one if it is near the size of the scene), or fit "
+    "no surface inside the grid; give a larger --voxel (a smaller one if voxels are as large as the scene), or fit "
     "with more steps"
 )
-"""Words where a grid holds no surface."""
+"""Message for a grid without a surface."""
 MIN_PART = 0.002
-"""Fraction of all triangles that a connected part has at least; smaller ones float in front of surfaces."""
+"""Smallest fraction of all triangles that a connected part needs to be kept; smaller parts float in front of surfaces."""
 
 
 def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -29,7 +29,7 @@ def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 def extract(grid: DistanceGrid) -> Mesh:
     """Return the surface where distances are 0, without colours.
 
-    It is left open where a view saw nothing: a triangle stays only where both grid points beside each of its vertices were
+    The surface is left open where no view looked: a triangle is kept only if both grid points beside each of its vertices were
     seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
 
     Args:
@@ -76,7 +76,7 @@ def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
 
 
 def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, int]:
-    """Return a mesh without connected parts of fewer triangles than that fraction of all, and the number of parts removed."""
+    """Return a mesh without connected parts of fewer triangles than ``fraction`` of all, and the number of parts removed."""
     number, part = parts(mesh)
     sizes = np.bincount(part, minlength=number)
     keep = sizes >= max(1.0, fraction * len(mesh.faces))
@@ -87,7 +87,7 @@ def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, in
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     """Return a mesh of at most about ``max_faces`` triangles, without colours; open edges stay where they are.
 
-    Edges collapse in the order of the quadric error (Garland and Heckbert 1997), by VTK. This part of it needs no graphics
+    Edges collapse in the order of the quadric error (Garland and Heckbert 1997), by VTK. This part of VTK needs no graphics
     library.
 
     Args:

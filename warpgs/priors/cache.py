@@ -64,7 +64,7 @@ class MapCache:
         Args:
             image: Colours, float32, shape [H, W, 3].
             names: Names of the maps.
-            decided_by: Everything else that the maps depend on, as JSON can hold it.
+            decided_by: All other values on which the maps depend, as JSON data.
             make: Function that computes the maps, float32 [H, W] in [0, 1] each.
 
         Returns:

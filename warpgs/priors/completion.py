@@ -10,7 +10,7 @@ SMOOTHNESS = (1e2, 1e4, 1e6)
 """Strengths of the smoother, tried in turn; a stronger one reaches farther, and the first that reaches a pixel is used
 there."""
 COLOR_SIGMA = 8.0
-"""Colour difference [1/255] at which neighbours stop having one depth, times e."""
+"""Colour difference [1/255] at which the weight between neighbours falls to 1/e."""
 MIN_FRACTION = 1e-3
 """Smallest fraction of a smoothed value that must come from consistent pixels."""
 

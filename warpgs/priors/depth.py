@@ -14,12 +14,12 @@ DEFAULTS = Preprocessing(384, 32, *HALF, output="disparity")
 CLIP = (0.5, 99.5)
 """Percentiles to which consistent inverse depths are clipped: one wrong match must not decide the range of the map."""
 COLOR_SIGMA = 8.0
-"""Colour difference [1/255] at which the smoother takes neighbours for different surfaces, times e."""
+"""Colour difference [1/255] at which the smoother's weight between neighbours falls to 1/e."""
 REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
-"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long one counts only where no
+"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long one matters only where no
 consistent depth is near."""
 MAX_ERROR_RATIO = 1e3
-"""Largest ratio of an error to the median error that matters: no consistent depth has a weight below a millionth."""
+"""Largest ratio of an error to the median error; larger ratios are clipped, so no weight is below a millionth."""
 MEAN_WEIGHT = 1e-9
 """Weight of the mean of all consistent depths, for pixels that edges separate from all of them."""
 
@@ -37,14 +37,14 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
 
     Args:
         network: The opened model; its output is [1, h, w], [1, 1, h, w], [1, h, w, 1] or [h, w].
-        preprocessing: Size and colours of its input, and whether it gives disparity or depth.
+        preprocessing: Size and colours of the network's input, and whether the output is disparity or depth.
         image: Colours in [0, 1], shape [H, W, 3].
 
     Returns:
         Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
 
     Raises:
-        DataError: The output is not a map, or depth that is not positive.
+        DataError: The output is not a map, or is depth that is not positive.
     """
     output = network.run(preprocessing.prepare(network, image))
     shape = output.shape
@@ -59,8 +59,8 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
     if preprocessing.output == "depth":
         if not output.min() > 0:
             raise DataError(
-                f"{network.path}: its depth goes down to {output.min():.3g}, and a depth must be above 0; "
-                "if it gives inverse depth, use --depth-output disparity"
+                f"{network.path}: its smallest depth is {output.min():.3g}, but depths must be above 0; "
+                "if the network gives inverse depth, use --depth-output disparity"
             )
         output = 1 / output
     return unit_range(resize(output, *image.shape[:2]))
@@ -70,8 +70,8 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     """Fill the gaps of a depth map in inverse depth, along surfaces of even colour and not across colour edges.
 
     The result is the ratio of smoothed ``w / z`` and smoothed ``w``, by the fast global smoother (Min et al. 2014), a solver
-    of weighted least squares that the image guides. The weight w falls with the change of 1 / z as the match slides by a
-    pixel, so that badly conditioned depths yield to their neighbours.
+    of weighted least squares that the image guides. The weight w falls with the change of 1 / z for a shift of the match
+    by one pixel, so badly conditioned depths have less weight than their neighbours.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3].
@@ -104,7 +104,7 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
 
 
 def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return smoothed values [H, W] by weight: from nearby pixels where they have any, else from ever farther ones."""
+    """Return values [H, W] smoothed by weight: from nearby pixels if these have weight, else from farther ones."""
     import cv2
 
     guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)

@@ -30,7 +30,7 @@ class EpipolarConfig:
     max_residual: float = 1.0
     """Largest distance of a match from its epipolar line [px] (NexusGS)."""
     max_round_trip: float = 1.5
-    """Largest distance between a pixel and the end of the flow there and back [px]; infinite leaves the check out."""
+    """Largest distance between a pixel and the end of the flow there and back [px]; infinity switches the check off."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays of a match [deg]; below it depth is noise."""
     near_count: int = 4
@@ -110,7 +110,7 @@ def epipolar_depth(
         first: Camera whose pixels get a depth.
         second: Camera of the matches.
         pixels: Positions in the first image [px], shape [N, 2].
-        matches: Position of each in the second image [px], shape [N, 2]; NaN where there is no match.
+        matches: Position of each pixel in the second image [px], shape [N, 2]; NaN where there is no match.
         min_parallax: Smallest angle between the rays [deg].
 
     Returns:
@@ -170,14 +170,14 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
         depths: Candidates [u], shape [S, N], nearest source first.
         sensitivities: |dz/dpx| of each [u/px], at least 0, shape [S, N].
         valid: True where a candidate counts, shape [S, N].
-        mode: least_sensitive takes the candidate that a slide along its line changes least, the nearest of equal ones;
+        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, the nearest source of equal ones;
             nearest_first the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
 
     Returns:
         Depths [u], shape [N], 0 where no candidate is valid; and sensitivities [u/px], shape [N], infinite there.
 
     Raises:
-        UsageError: There is no such mode.
+        UsageError: The mode is unknown.
     """
     if mode not in BLENDS:
         raise UsageError(f"blend {mode!r} is not one of {', '.join(BLENDS)}")
@@ -208,7 +208,7 @@ def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: Epi
         config: Checks and blending.
 
     Returns:
-        The depth; valid nowhere, with a note, where no flow survives.
+        The depth; valid nowhere, with a note, if no flow passes the checks.
     """
     view = views[index]
     shape = view.image.shape[:2]

@@ -44,8 +44,8 @@ class ExportRequest:
     random_weights: bool = False
     """Use a small untrained network, to test the export only."""
     size: int = 384
-    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map is stretched back. xfeat accepts
-    any size."""
+    """Both sides of the input [px], a multiple of 32; images are stretched to it, and the map is stretched back. Not used
+    for xfeat, which accepts sides of 96 to 4096 px."""
 
     def __post_init__(self):
         if self.model not in MODELS:
@@ -123,8 +123,8 @@ def _own_weights(request: ExportRequest) -> dict[str, torch.Tensor]:
     """Return the tensors [...] of the user's weights by name, before any library of networks is loaded."""
     if request.weights is None:
         raise UsageError(
-            "fcn-resnet18: no weights of it for the 21 VOC classes are known to be public; give your own by "
-            "--weights FILE.safetensors, or export fcn-resnet50, for which torchvision has some"
+            "fcn-resnet18: no public weights for the 21 VOC classes are known; give your own with --weights FILE.safetensors, "
+            "or export fcn-resnet50, for which torchvision has weights"
         )
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -136,7 +136,7 @@ def _own_weights(request: ExportRequest) -> dict[str, torch.Tensor]:
 
 
 def _no_weights(request: ExportRequest, error: Exception) -> DataError:
-    return DataError(f"{request.weights}: no weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
+    return DataError(f"{request.weights}: these are not weights of fcn-resnet18 ({str(error).splitlines()[0][:200]})")
 
 
 def _fcn_resnet50(request: ExportRequest) -> torch.nn.Module:
@@ -185,24 +185,24 @@ def build(request: ExportRequest) -> torch.nn.Module:
             torch.manual_seed(0)
             network = makers[request.model](request)
     except ImportError as e:
-        raise ResourceError(f"{request.model}: {e.name or e} is needed to write it; {REMEDY}") from e
+        raise ResourceError(f"{request.model}: the export needs {e.name or e}; {REMEDY}") from e
     return (_depth_alone(network) if request.model == "dpt" else network).eval()
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
-    """Write a network as ONNX, and beside one for maps the JSON file that describes its input and output.
+    """Write a network as ONNX; for one that gives maps, also write the JSON file that describes input and output.
 
     Args:
         request: The network, its weights and its input size.
         out: The ONNX file to write.
 
     Returns:
-        Lines for the user, one on how well onnxruntime and torch agree.
+        Lines for the user, including the difference between onnxruntime and torch.
 
     Raises:
         DataError: The weights cannot be loaded, the file would be too large, or onnxruntime and torch disagree.
         ResourceError: A package is missing, or the file cannot be written.
-        UsageError: There are no weights of that network.
+        UsageError: The network needs weights of the user, and none are given.
     """
     import torch
 
@@ -212,7 +212,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     weight = sum(p.numel() * p.element_size() for p in network.parameters())
     if not weight < MAX_FILE_BYTES:
         raise DataError(
-            f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose smaller ones"
+            f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose a smaller network"
         )
     image = torch.rand(1, 3, request.size, request.size, generator=torch.Generator().manual_seed(0)) * 2 - 1
     output = "disparity" if request.model == "dpt" else "scores"

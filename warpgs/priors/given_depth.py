@@ -18,25 +18,25 @@ from warpgs.priors.epipolar import nearest_views
 from warpgs.scene import DEPTH_KINDS, GivenDepth, PointCloud, View, ViewDepth
 
 MIN_OVERLAP = 50
-"""Fewest references of a view that a map is compared with or fitted to."""
+"""Smallest number of references in a view with which a map is compared, or to which it is fitted."""
 MAX_RATIO = 1.25
 """Largest median ratio of metric depth to its references, or its inverse, in a view; a map beyond it is rejected."""
 NEAR = 0.05
 """Relative difference of depths up to which they count as one surface."""
 GOOD, MIN_GOOD = 0.1, 0.5
-"""Largest relative difference from a reference of a good value of a fitted map, and the least fraction of good values."""
+"""Largest relative difference from a reference of a good value of a fitted map, and the smallest fraction of good values."""
 EXACT = 0.015
-"""Median difference up to which a fitted map counts as good as a metric one; that of a network is larger."""
+"""Median difference up to which a fitted map is treated like a metric one; maps of networks differ by more."""
 MIN_CONFIDENCE = 0.5
-"""Confidence from which a given depth may place Gaussians."""
+"""Smallest confidence at which a given depth may place Gaussians."""
 ROUNDS = 20
 """Rounds of reweighted least squares."""
 NEIGHBORS = 4
-"""Nearest other views that a map is compared with."""
+"""Number of nearest other views that a map is compared with."""
 MAX_POINTS = 2**18
-"""Most pixels of a map that are compared; larger maps are subsampled on a grid."""
+"""Largest number of pixels of a map that are compared; larger maps are subsampled on a grid."""
 SHOWN = 5
-"""Views that a message names."""
+"""Number of views that a message names."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Alignment:
     scale: float = 1.0
     """Factor of the values."""
     shift: float = 0.0
-    """Summand, in the unit of the scaled values."""
+    """Offset, in the unit of the scaled values."""
     references: int = 0
     """Number of references."""
     difference: float = float("nan")
-    """Median relative difference from them; NaN without any."""
+    """Median relative difference from the references; NaN without any."""
     why_not: str = ""
     """Reason why the map is not used; empty where it is."""
 
@@ -65,12 +65,12 @@ class Alignment:
 
 
 def any_given(views: Sequence[View]) -> bool:
-    """Return whether depth is given of a view."""
+    """Return whether any view has given depth."""
     return any(v.depth is not None for v in views)
 
 
 def check_given(views: Sequence[View]) -> None:
-    """Check the given maps of views that were made in Python; those that `load_scene` read are right.
+    """Check the given maps of views that were made in Python; `load_scene` has checked those that it read.
 
     Raises:
         UsageError: A map has another size than its image, an unknown kind, or values that no depth or normal has.
@@ -97,10 +97,10 @@ def check_given(views: Sequence[View]) -> None:
 
 
 def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
-    """Return scale and shift that take values [N] to wanted ones [N], above 0, by least relative differences.
+    """Return scale and shift that map values [N] to wanted values [N] above 0 with the smallest relative differences.
 
-    Weighted least squares, reweighted by Cauchy's function of the differences, from the line through the medians of the lower
-    and the upper third.
+    The method is least squares, reweighted by Cauchy's function of the differences. It starts from the line through the medians
+    of the lower and the upper third.
     """
     order = np.argsort(values, kind="stable")
     third = max(1, len(order) // 3)
@@ -123,7 +123,7 @@ def fit_line(values: np.ndarray, wanted: np.ndarray) -> tuple[float, float]:
 
 
 def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[np.ndarray, np.ndarray]:
-    """Return values of a view's given depth [N], and at the same pixels the depths [N] [u] that views confirm, float64."""
+    """Return values of a view's given depth [N], and the references [N] [u] at the same pixels, float64."""
     assert view.depth is not None
     sure = np.zeros(view.depth.values.shape) if found is None else np.where(found.valid, found.depth, 0).astype(np.float64)
     if known.tracks is not None:
@@ -142,7 +142,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
 
     Args:
         view: A view with given depth.
-        found: Depth of the view by the sweep that others confirm; None for none.
+        found: Depth of the view from the sweep that other views confirm; None without a sweep.
         known: Points of the reconstruction, with the views that saw them.
     """
     assert view.depth is not None
@@ -157,7 +157,8 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
             return made
         return replace(made, why_not=f"its depths are {ratio:.4g} times those that the views confirm")
     if count < MIN_OVERLAP:
-        return Alignment(references=count, why_not=f"{count} depths are known to fit it to, at least {MIN_OVERLAP} are needed")
+        why_not = f"{count} depths are known at its pixels, and the fit needs at least {MIN_OVERLAP}"
+        return Alignment(references=count, why_not=why_not)
     scale, shift = fit_line(values, 1 / wanted if kind == "disparity" else wanted)
     fitted = scale * values + shift
     with np.errstate(divide="ignore"):
@@ -166,7 +167,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
     made = Alignment(scale, shift, count, float(np.median(off)))
     good = float((off <= GOOD).mean())
     if good < MIN_GOOD:
-        return replace(made, why_not=f"{good:.0%} of its depths are within {GOOD:.0%} of those that the views confirm")
+        return replace(made, why_not=f"{good:.0%} of its depths are within {GOOD:.0%} of depths that other views confirm")
     if not scale > 0:
         other = "relative" if kind == "disparity" else "disparity"
         return replace(made, why_not=f"its values fall where depth rises; are they {other}?")
@@ -174,20 +175,20 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
 
 
 def exact(given: GivenDepth, made: Alignment | None) -> bool:
-    """Return whether a map is better than searched depth: a metric one, or one that fits it closely."""
+    """Return whether a map comes before estimated depth: a metric map, or one that fits its references closely."""
     return given.kind == "metric" or (made is not None and made.difference <= EXACT)
 
 
 def votes(
     views: Sequence[View], depths: Sequence[np.ndarray], index: int, near: int = NEIGHBORS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Count the other views that confirm each depth of a view, and those that look through it to something farther.
+    """Count the other views that confirm each depth of a view, and those that see through it to a farther surface.
 
     Args:
         views: All views, pinholes.
         depths: Depth of each [u], 0 for missing values, shape [H, W] each.
         index: Index of the view.
-        near: Number of nearest views that are asked.
+        near: Number of nearest views that are compared.
 
     Returns:
         Both counts, int, shape [H, W].
@@ -215,17 +216,17 @@ def with_given_depth(
 ) -> tuple[list[ViewDepth], list[str]]:
     """Return the depth of each view, combined with its given depth, and notes.
 
-    A depth of an `exact` map counts unless more views look through it than confirm it, and comes before a searched one.
-    Another counts where a view confirms it and the search found nothing or something else. ``ViewDepth.given`` has all depths
-    of the maps that are used, in scene units, without those that are contradicted.
+    A given depth is dropped where more views see through it than confirm it. The depth of an `exact` map comes before the
+    estimate. That of another map is used only where a view confirms it, and the estimate is missing or differs.
+    ``ViewDepth.given`` has all depths that are not dropped, in scene units.
 
     Args:
         views: Training views, pinholes.
-        found: Estimated depth of each that other views confirm; None if not estimated.
+        found: Estimated depth of each view that other views confirm; None if not estimated.
         known: Points of the reconstruction.
 
     Raises:
-        DataError: No map can be used; the message has the reason for each of the first.
+        DataError: No map can be used; the message gives the reasons for the first maps.
     """
     before = [_unknown(v) for v in views] if found is None else list(found)
     made = [None if v.depth is None else align(v, d, known) for v, d in zip(views, before, strict=True)]
@@ -266,7 +267,7 @@ def _unknown(view: View) -> ViewDepth:
 def _remedy(views: Sequence[View], made: Sequence[Alignment | None]) -> str:
     """Return what a user can do where no map can be used."""
     if any(v.depth is not None and v.depth.kind == "metric" for v in views):
-        return "Give the length of their unit with --depth-unit, or --depth-kind relative where it is not that of the cameras"
+        return "Set --depth-unit to the length of the maps' unit, or use --depth-kind relative if the cameras have another unit"
     return "Check --depth-kind, start from a sweep (--init.source sweep), or leave out --depths"
 
 
@@ -280,7 +281,7 @@ def _notes(
     if compared:
         off = [a.difference for a in compared]
         notes[0] += (
-            f"; median difference from depth that views confirm {np.median(off):.1%} (worst view {max(off):.1%}), at "
+            f"; median difference from depth that other views confirm {np.median(off):.1%} (worst view {max(off):.1%}), at "
             f"{sum(a.references for a in compared):,} pixels"
         )
     if len(compared) < len(used):

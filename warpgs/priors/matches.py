@@ -30,7 +30,7 @@ class Features(NamedTuple):
 
 
 def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> Features:
-    """Find the SIFT features of a view (Lowe 2004) where its mask counts.
+    """Find the SIFT features of a view (Lowe 2004) within its mask.
 
     Args:
         view: The view.

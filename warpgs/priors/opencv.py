@@ -8,11 +8,11 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def single_threaded_opencv() -> Iterator[None]:
-    """Keep OpenCV from starting threads, in this process; our own call it side by side.
+    """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel.
 
-    Many of its calls here are so short that starting threads takes longer than they save, and the rounding of some depends on
-    the number of threads: `cv2.distanceTransform` takes IPP's code where there is but one, and the fast global smoother cuts an
-    image into as many stripes as there are threads, and works on the last rows of a stripe in other code.
+    Many OpenCV calls here are so short that starting threads takes longer than they save. The rounding of some calls depends on
+    the number of threads. With one thread, `cv2.distanceTransform` uses IPP's code. The fast global smoother cuts an image into
+    as many stripes as there are threads, and processes the last rows of a stripe in other code.
     """
     import cv2
 

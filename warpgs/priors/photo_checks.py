@@ -21,18 +21,18 @@ from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
-"""Sharpness below which a photograph is named: untouched ones of five scenes have 0.88 and more, those blurred by a disk of 3
-px 0.5 to 0.85 (docs/decisions/019-thresholds.md)."""
+"""Sharpness below which a photograph is reported: untouched ones of five scenes have 0.88 and more, those blurred by a disk of
+3 px 0.5 to 0.85 (docs/decisions/019-thresholds.md)."""
 MAX_BRIGHTNESS = 1.2
-"""Factor of brightness, up or down, beyond which a photograph is named; below 1.1 where the exposure does not change."""
+"""Factor of brightness, up or down, beyond which a photograph is reported; it stays below 1.1 at constant exposure."""
 MAX_TINT = 1.1
-"""Largest factor between the brightness of one channel and of all three up to which the white balance counts as the same."""
+"""Largest ratio, up or down, of a channel's factor to the factor of brightness at which the white balance is not reported."""
 NEIGHBORS = 4
-"""Photographs taken nearest by that each photograph is compared with; each may itself be chosen by others."""
+"""Number of nearest photographs that each photograph is compared with; others may choose that photograph, too."""
 MIN_MATCHES = 10
-"""Fewest matches from which two photographs are compared."""
+"""Smallest number of matches for a comparison of two photographs."""
 MAX_FEATURES = 1000
-"""Most features of a photograph; they bound the time of a comparison."""
+"""Largest number of features of a photograph, which bounds the time of a comparison."""
 MAX_PIXELS = 100_000
 """Number of pixels to which a photograph is reduced for the search of features; sharpness is measured at its full size."""
 FINE, COARSE = 1.0, 2.0
@@ -46,7 +46,7 @@ DARKEST, BRIGHTEST = 0.04, 0.94
 REMEDY = "fix it in the camera, or try --exposure"
 """Remedy for photographs with different colours."""
 MAX_NAMED = 6
-"""Photographs that one sentence names."""
+"""Number of photographs that a note names."""
 PROGRESS_INTERVAL = 5.0
 """Seconds between two lines of progress."""
 
@@ -73,12 +73,12 @@ class PhotoCheck:
 
     @property
     def blurred(self) -> bool:
-        """True where the photograph is less sharp than others beyond doubt."""
+        """True where the photograph is clearly less sharp than others."""
         return self.sharpness is not None and self.sharpness < MIN_SHARPNESS
 
     @property
     def exposed_otherwise(self) -> bool:
-        """True where the photograph is darker or brighter than others beyond doubt."""
+        """True where the photograph is clearly darker or brighter than others."""
         return self.brightness is not None and not 1 / MAX_BRIGHTNESS <= self.brightness <= MAX_BRIGHTNESS
 
     @property
@@ -129,7 +129,7 @@ def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int
 
 
 def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return each photograph with those taken nearest by, every pair once: their number is bounded per photograph."""
+    """Return pairs of a photograph and one of the nearest to it, each once; their number per photograph is bounded."""
     centers, pairs = np.array([v.camera.center for v in views]), set()
     for i in range(len(views)):
         order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
@@ -138,7 +138,7 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _typical(differences: list[float]) -> float | None:
-    """Return the median; of an even number the middle value nearer to 0: a suspect one differs from most others."""
+    """Return the median; of an even number, the middle value nearer to 0: a faulty photograph differs from most others."""
     known = sorted(d for d in differences if np.isfinite(d))
     if not known:
         return None
@@ -147,10 +147,10 @@ def _typical(differences: list[float]) -> float | None:
 
 
 def check_photos(views: Sequence[View], progress: Callable[[str], object] = lambda line: None) -> list[PhotoCheck]:
-    """Compare each photograph with those taken nearest by.
+    """Compare each photograph with the nearest ones.
 
     Args:
-        views: All views of the scene, those held out, too: at least one.
+        views: All views of the scene, including held-out views; at least one.
         progress: Called at intervals with a line for the user.
 
     Returns:

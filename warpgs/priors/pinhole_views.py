@@ -15,7 +15,7 @@ from warpgs.scene import Camera, View, ViewDepth
 def pinhole_view(view: View) -> View:
     """Return a view resampled to a pinhole of the same K and size; a pinhole's view is returned unchanged.
 
-    Pixels that the lens did not see leave the mask; of a wide fisheye the rim is lost.
+    Pixels that the lens did not see are removed from the mask. The rim of a wide fisheye is lost.
 
     Raises:
         UsageError: The camera is orthographic, or its model is only supported by the kernels.
@@ -80,7 +80,7 @@ def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
 
 
 def _lens_pixels(camera: Camera) -> np.ndarray:
-    """Return the pixels [H * W, 2] of the lens that show the same as the pixels of a pinhole of its K; far off if none do."""
+    """Return the pixels [H * W, 2] of the lens in the directions of a pinhole of the same K; far off where there is none."""
     plane = (pixel_grid(camera) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     positions = np.concatenate([plane, np.ones((len(plane), 1))], 1)
     with np.errstate(all="ignore"):

@@ -31,7 +31,7 @@ class Preprocessing:
     mean: tuple[float, float, float]
     """Colour subtracted from colours in [0, 1], red first."""
     std: tuple[float, float, float]
-    """Divisor of the difference, red first."""
+    """Divisor of colours less ``mean``, red first."""
     output: str
     """Meaning of the output: disparity, depth or classes."""
 
@@ -85,7 +85,7 @@ def check_value(key: str, value: object, where: str, error: type[Exception] = Us
     """Check that a value may describe a network's input or output.
 
     Raises:
-        UsageError: It may not; ``error`` instead where given.
+        UsageError: The value is invalid; ``error`` instead, if given.
     """
     wanted, good = KEYS[key]
     if not good(value):
@@ -93,7 +93,7 @@ def check_value(key: str, value: object, where: str, error: type[Exception] = Us
 
 
 def side_file(model: Path) -> Path:
-    """Return the path of the JSON file that describes a model: its name with .json behind."""
+    """Return the path of the JSON file that describes a model: its name with .json appended."""
     return model.with_name(model.name + ".json")
 
 
@@ -121,13 +121,13 @@ def read_side_file(model: Path) -> dict:
 
 
 def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) -> tuple[Preprocessing, list[str]]:
-    """Return the description of a network: flags come before the file beside the model, and that before the defaults.
+    """Return the description of a network: flags override the file beside the model, and the file overrides the defaults.
 
     Args:
         network: The opened model.
         flags: Values of flags by field name; None or 0 where a flag was not given.
-        defaults: Description that holds where neither has a value.
-        flag: Beginning of the flags' names, for notes.
+        defaults: Values that neither the flags nor the file give.
+        flag: Prefix of the flags' names, for notes.
 
     Returns:
         The description, and notes on values that were assumed.

@@ -112,7 +112,7 @@ def network_semantics(network: Network, preprocessing: Preprocessing, image: np.
 
 
 def _fast_length(length: int) -> int:
-    """Return the largest product of 2, 3 and 5 up to a length: Fourier transforms of others take up to ten times as long.
+    """Return the largest product of 2, 3 and 5 up to a length: other Fourier transforms take up to ten times as long.
 
     ``length`` is the side of a reduced image, at least 1 [px].
     """
@@ -160,7 +160,7 @@ def classical_semantics(image: np.ndarray) -> SemanticMaps:
 def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
     """Return `classical_semantics` of each image; ``tell`` is called with a line for each.
 
-    A thread works on one, so results do not depend on the number of threads.
+    Each image is processed by one thread, so results do not depend on the number of threads.
     """
     with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
         made = [pool.submit(classical_semantics, image) for image in images]
@@ -170,8 +170,8 @@ def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] =
 def knows_foreground(maps: SemanticMaps) -> bool:
     """Return whether the maps separate an object from its background.
 
-    They do not where the mean foreground stays below 1 % (tabletop scans hold no VOC class), or where every pixel is labelled
-    background with a mean foreground below a half.
+    There is no separation if the mean foreground stays below 1 % (tabletop scans hold no VOC class), or if every pixel is
+    labelled background with a mean foreground below a half.
     """
     mean = float(maps.foreground.mean())
     return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)

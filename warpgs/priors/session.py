@@ -115,7 +115,7 @@ def _checked(path: Path, data: bytes, session: Any) -> Network:
     for what, found in (("input", inputs), ("output", outputs)):
         names = ", ".join(f.name for f in found)  # read even if unused: names that are not UTF-8 fail here
         if len(found) != 1:
-            raise DataError(f"{path}: it has {len(found)} {what}s ({names}); one is needed. Export it with that one alone")
+            raise DataError(f"{path}: it has {len(found)} {what}s ({names}); export it with only one")
     if inputs[0].type not in TYPES:
         raise DataError(f"{path}: its input is a {inputs[0].type}; float or float16 is needed")
     layout, size = _input_axes(path, inputs[0].shape)

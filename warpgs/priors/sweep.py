@@ -1,8 +1,8 @@
 """Depth by sweeping planes: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
 
-Poses are known, so a match is sought along the epipolar line only: one plane per inverse depth (Collins 1996), zero-mean
-normalised correlation over a window, semi-global aggregation (Hirschmüller 2008), a parabola between planes, and depths kept
-where another view's own sweep agrees. Compared with optical flow in docs/decisions/007-coarse-start.md.
+Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996). The method
+is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a parabola between planes.
+Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares it with optical flow.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def consistent_depth(
 ) -> ViewDepth:
     """Return the depth of one view where it is geometrically consistent with that of at least one other view.
 
-    A point is projected to each other view and back by the depth found there. It must return nearer than ``max_round_trip``
-    to its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
+    A point is projected to each other view and back by the depth found there. It must return to within ``max_round_trip``
+    of its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
 
     Args:
         views: Views by index.
@@ -72,7 +72,7 @@ def consistent_depth(
 def _backend(
     views: Mapping[int, View], planes: Mapping[int, np.ndarray], config: SweepConfig, device: torch.device
 ) -> tuple[Callable[[View, Sequence[View], np.ndarray], np.ndarray], list[str]]:
-    """Return the function that sweeps a view on the device, or on the CPU where that must do it, and messages on that."""
+    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on that."""
     notes: list[str] = []
     if device.type == "cuda":
         needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())
@@ -109,21 +109,21 @@ def sweep_depths(
     views: Sequence[View], bounds: Sequence[tuple[float, float]], config: SweepConfig, device: torch.device = CPU,
     progress: Callable[[int, int], object] = lambda done, total: None,
 ) -> list[ViewDepth]:  # fmt: skip
-    """Return the depth of every view by sweeping planes against those that share most of its sight.
+    """Return the depth of every view by sweeping planes against views that see the same surfaces.
 
     At most ``config.max_views`` views are swept, so that the time is bounded. They are compared with their
-    best neighbours among all views, and checked by round trips to one another.
+    nearest neighbours among all views, and checked by round trips to one another.
 
     Args:
         views: The views; a single one has no consistent depth.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
         device: Device of costs and paths; the CPU computes them where a GPU has too little memory, or images are tiny.
-        progress: Called after each view with the number of views swept so far, and of all that will be.
+        progress: Called after each view with the number of views swept so far, and their total.
 
     Returns:
-        One depth per view at its own size; its notes name a reduced size and views without a consistent depth. A view that was
-        not swept has no valid depth; a note names it.
+        One depth per view at its own size; its notes report a reduced size and views without a consistent depth. A view that
+        was not swept has a note, and no valid depth.
     """
     cameras = [v.camera for v in views]
     sight = shared_sight(cameras, bounds)

@@ -24,7 +24,7 @@ MAPS = 24
 
 
 def needed_bytes(view: View, planes: int) -> int:
-    """Return the largest device memory [bytes] that `inverse_depths` takes for a view and that many planes."""
+    """Return the largest device memory [bytes] that `inverse_depths` takes for a view and ``planes`` planes."""
     return view.camera.width * view.camera.height * (4 * planes + 4 * MAPS * min(planes, PLANES_AT_ONCE))
 
 

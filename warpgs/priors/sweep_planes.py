@@ -31,9 +31,9 @@ class SweepConfig:
     """Settings of the planes, of the smoothing of costs and of the consistency check."""
 
     near_count: int = 4
-    """Number of other views with which each view is compared, those that share most of its sight."""
+    """Number of other views with which each view is compared: the nearest that see the same surfaces."""
     max_views: int = 30
-    """Most views that are swept; of more, those that together see most. The others are still compared with."""
+    """Largest number of views that are swept: those that together see most. All others serve only for comparison."""
     window: int = 7
     """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
     spacing: float = 0.5
@@ -47,7 +47,7 @@ class SweepConfig:
     large_step: float = 0.5
     """Penalty for any other depth (P2) where the image is even; less across its edges, but above 1.5 P1."""
     max_round_trip: float = 0.6
-    """Largest distance [px] from a pixel after a round trip by the depth that another view found."""
+    """Largest error [px] of a round trip of a pixel through another view and back by that view's depth."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays [deg]; below it depth is noise."""
 

@@ -1,4 +1,4 @@
-"""Choice of views by their overlap: neighbours to compare a view with, and few views that together see most."""
+"""Choice of views by their overlap: neighbours to compare a view with, and a few views that together see most of the scene."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ SAMPLES = 4
 DEPTHS = 3
 """Depths at each of them."""
 LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
-"""Angles between two rays to a point [deg]: below the first depth is uncertain, from the second on a surface looks different
-to both views, and at the third they are taken to share nothing."""
+"""Angles between two rays to a point [deg]. Below the first, depth is uncertain. Above the second, a surface looks different to
+both views. From the third on, the views are assumed to share nothing."""
 
 
 class Sight(NamedTuple):
     """Sight that pairs of V views share, as fractions of what the first one sees."""
 
     overlap: np.ndarray
-    """Fraction of the first view's sight that the second shares, evenly less with the angle, in [0, 1], shape [V, V]."""
+    """Fraction of the first view's sight that the second shares, less at larger angles, in [0, 1], shape [V, V]."""
     matching: np.ndarray
-    """The same by how well the angle lets depth be found, 0 for a view and itself, shape [V, V]."""
+    """Shared fraction, weighted by how well depth can be found at the angle; 0 for a view and itself, shape [V, V]."""
 
 
 def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
@@ -75,10 +75,10 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
 
 
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
-    """Return the views to compare one with: the nearest cameras (ties by order) of those that share sight, at most ``count``.
+    """Return up to ``count`` views to compare a view with: the nearest cameras (ties by order) that share sight with it.
 
     Views too near for depth are skipped: their angles halve the shared fraction. If none is left, the sampled points may have
-    missed the overlap, and the nearest cameras are returned. To take the views that share most at the best angles instead finds
+    missed the overlap, and the nearest cameras are returned. Views that share most at the best angles would give
     fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
 
     Args:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MIN_CONSISTENT = 50
 """Smallest number of pixels with a geometrically consistent depth; below it a view's depth counts as unknown."""
 MAX_OBJECT_FRACTION = 0.9
-"""Largest fraction of the image that an object's region covers; a larger region is what a mask leaves."""
+"""Largest fraction of the image that an object's region covers; a larger region only shows that a mask cuts something off."""
 FLAGS = ("size", "multiple", "mean", "std")
 OUTPUTS = ("auto", "disparity", "depth")
 
@@ -35,32 +35,33 @@ Colors = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PriorConfig:
-    """Networks for priors, and their inputs; classical methods without networks."""
+    """Networks for priors, and their inputs; without networks, classical methods are used."""
 
     depth_model: str | None = None
     """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
     depth_output: str = "auto"
     """Output of the depth network: disparity (inverse depth), depth, or auto: as in FILE.onnx.json, else disparity."""
     depth_guides: bool = False
-    """Use the depth network's map like a map of --depths, to place Gaussians and guide the fit, in views without one."""
+    """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
     depth_size: int = 0
-    """Shorter side of its input [px], if the network leaves it free; 0 for the value of FILE.onnx.json, else 384."""
+    """Shorter side of the depth network's input [px], unless fixed; 0 for the value of FILE.onnx.json, else 384."""
     depth_multiple: int = 0
-    """Divisor of both sides of its input [px]; 0 for the value of FILE.onnx.json, else 32. Depth Anything needs 14."""
+    """Divisor of both sides of the depth network's input [px]; 0 for the value of FILE.onnx.json, else 32.
+    Depth Anything needs 14."""
     depth_mean: Colors | None = None
     """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     depth_std: Colors | None = None
-    """Divisor of the difference. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
+    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
     segmentation_size: int = 0
-    """Shorter side of its input [px], if the network leaves it free; 0 for the value of FILE.onnx.json, else 512."""
+    """Shorter side of the segmentation network's input [px], unless fixed; 0 for the value of FILE.onnx.json, else 512."""
     segmentation_multiple: int = 0
-    """Divisor of both sides of its input [px]; 0 for the value of FILE.onnx.json, else 32."""
+    """Divisor of both sides of the segmentation network's input [px]; 0 for the value of FILE.onnx.json, else 32."""
     segmentation_mean: Colors | None = None
     """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else ImageNet's 0.485 0.456 0.406."""
     segmentation_std: Colors | None = None
-    """Divisor of the difference. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
+    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
     onnx_provider: str = "cpu"
     """Device of the networks: cpu or cuda."""
     cache: bool = True
@@ -76,16 +77,14 @@ class PriorConfig:
                 if value is not None and value != 0:
                     check_value(key, value, f"--{kind}-{key}")
                     if getattr(self, f"{kind}_model") is None:
-                        raise UsageError(
-                            f"--{kind}-{key} describes a network; name it by --{kind}-model, or leave the flag out"
-                        )
+                        raise UsageError(f"--{kind}-{key} requires --{kind}-model; add it, or leave --{kind}-{key} out")
         if self.depth_guides and self.depth_model is None:
-            raise UsageError("--depth-guides uses a network; name it by --depth-model, or give maps by --depths")
+            raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
         if self.depth_output != "auto" and self.depth_model is None:
-            raise UsageError("--depth-output describes a network; name it by --depth-model, or leave the flag out")
+            raise UsageError("--depth-output requires --depth-model; add it, or leave --depth-output out")
 
     def flags(self, kind: str) -> dict:
-        """Return the flags that describe the input of a network, ``kind`` depth or segmentation, by the rest of their names."""
+        """Return the flags of the input of a network, ``kind`` depth or segmentation, keyed by the rest of their names."""
         return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
 
 
@@ -174,7 +173,7 @@ def _stands_out(region: np.ndarray | None) -> bool:
 
 
 def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], regions, classical: bool, notes: list[str]):
-    """Replace a foreground that is not known by the region of the view; by zeros where it has no region either."""
+    """Replace an unknown foreground by the region of the view, or by zeros if the view has no region."""
     replaced, empty, result = [], [], []
     for (maps, source), view, region in zip(found, views, regions):
         if _stands_out(region) and (classical or not knows_foreground(maps)):
@@ -221,7 +220,7 @@ def view_priors(
         views: The training views.
         config: Networks and their inputs.
         depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
-            only where no depth network is named.
+            only if no depth network is given.
         regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.
@@ -254,6 +253,6 @@ def view_priors(
     if store is not None:
         notes += store.notes
         if store.found:
-            words = f"priors: {store.found} of {store.found + store.made} maps were there already, in {store.folder}"
+            words = f"priors: {store.found} of {store.found + store.made} maps were read from the cache {store.folder}"
             notes.append(Detail(words))
     return priors, notes

@@ -13,11 +13,11 @@ from warpgs.scene import Camera
 
 
 def check_arrays(camera: Camera) -> None:
-    """Check types and shapes of a camera's arrays, their values where they are in main memory, and the type of its size.
+    """Check types and shapes of a camera's arrays, the type of its size, and the values of arrays in main memory.
 
     Raises:
         TypeError: An array is neither of numpy nor a tensor, sparse, or not of real numbers; or the size is not of integers.
-        ValueError: A shape is another; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
+        ValueError: A shape is wrong; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
             scales or shears, or has another last row than 0, 0, 0, 1.
     """
     for name, rows, tolerance, off, check in MATRICES:
@@ -27,9 +27,9 @@ def check_arrays(camera: Camera) -> None:
             raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(given.shape)}")
         if getattr(given, "is_cuda", False):
             continue
-        listed = given.tolist()  # as numbers, which takes a third of the time of tensors
+        listed = given.tolist()  # Python numbers take a third of the time of tensors
         for i, matrix in enumerate(listed if given.ndim == 3 else (listed,)):
-            if not off(matrix) <= tolerance:  # the sum, which also is a NaN or infinite where a number is; few get further
+            if not off(matrix) <= tolerance:  # also where a number is NaN or infinite; few matrices get further
                 check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
     distortion: Any = camera.distortion
     if distortion is not None:
@@ -37,7 +37,7 @@ def check_arrays(camera: Camera) -> None:
         if distortion.ndim not in (1, 2):
             raise ValueError(f"camera.distortion must have shape [P] or [C, P], not {list(distortion.shape)}")
         if not (getattr(distortion, "is_cuda", False) or all(map(math.isfinite, distortion.reshape(-1).tolist()))):
-            raise ValueError(f"camera.distortion holds numbers that are not finite: {distortion.tolist()}")
+            raise ValueError(f"camera.distortion has non-finite values: {distortion.tolist()}")
     for name in ("width", "height"):
         size = getattr(camera, name)
         if not isinstance(size, (int, np.integer)):
@@ -58,7 +58,7 @@ def _check_type(name: str, array: Any) -> None:
 
 
 def _skew_of(matrix: list[list[float]]) -> float:
-    """Return the sum of what the fixed entries of K are off by, not finite where an entry is not."""
+    """Return the sum of the errors of the fixed entries of K; non-finite if an entry of K is."""
     (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
     return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
 
@@ -84,32 +84,32 @@ def _products(matrix: list[list[float]]) -> tuple[float, ...]:
 
 
 def _stretch_of(matrix: list[list[float]]) -> float:
-    """Return the sum of what R R^T and the last row of a pose are off by, not finite where an entry is not."""
+    """Return the sum of the errors of R R^T and of the last row of a pose; non-finite if an entry of the pose is."""
     (p, q, r, s), shift = matrix[3], matrix[0][3] + matrix[1][3] + matrix[2][3]
     return sum(map(abs, _products(matrix))) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * shift
 
 
 def _check_pose(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the pose is not rigid, except that it may mirror: then the mirrored image is right."""
+    """Raise ValueError where the pose is not rigid; it may mirror, since the mirrored image is right."""
     _check_finite(matrix, where)
     p, q, r, s = matrix[3]
     if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
         raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
     off = max(map(abs, _products(matrix)))
-    if not off <= POSE_TOLERANCE:  # products of wild numbers overflow
+    if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
         raise ValueError(
-            f"{where} scales or shears: R R^T is off by {off:.2g} for its upper left 3 x 3 block R. Give a rotation; of a "
-            "scaled pose, divide the first three rows by the scale, which divides depths, too"
+            f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
+            "Give a rotation. If the pose is scaled, divide its first three rows by the scale; this also divides depths"
         )
 
 
 def _check_finite(matrix: list[list[float]], where: str) -> None:
     """Raise ValueError where a number of the matrix is not finite."""
     if not all(math.isfinite(value) for row in matrix for value in row):
-        raise ValueError(f"{where} holds numbers that are not finite: {matrix}")
+        raise ValueError(f"{where} has non-finite values: {matrix}")
 
 
 MATRICES = (
     ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
 )  # fmt: skip
-"""Matrices of a camera: rows, tolerance, what they are off by, and the check of one that is off by more."""
+"""Matrices of a camera: name, rows, tolerance, function of the error, and check of a matrix with a larger error."""

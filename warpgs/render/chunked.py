@@ -21,14 +21,14 @@ class ChunkedFrame:
     settings: RenderSettings
     """Settings of the whole render; its window is divided."""
     max_instances: int
-    """Largest number of instances of a chunk. A single tile is never divided, so it may have one for each projected
-    Gaussian."""
+    """Largest number of instances of a chunk. A single tile is never divided, so it may have an instance for each
+    projected Gaussian."""
     deterministic: bool = True
     """True to sum gradients in a fixed order."""
 
 
 def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
-    """Split a window at a tile's border: into upper and lower half, or left and right of a single row; None for one tile."""
+    """Split a window at a border of tiles into upper and lower half, or a row of tiles into two; None for one tile."""
     x, y, width, height = window
     if height > tile_size:
         first = -(-height // (2 * tile_size)) * tile_size
@@ -42,7 +42,7 @@ def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
 def chunks(frame: ChunkedFrame, inputs: ProjectInputs) -> Iterator[tuple[RenderSettings, torch.Tensor]]:
     """Yield the settings of windows of at most ``frame.max_instances`` instances, with the tile counts [C, N] in each.
 
-    They come from top to bottom; a window with more is halved.
+    Windows come from top to bottom; one with more instances is halved.
 
     Args:
         frame: Settings.
@@ -168,7 +168,7 @@ def heaviest_chunked(
         k: Number of Gaussians.
 
     Returns:
-        Numbers and weights [C, H, W, k], and the number blended [C, H, W].
+        Ids and weights of the Gaussians [C, H, W, k], and the number of blended Gaussians [C, H, W].
     """
     _, _, width, height = frame.settings.window
     shape = (len(projected), height, width)
@@ -188,8 +188,8 @@ def blend_chunked(
 ) -> Images:  # fmt: skip
     """Composite projected Gaussians chunk by chunk: the same images as `images_of` gives, to the bit.
 
-    The backward pass renders each chunk again and adds up the gradients, so nothing but the inputs is saved for it. This takes
-    about 1.5 times as long as `blend`, but memory for the instances of only one chunk.
+    The backward pass renders each chunk again and adds up the gradients, so only the inputs are saved for it. This takes
+    about 1.5 times as long as `blend`, and the memory of one chunk's instances.
 
     Args:
         projected: Result of `project` for the frame's window, shape [C, N, 12]; differentiable.

@@ -37,13 +37,13 @@ class Composed:
     projected: torch.Tensor
     """Projected Gaussians, shape [C, N, 12]."""
     tile_counts: torch.Tensor
-    """Number of tiles that each touches, int32, shape [C, N]."""
+    """Number of tiles that each Gaussian touches, int32, shape [C, N]."""
     tiles: Tiles
     """Instances of each tile."""
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return an array as a tensor [C, ...] of the type of ``like``; that of a single camera has ``axes`` axes."""
+    """Return an array as a tensor [C, ...] of the type of ``like``; the array of a single camera has ``axes`` axes."""
     tensor: torch.Tensor = array
     if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
         tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
@@ -51,7 +51,7 @@ def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
 
 
 def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return what a camera holds under a name as a tensor [C, ...], one for each of the poses ``like`` [C, 4, 4].
+    """Return the array ``name`` of a camera as a tensor [C, ...], with an entry for each of the poses ``like`` [C, 4, 4].
 
     Raises:
         ValueError: The number of entries is neither 1 nor that of the poses.
@@ -60,13 +60,13 @@ def _for_each(name: str, array: Any, like: torch.Tensor, axes: int = 2) -> torch
     own = list(tensor.shape[1:])
     if tensor.ndim != axes + 1 or tensor.shape[0] not in (1, cameras):
         raise ValueError(
-            f"camera.{name} must have shape {own} or {[cameras, *own]}, as many as camera.viewmat, not {list(array.shape)}"
+            f"camera.{name} must have shape {own} or {[cameras, *own]} to match camera.viewmat, not {list(array.shape)}"
         )
     return tensor if tensor.shape[0] == cameras else tensor.expand(cameras, *own).contiguous()
 
 
 def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: torch.Tensor | None = None) -> ProjectInputs:
-    """Return the tensors of a render; the camera's are brought to the type and device of ``gaussians.means``.
+    """Return the tensors of a render; the camera's tensors are converted to the type and device of ``gaussians.means``.
 
     Args:
         gaussians: The scene, N Gaussians.
@@ -75,8 +75,8 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
 
     Raises:
         TypeError: The scalar types of means and covariances, or of the factors, differ.
-        ValueError: The covariances or the factors have another shape, or are on another device; or the camera holds
-            another number of intrinsics or lenses than of poses, and not one for all.
+        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's
+            number of intrinsics or lenses is neither 1 nor that of its poses.
     """
     means = gaussians.means
     viewmats = as_batch(camera.viewmat, means)
@@ -115,14 +115,14 @@ def bin_projected(
 
     Args:
         projected: Projected Gaussians, shape [C, N, 12].
-        tile_counts: Number of tiles of the window that each touches, int32, shape [C, N].
+        tile_counts: Number of tiles of the window that each Gaussian touches, int32, shape [C, N].
         settings: Settings of the render.
         memory: Memory of the instances.
         slotted: True for gradients and `weights_of`; False is faster (`bin_tiles`).
         listed: Tiles that get their instances, bool, shape [C * tiles]; None for all.
 
     Raises:
-        ResourceError: There are more than memory allows.
+        ResourceError: There are more instances than memory allows.
     """
     named = {"memory": memory, "slotted": slotted, "listed": listed, **settings.of_window()}
     return bin_tiles(projected, tile_counts, tile_size=settings.tile_size, **named)
@@ -199,7 +199,7 @@ def median_depth_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSetti
 def heaviest_of(
     projected: torch.Tensor, tiles: Tiles, settings: RenderSettings, k: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return numbers and weights [C, H, W, k] of the k heaviest Gaussians, and the number blended [C, H, W] (`heaviest`)."""
+    """Return ids and weights [C, H, W, k] of the k heaviest Gaussians, and the number blended [C, H, W] (`heaviest`)."""
     return heaviest(projected, tiles, k, **settings.of_window())
 
 
@@ -213,11 +213,11 @@ def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory, save: bool = True,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Bin and blend without autograd, in memory of the allocator; returns what the backward pass needs, too.
+    """Bin and blend without autograd, in memory of the allocator; return what the backward pass needs, too.
 
     Args:
         projected: Projected Gaussians, contiguous, shape [C, N, 12].
-        tile_counts: Number of tiles that each touches, int32, shape [C, N].
+        tile_counts: Number of tiles that each Gaussian touches, int32, shape [C, N].
         backgrounds: Colour behind everything, contiguous, shape [C, 3].
         settings: Settings of the render.
         memory: Memory of the instances; its allocator provides all other tensors.

@@ -34,13 +34,13 @@ from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
-"""Equal calls in a row from which on kernels are captured. After a capture without a gain, the number doubles."""
+"""Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and instances, as a multiple of the most that such calls were seen to have."""
+"""Capacity for visible Gaussians and instances, as multiples of the largest numbers seen in such calls."""
 SPARE = 1024
-"""Number that is added to both."""
+"""Number that is added to both capacities."""
 MAX_PROJECTED = 2**23
-"""Most projected Gaussians of a captured call. Beyond, the GPU takes so long that a graph would gain nothing."""
+"""Largest number of projected Gaussians of a captured call. Larger calls take the GPU so long that a graph has no gain."""
 MAX_MEMORY_FRACTION = 0.05
 """Largest fraction of the free memory that lists and saved states may take; calls that need more are not captured."""
 
@@ -54,11 +54,11 @@ class Capacity(NamedTuple):
     """(Gaussian, tile) instances."""
 
     def within(self, other: Capacity) -> bool:
-        """Return whether neither number is larger than the other's."""
+        """Return whether neither number exceeds that of ``other``."""
         return self.visible <= other.visible and self.instances <= other.instances
 
     def or_more(self, other: Capacity) -> Capacity:
-        """Return the larger of both numbers."""
+        """Return the larger value of each number."""
         return Capacity(max(self.visible, other.visible), max(self.instances, other.instances))
 
 
@@ -82,7 +82,7 @@ class GraphedRasterizer:
         self._project_settings = settings.projection()
         self._coefficients = CAMERA_MODELS.find(settings.camera_model).coefficients
         self.rendered = 0
-        """Number of renders that fitted."""
+        """Number of renders within the capacity."""
         self.needed = Capacity(0, 0)
         """Numbers of the last call."""
         on_gpu = self.device.type == "cuda"
@@ -133,7 +133,7 @@ class GraphedRasterizer:
             images = _blended(projected, backgrounds, self, projection[1], images, block, passes)
             count_passes(projected, passes)
         if self._total_ready is not None:
-            self._total_ready.synchronize()  # not before, so that the device works meanwhile
+            self._total_ready.synchronize()  # only now, so that the device works meanwhile
         self.needed = Capacity(*split_sum(int(self._total[0]), projection[1].numel()))
         if not self.needed.within(self.capacity):
             return None
@@ -141,14 +141,14 @@ class GraphedRasterizer:
         return images, projected, projection[1]
 
     def _inputs(self, gaussians, cameras: torch.Tensor) -> ProjectInputs:
-        """Return all inputs from the tensors of the Gaussians [...] and one that holds those of the cameras, [F]."""
+        """Return all inputs from the tensors of the Gaussians [...] and one flat tensor with those of the cameras, [F]."""
         first, second = 16 * self.cameras, 25 * self.cameras
         viewmats, Ks = cameras[:first].view(-1, 4, 4), cameras[first:second].view(-1, 3, 3)
         distortion = cameras[second:].view(self.cameras, self._coefficients)
         return ProjectInputs(*gaussians, viewmats, Ks, distortion, self._no_factors)
 
     def _project_and_count(self, allocator: Allocator, *gaussians: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        # a copy, since gradients are still to come when the next call's cameras are at the same addresses
+        # a copy: the backward pass may come after the next call has put its cameras at the same addresses
         cameras = allocator.output(((25 + self._coefficients) * self.cameras,), torch.float32, self.device)
         fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
@@ -244,19 +244,19 @@ class _Blended(torch.autograd.Function):
         return *found, None, None, None, None, None
 
 
-# Function.apply itself, which looks for functorch's wrappers first, takes as long again as what it calls
+# torch.autograd.Function.apply looks for functorch's wrappers first, which doubles the time
 _projected, _blended = (super(torch.autograd.Function, node).apply for node in (_Projected, _Blended))
 
 
 class Recorder:
-    """History of the calls on one stream, and the rasterizer of those that came often enough."""
+    """History of the calls on one stream, and the rasterizer of calls that repeat often enough."""
 
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the current calls; None if they were too few."""
+        """Rasterizer of the current calls; None before there were enough of them."""
         self.min_calls = MIN_CALLS
-        """Equal calls in a row from which on kernels are captured."""
+        """Number of equal calls in a row before kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
         self._exceeded: tuple[tuple | None, Capacity] = (None, Capacity(0, 0))
         """Key of the last call that exceeded its capacity, and what it needed."""
@@ -284,7 +284,7 @@ class Recorder:
                 found = self.rasterizer.render(inputs, backgrounds)
             except BaseException:
                 if self.graphs.stream is not None:
-                    with contextlib.suppress(RuntimeError):  # what went wrong is raised below
+                    with contextlib.suppress(RuntimeError):  # the first error is raised below
                         self.graphs.stream.synchronize()  # the device reads memory of the rasterizer
                 self._drop()
                 raise
@@ -323,7 +323,7 @@ class Recorder:
 
 @torch.no_grad()
 def count_needed(inputs: ProjectInputs, settings: RenderSettings) -> Capacity:
-    """Return the numbers of a render."""
+    """Return the numbers of visible Gaussians and of instances of a render."""
     counts = project.project_inputs(inputs, settings.projection())[1]
     return Capacity(*torch.stack([(counts > 0).sum(), counts.sum()]).tolist())
 
@@ -357,8 +357,8 @@ def call_key(
 def _can_capture(device: torch.device) -> bool:
     """Return whether calls can be captured now, on this device.
 
-    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors:
-    checkpointing, which has such hooks, needs the same number of saved tensors each time. Nor are they captured where torch
+    Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors.
+    Checkpointing has such hooks, and needs the same number of saved tensors each time. Nor are they captured where torch
     allocates each tensor from the driver, or Warp checks for errors after each kernel.
     """
     if _UNCACHED or wp.config.verify_cuda:

@@ -12,7 +12,7 @@ def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list
     """Return Gaussians, camera and options of each of C cameras; single values are shared by all.
 
     Raises:
-        ValueError: A list has another length.
+        ValueError: The length of a list is not C.
     """
     columns = []
     for name, given in (("gaussians", gaussians), ("options", options)):

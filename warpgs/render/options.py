@@ -103,7 +103,7 @@ class RasterizeOptions:
         """Check the types of switches and numbers; other ranges are checked in `rasterize`.
 
         Raises:
-            UsageError: An option is of another type, or negative.
+            UsageError: An option has the wrong type, or is negative.
         """
         for name in SWITCHES:
             if not isinstance(getattr(self, name), (bool, np.bool_)):

@@ -9,15 +9,15 @@ from warpgs.render.settings import RenderSettings, Window
 from warpgs.scene import Camera
 
 INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
-"""Types of pixel numbers."""
+"""Types of pixel coordinates."""
 
 
 def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
     """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
 
     Raises:
-        TypeError: They are not a dense tensor of integers.
-        ValueError: The shape is another.
+        TypeError: The pixels are not a dense tensor of integers.
+        ValueError: The shape is wrong.
     """
     if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
         found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
@@ -31,7 +31,7 @@ def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> 
 
 
 def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
-    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; this reads them from the device.
+    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device.
 
     Raises:
         ValueError: A pixel is outside the image.

@@ -41,7 +41,7 @@ from warpgs.runtime.device_memory import available_bytes, installed_bytes
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
 
 TILE_SIZES = (8, 16)
-"""Sides of a tile that the kernels can be made for [px]."""
+"""Supported sides of a tile [px]."""
 
 BOUND_ROUNDING = 2.0**-29
 """Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
@@ -50,7 +50,7 @@ float64 is 2^29 times finer than that of float32, so e is at most 2^-30 if the e
 
 
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
-"""Outputs of real numbers without a gradient: `Render` rejects one through them."""
+"""Real-valued outputs without a gradient: `Render` rejects a gradient through them."""
 
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
@@ -67,16 +67,16 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     near = rule.near if options.near is None else options.near
     far = rule.far if options.far is None else options.far
     if not 0 <= near < far <= FAR:
-        raise ValueError(f"near {near} and far {far} bound no range of depths: give 0 <= near < far <= {FAR:g}")
+        raise ValueError(f"near {near} and far {far} are not a range of depths: give 0 <= near < far <= {FAR:g}")
     if options.tile_size not in TILE_SIZES:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
     if options.heaviest < 0:
-        raise UsageError(f"heaviest must be a number of Gaussians, or 0 for none, not {options.heaviest}")
+        raise UsageError(f"heaviest must be at least 0, not {options.heaviest}")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
-        raise UsageError("max_instances must be at least 1 and does not go with a capacity")
+        raise UsageError("max_instances must be at least 1, and cannot be combined with capacity")
     if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
-        raise UsageError("pixels do not go with window, contributions and capacity: leave those out")
+        raise UsageError("pixels cannot be combined with window, contributions or capacity: leave those out")
     if options.capacity is not None and options.capacity > MAX_INSTANCES:
         raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
     if options.error_bound and options.capacity is not None:
@@ -85,13 +85,13 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
 
 
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
-    """Check types, and the shapes of the camera; those of other tensors are checked where they are used.
+    """Check types, and the shapes of the camera; shapes of other tensors are checked where the tensors are used.
 
-    Values of Gaussians are not checked; one that is not finite is culled.
+    Values of Gaussians are not checked; Gaussians with non-finite values are culled.
 
     Raises:
-        TypeError: An argument, or what the camera holds, is of another type.
-        UsageError: A background has nothing before it, or Gaussians have no colours.
+        TypeError: An argument, or an array of the camera, has the wrong type.
+        UsageError: There is a feature background but no features, or the Gaussians have no colours.
         ValueError: A shape or a number of the camera is wrong (`check_arrays`).
     """
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
@@ -102,12 +102,12 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
             raise TypeError(f"{name} must be an instance of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
         raise UsageError("gaussians have no sh: give sh=..., or RasterizeOptions(colors=...)")
-    _check_tensor("means", gaussians.means)  # first, since the harmonics of None are made like them
+    _check_tensor("means", gaussians.means)  # first, since missing harmonics are made like the means
     for name, tensor in gaussians.tensors().items():
         _check_tensor(name, tensor)
     check_arrays(camera)
     if options.feature_background is not None and options.features is None:
-        raise UsageError("feature_background is behind features: give features=..., too, or leave it out")
+        raise UsageError("feature_background requires features: give features=..., or leave feature_background out")
     sh = gaussians.tensors()["sh"]
     if sh.ndim != 3 or sh.shape[1] != (gaussians.sh_degree + 1) ** 2:
         raise ValueError(f"sh must have shape [N, K, 3], where K is 1, 4, 9, 16 or 25, not {list(sh.shape)}")
@@ -120,7 +120,7 @@ def _check_tensor(name: str, value: Any) -> None:
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
-    """Return the part to render; UsageError where its edges are not where they must be."""
+    """Return the part to render; UsageError where its edges do not fit the image and its tiles."""
     width, height, side = camera.width, camera.height, options.tile_size
     if options.window is None:
         return 0, 0, width, height
@@ -138,8 +138,8 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     """Return channels [N, D] or [C, N, D] with an axis of cameras, [1, N, D] or [C, N, D].
 
     Raises:
-        TypeError: They are not a tensor, or of another scalar type than the Gaussians.
-        ValueError: The shape or the device is another.
+        TypeError: The channels are not a tensor, or have another scalar type than the Gaussians.
+        ValueError: The shape or the device is wrong.
     """
     if values is None:
         return None
@@ -178,14 +178,14 @@ class _Layer(NamedTuple):
 
 
 def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
-    """Return channels [..., D] with their background: one, a batch of them, or None for zeros; ``name`` is its option's.
+    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is that of the option.
 
     Raises:
-        TypeError: The background is not real numbers, or sparse.
-        ValueError: The shape of the background is another.
+        TypeError: The background does not hold real numbers, or is sparse.
+        ValueError: The shape of the background is wrong.
     """
     channels, like = 3 if colors is None else colors.shape[-1], inputs.viewmats
-    if background is None:  # outside of the guard: a full GPU must not be called a wrong background
+    if background is None:  # outside of the try block: a full GPU is not a wrong background
         background = like.new_zeros(channels)
     try:
         values = torch.as_tensor(background)
@@ -228,17 +228,17 @@ def rasterize(
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera; a list of renders for a list of cameras. If you read
-        ``render.means2d`` before the backward pass, it holds the gradients of the projected means after it.
+        The images, without a leading axis for a single camera; a list of renders for a list of cameras. Read
+        ``render.means2d`` before the backward pass; after the pass, it holds the gradients of the projected means.
 
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than is available.
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other, a
             transform of torch.func is active, or a second derivative is requested.
-        ValueError: A shape or device is wrong (the message names argument, expected and found); an array of ``camera``, unless
-            it is on a GPU, holds a non-finite number, ``K`` has a skew, ``viewmat`` scales or shears, or either has a wrong
-            last row; the near or far plane is out of range; a pixel is outside the image; or lists differ in length.
+        ValueError: A shape or device is wrong (the message names argument, expected and found); the near or far plane is out
+            of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
+            has a non-finite number, ``K`` has a skew, ``viewmat`` scales or shears, or either has a wrong last row.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
@@ -257,7 +257,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     rule = _checked_rule(camera, options)
     inputs = inputs_of(gaussians, camera, options.opacity_factors)
     degree = gaussians.sh_degree if options.sh_degree is None else options.sh_degree
-    degree = degree if options.colors is None else 0  # harmonics are not shown then, so as few as possible are read
+    degree = degree if options.colors is None else 0  # unused harmonics: read as few as possible
     named = {n: getattr(options, n) for n in ("tile_size", "absgrad", "antialiased")}
     pixels = None
     if options.pixels is not None:
@@ -268,7 +268,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
-        raise UsageError(f"absgrad takes at most {WIDTHS[-1]} channels in colors and no features: render those in another call")
+        raise UsageError(f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: use two calls")
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
         gradients = needs_slots((*inputs, backgrounds))
@@ -293,7 +293,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
 
 
 def _refusing_gradients(render: Render) -> Render:
-    """Return the render, where a gradient through outputs that have none is an error."""
+    """Return the render; a gradient through an output that has none becomes an error."""
     refusing: dict[str, Any] = {}
     for name in WITHOUT_GRADIENT:
         values, source = getattr(render, name), render.rgb if name == "error_bound" else render.projected
@@ -327,7 +327,7 @@ def _rasterize(
 ) -> tuple[Any, ...]:  # fmt: skip
     """Return the images of the first layer as one tuple, and the further fields of `Render`, by kernels launched one by one.
 
-    The last is what was requested beside them by name: further maps [C, H, W, ...].
+    The last entry holds the further maps [C, H, W, ...] that were requested, by name.
     """
     projected, tile_counts = project_inputs(inputs, settings.projection())
     overflow = None if options.capacity is None else torch.zeros(1, dtype=torch.int32, device=projected.device)

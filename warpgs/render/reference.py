@@ -1,4 +1,4 @@
-"""The image that rule ``exact`` defines, in float64 and by other means than the kernels: errors are measured against it."""
+"""Reference image of rule ``exact`` in float64, computed without the kernels: errors are measured against it."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
 def _pixels(
     camera: Camera, K: torch.Tensor, lens: torch.Tensor | None, positions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pixels [N, 2] of positions in the camera [N, 3], and the Jacobians [N, 2, 3] of their expansion."""
+    """Return the pixels [N, 2] of positions in the camera [N, 3], and the Jacobians [N, 2, 3] of the projection."""
     z, focal, center = positions[:, 2:], torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=K.device)
 
@@ -78,7 +78,7 @@ def _pixels(
         return pixels, torch.cat([torch.diag_embed(focal / z), ((center - clamped(pixels)) / z)[..., None]], -1)
     pixels = focal * lenses.to_plane(camera.model, lens, positions) + center
     at = positions
-    if camera.model == "opencv":  # as far as the pixel is moved towards the axis, so is the point
+    if camera.model == "opencv":  # the point moves towards the axis by the same factor as the pixel
         scale = (clamped(pixels) - center) / torch.where(pixels == center, 1, pixels - center)
         scale = torch.where((clamped(pixels) != pixels) & (scale >= 0) & (scale < 1), scale, 1)
         at = torch.cat([positions[:, :2] * scale, z], 1)
@@ -90,7 +90,7 @@ def _pixels(
 
 
 def _block(g: _Ellipses, corner: torch.Tensor, size: tuple[int, int], steps: torch.Tensor, background: torch.Tensor):
-    """Return the colours [w * h, 3] of a block of ``size`` w x h, by rows; ``steps`` are pixel centres from its corner on."""
+    """Return the colours [w * h, 3] of a block of ``size`` w x h, by rows; ``steps`` are offsets of pixel centres."""
     rule, (w, h), (A, B, C) = RULES["exact"], size, g.power
     extent = torch.tensor([w, h], dtype=torch.float64, device=corner.device)
     pixels, half, opacities, colors = g.pixels, g.half, g.opacities, g.colors
@@ -112,8 +112,8 @@ def reference_image(
 ) -> torch.Tensor:  # fmt: skip
     """Return the colours in a window of one camera's image under rule ``exact``, in float64.
 
-    Dense over the pixels of a block and by matrices throughout (Kerbl et al. 2023, section 4 and eq. 3), so for windows of
-    a few thousand pixels. Leave out Gaussians that do not reach the window: many are slow.
+    Gaussians are evaluated at all pixels of a block, with matrices (Kerbl et al. 2023, section 4 and eq. 3). Use it for
+    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: many Gaussians are slow.
 
     Args:
         gaussians: N Gaussians of any scalar type, all finite.

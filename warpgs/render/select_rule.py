@@ -17,7 +17,7 @@ from warpgs.scene import Camera, Gaussians
 FASTEST_FIRST = ("fast", "balanced", "exact")
 """Rules to choose from; each skips all that the next one skips, and more."""
 DEFAULTS = RasterizeOptions()
-"""Options where none are given."""
+"""Default options."""
 MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"mean": torch.mean, "max": torch.amax}
 """Reductions over the pixels of a view, by name."""
 
@@ -43,7 +43,7 @@ def select_rule(
         The name of the rule, and its measured error: the largest of the views.
 
     Raises:
-        UsageError: No rule keeps the limit, there is no view or no list of them, the limit is not a positive number, or the
+        UsageError: No rule keeps the limit, ``cameras`` is empty or not a list, the limit is not a positive number, or the
             measure is unknown.
     """
     if not (isinstance(max_error, Real) and 0 < max_error < math.inf):
@@ -66,6 +66,6 @@ def select_rule(
         else:
             return rule, error
     raise UsageError(
-        f"no rule keeps a {measure} error of {max_error:g}: float32 alone errs by {error:.1e} under rule exact; allow more, "
-        "or render float64 tensors"
+        f"no rule keeps a {measure} error of {max_error:g}: float32 alone errs by {error:.1e} under rule exact; raise "
+        "max_error, or render float64 tensors"
     )

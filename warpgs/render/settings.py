@@ -40,17 +40,17 @@ class RenderSettings:
     """True to reduce the opacity of Gaussians that the pixel filter widens (`ProjectSettings.antialiased`)."""
 
     def projection(self) -> ProjectSettings:
-        """Return what the projection takes."""
+        """Return the settings of the projection."""
         size, count = (self.width, self.height), sh.coefficient_count(self.degree)
         variant = (self.camera_model, self.parameters, self.antialiased)
         return ProjectSettings(size, self.window, count, self.rule, self.tile_size, *variant)
 
     def of_window(self) -> dict[str, Any]:
-        """Return size, place and cut-offs of the window, as binning and blending take them by name."""
+        """Return size, position and cut-offs of the window, as keyword arguments of binning and blending."""
         x, y, width, height = self.window
         return {"width": width, "height": height, "rule": self.rule, "origin": (x, y)}
 
     def blending(self, deterministic: bool = True) -> BlendSettings:
-        """Return what blending takes; ``deterministic`` sums gradients in a fixed order."""
+        """Return the settings of blending; ``deterministic`` sums gradients in a fixed order."""
         x, y, width, height = self.window
         return BlendSettings((x, y), width, height, self.rule, deterministic, self.absgrad)

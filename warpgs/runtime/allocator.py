@@ -19,7 +19,7 @@ ALIGNMENT = 256
 
 
 class Allocator:
-    """Provider of a function's tensors; this one allocates each with torch."""
+    """Provider of a function's tensors; this class allocates each with torch."""
 
     def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
         """Return a new tensor of a shape [...] that the caller may keep."""
@@ -88,7 +88,7 @@ class Arena(Allocator):
         self.begin()
 
     def begin(self) -> None:
-        """Hand out the same tensors again, from the first on."""
+        """Start again: the next requests get the same tensors, from the first on."""
         self._asked = self._saved_to = self._workspace_to = 0
 
     def addresses(self) -> tuple[int, ...]:
@@ -97,7 +97,7 @@ class Arena(Allocator):
         return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
 
     def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
-        """Return the place of a saved tensor [...], the arguments of `part` after the block."""
+        """Return the place of a saved tensor [...], as the arguments of `part` that follow the block."""
         begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # an empty tensor has no address
         return begin, tuple(tensor.shape), tensor.dtype
 

@@ -19,7 +19,7 @@ from warpgs.runtime import interop
 from warpgs.runtime.allocator import Arena, SizingAllocator, part
 
 MAX_GRAPHS = 8
-"""Most graphs of one function, each for one set of addresses: a loop that holds on to some result alternates between two."""
+"""Most graphs of one function, each for one set of addresses: a loop that keeps its last result alternates between two sets."""
 MIN_REPLAYS = 30
 """Replays that pay for one capture."""
 FREE_CAPTURES = 16
@@ -44,7 +44,7 @@ def _no_collection():
 
 
 class CapturedGraph:
-    """A CUDA graph of the kernels that torch and Warp launch in one call, and everything that must live as long as it."""
+    """A CUDA graph of the kernels that torch and Warp launch in one call, and everything that must live as long as it does."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
         """Capture the work; nothing runs yet.
@@ -54,8 +54,8 @@ class CapturedGraph:
         Args:
             work: A function that neither reads from the device nor loads kernels: call it once before, to load them.
             stream: Stream to capture on, not the default one.
-            pool: `pool` of a graph to share memory with, which is never replayed at the same time and leaves nothing there;
-                None for memory of its own.
+            pool: `pool` of a graph to share memory with. That graph must never be replayed at the same time, nor leave results
+                in the memory. None for own memory.
 
         Raises:
             RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
@@ -88,7 +88,7 @@ class CapturedGraph:
 class GraphMemory:
     """Account of the memory that torch keeps for deleted graphs.
 
-    A graph has memory of its own, which torch keeps after the graph is gone and lends to no other.
+    A graph has its own memory. torch keeps that memory after the graph is deleted, and does not reuse it.
     """
 
     def __init__(self, device: torch.device):
@@ -153,7 +153,7 @@ class GraphPool:
         return None if self._keeper is None else self._keeper.pool()
 
     def release(self) -> None:
-        """Keep no memory for graphs to come, and forget that a capture failed."""
+        """Keep no memory for later graphs, and forget that a capture failed."""
         self._keeper, self.failed = None, False
 
 
@@ -212,15 +212,15 @@ class GraphedFunction:
     def _capture(self, key: tuple[int, ...], arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> CapturedGraph | None:
         """Return a new graph; None where it would not pay or is not possible."""
         if self.graphs.failed or self.captures - FREE_CAPTURES > self.replays // MIN_REPLAYS:
-            return None  # the latter where addresses change too often
+            return None  # too many captures: addresses change too often
         self.captures += 1
         try:
             graph = self.graphs.capture(lambda: self._run(arena, inputs))
         except torch.OutOfMemoryError:
             return None
-        except RuntimeError as error:  # of the driver, or of an allocator that knows no graphs
+        except RuntimeError as error:  # of the driver, or of an allocator without support for graphs
             self.graphs.failed = True
-            message = f"calls of the rasterizer are not captured from here on, which makes small ones slower: {error}"
+            message = f"rasterizer calls are no longer captured as CUDA graphs, so small ones are slower: {error}"
             warnings.warn(message, stacklevel=2)
             return None
         if len(self._graphs) == MAX_GRAPHS:

@@ -33,7 +33,7 @@ def kept(ctx: Any) -> tuple[Any, ...]:
     """Return the tensors [...] that `keep` saved.
 
     Raises:
-        RuntimeError: One has another shape now. The kernels would read and write beside it.
+        RuntimeError: A tensor has another shape now. The kernels would read and write out of bounds.
     """
     tensors = ctx.saved_tensors
     for tensor, shape in zip(tensors, ctx.shapes, strict=True):
@@ -68,7 +68,7 @@ def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _WithoutGradient(torch.autograd.Function):
-    """Values that hang on the tensors that they were made from, so that a gradient through them is rejected and not dropped."""
+    """Values that autograd connects to their source, so that a gradient through them is an error and not silently zero."""
 
     @staticmethod
     def forward(ctx: Any, name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
@@ -77,7 +77,7 @@ class _WithoutGradient(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> None:
-        raise UsageError(f"{ctx.name} has no gradient: detach it, or take rgb, alpha, depth or features")
+        raise UsageError(f"{ctx.name} has no gradient: detach it, or differentiate rgb, alpha, depth or features")
 
 
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
@@ -96,7 +96,7 @@ def refuse_transforms() -> None:
     """Check that no transform of torch.func is active.
 
     Raises:
-        UsageError: One is.
+        UsageError: A transform is active.
     """
     if torch._C._are_functorch_transforms_active():
         raise UsageError(

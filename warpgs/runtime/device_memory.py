@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import torch
 
 ASSUMED_BYTES = 2 * 2**30
-"""Assumed memory of a machine that does not report it, that of a small machine."""
+"""Assumed memory of a machine that does not report it [bytes]: the memory of a small machine."""
 
 OWN_CGROUPS = Path("/proc/self/cgroup")
 CGROUPS = Path("/sys/fs/cgroup")
@@ -24,18 +24,18 @@ NO_MEMORY = (
     "out of memory", "can't allocate memory", "cannot allocate memory", "not enough memory", "insufficient memory",
     "failed to allocate", "bad_alloc", "bad allocation", "unable to allocate",
 )  # fmt: skip
-"""Words of torch, Warp, OpenCV, ONNX Runtime, numpy and C++ where the CPU or a GPU has no memory left, in lower case."""
+"""Parts of the messages of torch, Warp, OpenCV, ONNX Runtime, numpy and C++ on lack of memory, in lower case."""
 
 
 class Memory(NamedTuple):
-    """Installed and available bytes; what the system keeps of files and would give up counts as available."""
+    """Installed and available bytes; cached files that the system would drop count as available."""
 
     installed: int
     available: int
 
 
 def available_bytes(device: torch.device) -> int:
-    """Return the memory that is free now on a device [bytes]; on CUDA with what torch holds and has not given out."""
+    """Return the memory that is free now on a device [bytes]; on CUDA including memory that torch holds unused."""
     if device.type == "cuda":
         import torch
 
@@ -61,8 +61,8 @@ def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool 
     ``purpose`` may state the use of the memory, such as " for step 3".
     """
     remedy = (
-        "Lower the need of the fit by --memory-limit or --downscale, or end other programs; --resume continues from the last "
-        "checkpoint"
+        "Reduce the memory of the fit with --memory-limit or --downscale, or end other programs; --resume continues from the "
+        "last checkpoint"
         if fitting
         else "End other programs, and try again"
     )
@@ -72,7 +72,7 @@ def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool 
 
 @functools.cache
 def installed_bytes(device: torch.device) -> int:
-    """Return the memory of a device [bytes], on a CPU no more than its container may use; requested once."""
+    """Return the memory of a device [bytes], on a CPU no more than its container may use; queried once."""
     if device.type == "cuda":
         import torch
 
@@ -89,15 +89,15 @@ def machine_memory() -> Memory | None:
 
 
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
-    """Return the tightest limit that control groups set on this process, and the least that is left below one.
+    """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit.
 
     Only Linux has control groups; on other systems, and without a limit, this is None. Both versions are read, from the
     process's own group up to the root, since every group above counts too (kernel documentation, cgroup-v2 "Memory" and
     cgroup-v1 "Memory Resource Controller"). Pages of files not used lately count as free: the kernel drops them first.
 
     Args:
-        own: What names the process's groups; /proc/self/cgroup where None.
-        mount: Where groups are mounted; /sys/fs/cgroup where None.
+        own: File that lists the process's groups; None for /proc/self/cgroup.
+        mount: Folder in which groups are mounted; None for /sys/fs/cgroup.
     """
     limits, rooms = [], []
     for folder, limit_name, used_name, cache_name in _groups(own or OWN_CGROUPS, mount or CGROUPS):
@@ -125,7 +125,7 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
 
 
 def _system_memory() -> Memory | None:
-    """Return what psutil finds; it reads a different source on each system, and any of them may be closed off."""
+    """Return what psutil finds; its source differs between systems, and access to any of them may be denied."""
     try:
         import psutil
 

@@ -10,9 +10,9 @@ from pathlib import Path
 from warpgs.files import FULL
 
 WORDS = (*map(os.strerror, FULL), "disk is full", f"[Errno {errno.ENOSPC}]", f"[Errno {errno.EDQUOT}]")
-"""Words of systems, of SQLite and of Python on a full disk."""
+"""Parts of messages of systems, SQLite and Python on a full disk."""
 MIN_FREE = 2**16
-"""Room on a disk below which it is full [bytes]: some libraries fail without such words."""
+"""Free space below which a disk counts as full [bytes]: some libraries fail without such a message."""
 
 
 def disk_is_full(folder: Path, said: str) -> bool:

@@ -26,9 +26,10 @@ def is_utf8(text: str) -> bool:
 
 
 def use_utf8_names() -> None:
-    """Start this program again in Python's UTF-8 mode where Python takes names for another encoding, and print that.
+    """Start this program again in Python's UTF-8 mode, with a note, if Python reads file names in another encoding.
 
-    Names in files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python cannot open them.
+    File names in scene files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python cannot
+    open them.
     """
     encoding = sys.getfilesystemencoding()
     if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
@@ -46,10 +47,10 @@ def utf8_name(path: Path) -> Iterator[str]:
     """Give a name of a file that a library can take: its own if that is UTF-8, else a path through an open folder or file.
 
     Args:
-        path: The file. One to be written must have a name in UTF-8, in whatever folder.
+        path: The file. The name of a file to be written must be UTF-8; that of its folder need not.
 
     Raises:
-        UsageError: This system has no such other name.
+        UsageError: The name is not UTF-8, and this system has no other path to the file.
     """
     if is_utf8(str(path)):
         yield str(path)

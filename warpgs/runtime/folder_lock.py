@@ -25,7 +25,7 @@ from warpgs.output_folders import Folder, RefusedError, open_folder
 from warpgs.temporary import NO_LOCKS, sweep_temporary_files
 
 SIGNED_WITHIN = 50
-"""Times that the signature of who holds a lock is looked for, a hundredth of a second apart."""
+"""Number of attempts to read the signature of a lock's holder, a hundredth of a second apart."""
 MOST_LETTERS = 200
 """Length at which a command is cut short in a message."""
 
@@ -34,7 +34,7 @@ MOST_LETTERS = 200
 def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
     """Hold a folder, and make it if it is missing, so that no other process writes into it meanwhile.
 
-    The system releases the lock when its holder ends, killed or not. It also holds against processes in other containers. The
+    The system releases the lock when its holder ends, killed or not. The lock also excludes processes in other containers. The
     lock file names the holder. Leftovers of killed writers are removed from the folder and from the system's temporary files.
     In the block nothing below the folder is written through a link (`output_folder`). A folder that was made here and is still
     empty when an error ends the block is removed as well; other folders are never removed.
@@ -48,7 +48,7 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
 
     Raises:
         FolderHeldError: Another process holds the folder.
-        ResourceError: It cannot be written.
+        ResourceError: The folder cannot be written.
     """
     sweep_temporary_files()
     with writing_into(folder) as made:
@@ -56,7 +56,8 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
             with open_folder(folder) as opened, _held(opened) as locked:
                 for name in (".", *parts):
                     remove_leftovers(folder / name)
-                yield ([] if locked else [f"{folder}: its file system has no locks; start no second process that writes there"])
+                note = f"{folder}: its file system has no locks; do not start a second process that writes there"
+                yield [] if locked else [note]
         except BaseException:
             if made:
                 with contextlib.suppress(OSError), open_folder(folder.absolute().parent) as above:
@@ -71,7 +72,7 @@ def hold_file(path: Path) -> Iterator[list[str]]:
     Raises:
         FolderHeldError: Another process holds the folder.
         ResourceError: The folder cannot be written.
-        UsageError: The path cannot be a file's.
+        UsageError: The path is a folder, or too long.
     """
     check_file_path(path)
     with hold_folder(path.parent) as notes:
@@ -79,7 +80,7 @@ def hold_file(path: Path) -> Iterator[list[str]]:
 
 
 def check_file_path(path: Path) -> None:
-    """Check that a path can be that of a file to write, before the work: that it is no folder, and not too long.
+    """Check, before the work, that a file can be written at a path: it is not a folder, and not too long.
 
     Raises:
         UsageError: The path is a folder, or too long.
@@ -89,13 +90,13 @@ def check_file_path(path: Path) -> None:
     except OSError as e:
         if e.errno == errno.ENAMETOOLONG:
             raise UsageError(f"{path}: the name of the file is too long; choose a shorter one") from e
-        return  # it is not there, or `hold_folder` says more
+        return  # no such path, or an error that `hold_folder` reports
     if is_folder:
-        raise UsageError(f"{path}: is a folder, and a file is to be written; give the name of a file, such as one in it")
+        raise UsageError(f"{path}: is a folder; give the name of the file to write, such as one in this folder")
 
 
 def check_free(folder: Path) -> None:
-    """Check that no process holds a folder; writes nothing, and takes a folder that cannot be read as free.
+    """Check that no process holds a folder, without writing; a folder that cannot be read counts as free.
 
     Raises:
         FolderHeldError: Another process holds it.
@@ -112,7 +113,7 @@ def _held(folder: Folder) -> Iterator[bool]:
         file = _open(folder)
         try:
             locked = _lock(file, folder.path)
-            # the last holder may have removed it between the two calls; then other processes lock a new file
+            # the last holder may have removed the lock file between the two calls; then other processes lock a new file
             if not locked or os.fstat(file.fileno()).st_nlink:
                 break
         except BaseException:
@@ -124,7 +125,7 @@ def _held(folder: Folder) -> Iterator[bool]:
             _sign(file)
         yield locked
     finally:
-        # Windows removes no open file; a system that does must remove it while the lock holds
+        # Windows cannot remove an open file; other systems must remove it while the lock is held
         if sys.platform == "win32":
             file.close()
         try:
@@ -152,7 +153,7 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
 
     Raises:
         FolderHeldError: Another process holds it.
-        ResourceError: It cannot be locked.
+        ResourceError: The file cannot be locked.
     """
     try:
         if lock_descriptor(file.fileno(), blocking=False):
@@ -162,7 +163,7 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
             return False
         raise ResourceError(f"{folder}: cannot be locked ({e.strerror or e}); choose another folder") from e
     raise FolderHeldError(
-        f"{folder}: {_holder(file)} is writing there. Wait until it has ended, or end it, or choose another folder"
+        f"{folder}: {_holder(file)} is writing there. Wait until that process ends, end it, or choose another folder"
     )
 
 
@@ -179,7 +180,7 @@ def _sign(file: BinaryIO) -> None:
 
 
 def _holder(file: BinaryIO) -> str:
-    """Return in words who holds a lock file, which may have been locked just now: its signature is waited for a little."""
+    """Return a text on the holder of a lock file; wait briefly for the signature, since the lock may be new."""
     for _ in range(SIGNED_WITHIN):
         words = _signed(file)
         if words is not None:

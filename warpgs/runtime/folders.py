@@ -1,4 +1,4 @@
-"""Folders for what can be made again: the user's cache, or one that is private to this process and removed at its end."""
+"""Folders for files that can be made again: the user's cache, or one that is private to this process and removed at its end."""
 
 from __future__ import annotations
 

@@ -8,7 +8,10 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def fast_imports() -> Iterator[None]:
-    """Import without looking for garbage meanwhile or later: modules leave none, and looking takes a fifth of the time."""
+    """Import without garbage collection, and exempt the imported objects from later collections.
+
+    Modules leave no garbage, and collection takes a fifth of the time.
+    """
     if "torch" in sys.modules or not gc.isenabled():
         yield
         return

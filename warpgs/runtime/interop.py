@@ -44,10 +44,10 @@ FEW_THREADS = 4
 """Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
 
 SERIAL_WORK = 20_000
-"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. Ranges take half of it or more."""
+"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. A range has at least half."""
 
 MAX_SIZE = 2**31 - 1
-"""Largest number of entries of an axis, and of items of a launch: Warp numbers them in signed 32 bits."""
+"""Largest number of entries of an axis, and of items of a launch: Warp indexes them with signed 32-bit integers."""
 
 
 def _check_size(size: int) -> None:
@@ -63,7 +63,7 @@ def real_of(tensor: torch.Tensor) -> type:
     """Return the Warp scalar type of a tensor, float32 or float64.
 
     Raises:
-        TypeError: The tensor is of another type.
+        TypeError: The tensor has another type.
     """
     if tensor.dtype not in REALS:
         raise TypeError(f"kernels take float32 or float64 tensors, not {tensor.dtype}")
@@ -71,7 +71,7 @@ def real_of(tensor: torch.Tensor) -> type:
 
 
 def set_threads(count: int) -> None:
-    """Set the number of threads of CPU launches, at least 1. The number is torch's own, so both agree."""
+    """Set the number of threads of CPU launches, at least 1. It sets torch's own number, so both agree."""
     torch.set_num_threads(count)
 
 
@@ -86,8 +86,8 @@ class View(NamedTuple):
     tensor: torch.Tensor
     dtype: object
     axes: int | None = None
-    """1 for a flat array, 2 for rows of the last axis, 0 for a flat array with what lies between the rows, None for the axes of
-    the tensor."""
+    """1 for a flat array, 2 for rows of the last axis, 0 for a flat array with the gaps between rows, None for the axes of the
+    tensor."""
 
     def shape(self) -> tuple[int, ...]:
         """Return the sizes of the axes that a kernel sees, those of a vector type included."""
@@ -133,7 +133,7 @@ def rows(tensor: torch.Tensor, dtype) -> View:
 
 
 def span(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with what lies between them.
+    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with the gaps between rows.
 
     Rows are contiguous, and `View.row_stride` leads from each to the next.
     """
@@ -153,7 +153,7 @@ def _several_devices() -> bool:
 
 
 def _current(device: torch.device):
-    """Return a context in which a CUDA device is the current one, and after which the caller's is again.
+    """Return a context in which a CUDA device is current; afterwards the caller's device is current again.
 
     Warp makes a device current when it works there, and leaves it so; torch takes that for the caller's choice.
     """
@@ -179,8 +179,8 @@ def _is_struct(value) -> bool:
 
 
 _LOADING = threading.Lock()
-"""Lock held while a CPU module is loaded, since it is not safe to compile one from several threads at once; and in debug mode,
-in which kernels are not safe either, while one runs."""
+"""Lock held while a CPU module is loaded, since several threads must not compile at once. In debug mode it is also held while a
+kernel runs, since these kernels are not thread-safe either."""
 _SORTING = threading.RLock()
 """Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
 
@@ -211,7 +211,7 @@ def _copied(struct):
 
 
 class _Recorded:
-    """A kernel whose launch is recorded once, and then only its arguments are replaced.
+    """A kernel with a launch that is recorded once; later calls only replace its arguments.
 
     ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
     here take, and at 140 us on a CPU of 2.6 GHz. The recorded launch keeps the packed arguments; a call writes pointers, sizes
@@ -292,7 +292,7 @@ _OF_THREAD = _OfThread()
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
 
-    On a CPU, torch's number of threads share ranges of the items. This repeats, since an item writes to memory of its own.
+    On a CPU, torch's number of threads share the items; results are repeatable, since each item has its own output memory.
 
     Args:
         kernel: Warp kernel whose item number is ``begin + wp.tid()``.
@@ -324,7 +324,7 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         with _LOADING:  # launches on a CPU are compiled for blocks of one thread
             recorded = _Recorded(kernel, device, 1)
             first = recorded.patched(count, inputs)
-        _OF_THREAD.recorded[kernel] = recorded  # not before: one that failed has no command
+        _OF_THREAD.recorded[kernel] = recorded  # only now: a launch that failed has no command
     else:
         first = recorded.patched(count, inputs)
     threads = torch.get_num_threads()

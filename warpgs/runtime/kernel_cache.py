@@ -31,7 +31,7 @@ class KernelCache(NamedTuple):
 
 @functools.cache
 def prepare_kernel_cache() -> KernelCache:
-    """Choose the folder and tell Warp; to be called before `wp.init`. If it is a private one, a line is printed on stderr.
+    """Choose the folder, and set it in Warp's settings before `wp.init`; print a line on stderr if the folder is private.
 
     Raises:
         ResourceError: There is no writable folder.
@@ -51,10 +51,10 @@ def prepare_kernel_cache() -> KernelCache:
 
 
 def choose_kernel_cache(configured: str | None = None) -> KernelCache:
-    """Choose a folder: the one configured, that of WARP_CACHE_PATH, or Warp's own, where it is sound; else a private one.
+    """Choose the configured folder, that of WARP_CACHE_PATH, or Warp's default; a private one if that is unusable.
 
     Args:
-        configured: What ``warp.config.kernel_cache_dir`` is: set by the user's program, or by Warp once started.
+        configured: Value of ``warp.config.kernel_cache_dir``: set by the user's program, or by Warp once started.
 
     Raises:
         ResourceError: Neither the usual nor the private folder can be written.
@@ -88,7 +88,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
 
 
 def _fault(folder: Path) -> str:
-    """Return why a folder cannot be used, made if it is missing; empty where it can."""
+    """Return why a folder cannot be used, or an empty text if it can; a missing folder is made."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as f:

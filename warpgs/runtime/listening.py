@@ -1,8 +1,8 @@
 """Guards of all servers: sockets of this machine only, and checks of the clients of a served page.
 
-Any page in a browser can send requests to any port of the machine that its reader sits at, and so can every program of every
-user of the machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start,
-and looks at ``Host`` and ``Origin`` before anything else does.
+Any web page can send requests to every port of the machine that shows it, and so can every program of every user of the
+machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start, and checks
+``Host`` and ``Origin`` first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from warpgs.runtime.terminal import say
 HOST = "127.0.0.1"
 """Address that servers listen at: only this machine reaches it."""
 NAMES = (HOST, "localhost")
-"""Host names that a browser may request, at any port: that of an SSH tunnel may differ from the server's."""
+"""Host names that a browser may request, at any port: the port of an SSH tunnel may differ from the server's."""
 TOKEN_BYTES = 24
 """Random bytes of a token: 32 letters."""
 _PLAIN = re.compile(r"[A-Za-z0-9._/-]*")
@@ -38,7 +38,7 @@ def loopback_socket(port: int, fix: str, host: str = HOST) -> socket.socket:
         host: 127.0.0.1 or ::1.
 
     Raises:
-        UsageError: The port is taken, or no port.
+        UsageError: The port is taken, or is not a valid port.
     """
     opened = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     # on Windows SO_REUSEADDR would let another program bind the same port beside us
@@ -57,7 +57,7 @@ def loopback_of(name: str) -> str | None:
     """Return the loopback address of a host name or address, 127.0.0.1 before ::1; None for other hosts."""
     try:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
-    except (OSError, UnicodeError):  # it cannot be resolved; connecting to it raises the error
+    except (OSError, UnicodeError):  # the name cannot be resolved; connecting raises the error
         return None
     if not found or not all(map(is_loopback, found)):
         return None
@@ -68,7 +68,7 @@ def loopback_interface(host: str = HOST) -> str:
     """Return the name of the network interface that has a loopback address, such as lo.
 
     Raises:
-        ResourceError: No interface has it.
+        ResourceError: No interface has the address.
     """
     import psutil
 
@@ -79,7 +79,7 @@ def loopback_interface(host: str = HOST) -> str:
 
 
 def listening_at(process: int | None = None) -> list[tuple[str, int]]:
-    """Return the addresses and ports at which a process listens, sorted; none where the system does not let us ask.
+    """Return the addresses and ports at which a process listens, sorted; none where the system denies access.
 
     Args:
         process: Number of the process; None for this one.
@@ -122,13 +122,13 @@ def is_loopback(address: str) -> bool:
 
 
 class Allowance:
-    """A number of messages that may come, refilled with time up to a limit."""
+    """Rate limit: a number of allowed messages that grows with time up to a maximum."""
 
     def __init__(self, per_second: float, most: float, clock: Callable[[], float] = time.monotonic):
-        """Begin full.
+        """Start with the largest number of messages.
 
         Args:
-            per_second: Messages by which it grows in a second.
+            per_second: Messages that are added in a second.
             most: Largest number of messages at once.
             clock: Returns the time [s].
         """
@@ -136,7 +136,7 @@ class Allowance:
         self._left, self._last = most, clock()
 
     def take(self) -> bool:
-        """Take one message; returns False at the end."""
+        """Take one message; return False if none is left."""
         now = self._clock()
         self._left = min(self._most, self._left + self._per_second * (now - self._last))
         self._last = now
@@ -161,7 +161,8 @@ class WebGuard:
         """Return the requested path below the token, or None if the request must be rejected.
 
         Args:
-            target: Target of the request line. One with a query is rejected: pages obey parameters that others choose.
+            target: Target of the request line. A target with a query is rejected: a foreign link must not choose parameters of
+                the page.
             hosts: Values of all headers ``Host``. There must be one, with one of `NAMES`: a foreign name that resolves to
                 127.0.0.1 is rejected.
             origins: Values of all headers ``Origin``. Each must be the server's own, and a websocket must have exactly one.
@@ -183,10 +184,10 @@ class WebGuard:
         """Return the headers of every answer.
 
         Args:
-            host: Value of the request's header ``Host``; of a refused request, anything.
-            nonce: Word that scripts of the page carry; others do not run.
+            host: Value of the request's header ``Host``; any text for a rejected request.
+            nonce: Nonce of the scripts of the page; other scripts do not run.
         """
-        # Safari takes 'self' for http alone; a host that is not our own must not come into the header
+        # in Safari, 'self' covers http only; a foreign host must not get into the header
         sockets = f" ws://{host}" if _is_own(host) else ""
         policy = {
             "default-src": "'none'",

@@ -25,7 +25,7 @@ _LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
 def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]]:
     """Call ``listener`` within the block with the name of each module that the cache lacks, before it is compiled.
 
-    It may be called from any thread. Yields a list that grows by the time of each module once it is compiled [s].
+    ``listener`` may be called from any thread. Yields a list that grows by the time of each module once it is compiled [s].
     """
     entry: tuple[Callable[[str], object], list[float]] = listener, []
     _LISTENERS.append(entry)
@@ -36,7 +36,7 @@ def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]
 
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int):
-    """Load a module for blocks of that many threads and return Warp's handle of it; compile it where the cache lacks it.
+    """Load a module for blocks of ``block_dim`` threads and return Warp's handle; compile it where the cache lacks it.
 
     Several fits that start at once on a fresh machine need the same modules. A file lock beside the cache's folders makes one
     of them compile; the others find the result. Once a module is loaded no lock is taken.
@@ -63,8 +63,8 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
 def exclusive(path: Path) -> Iterator[None]:
     """Hold a file, which is made if it is missing, so that one thread of one process at a time runs the body.
 
-    The system releases the file when its holder ends, killed or not. A file system without locks is passed over: Warp puts a
-    compiled module in place by renaming, so that two that compile it lose time and nothing else.
+    The system releases the file when its holder ends, killed or not. On a file system without locks the body runs
+    without one: Warp renames a compiled module into place, so two processes that compile it only lose time.
 
     Raises:
         ResourceError: The file cannot be opened.

@@ -1,4 +1,4 @@
-"""Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be pulled in.
+"""Check of an ONNX file by its bytes, before onnxruntime loads it: nothing outside the file may be loaded.
 
 The wire format is protobuf; field numbers are those of onnx.proto (ONNX IR version 3 and later).
 """
@@ -137,7 +137,7 @@ def check_onnx(data: bytes, path: Path) -> None:
         graphs, functions = list(_parts(model, MODEL_GRAPH)), list(_parts(model, MODEL_FUNCTION))
         if len(graphs) != 1 or not any(n == MODEL_OPSET for n, _ in model):
             raise ValueError("it has no graph" if not graphs else "it names no operator set")
-        # exporters put what they compose of standard operators into functions that travel in the file
+        # exporters store compositions of standard operators as functions in the file
         walk = _Walk(path, {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions})
         walk.graph(graphs[0])
         for function in functions:

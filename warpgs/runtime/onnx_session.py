@@ -23,7 +23,7 @@ def read_model(path: Path) -> bytes:
     """Return the bytes of an ONNX file, checked to need no other files.
 
     Raises:
-        DataError: It cannot be read, is not an ONNX model, or needs other files or foreign operators.
+        DataError: The file cannot be read, is not an ONNX model, or needs other files or foreign operators.
     """
     try:
         data = read_input(path, MAX_MODEL_BYTES)
@@ -55,7 +55,7 @@ def start_session(data: bytes, path: Path, provider: str, threads: int) -> Infer
     try:
         import onnxruntime as ort
     except ImportError as e:
-        raise ResourceError(f"{path}: onnxruntime, which runs it, cannot be imported ({e}); `pip install onnxruntime`") from e
+        raise ResourceError(f"{path}: onnxruntime is needed, and cannot be imported ({e}); `pip install onnxruntime`") from e
     there = [name for name, long in PROVIDERS.items() if long in ort.get_available_providers()]
     remedy = "`pip uninstall onnxruntime`, then `pip install onnxruntime-gpu[cuda,cudnn]`; or leave the flag out"
     if provider not in there:

@@ -37,7 +37,7 @@ def _send_to_null(number: int) -> None:
     """Point a descriptor at the null device; if no further descriptor can be opened, keep it."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
-        if null == number:  # it was closed, and the lowest one free
+        if null == number:  # it was closed, and the lowest free descriptor
             os.set_inheritable(number, True)
             return
         os.dup2(null, number)
@@ -52,7 +52,7 @@ def is_gone_reader(error: BaseException | None) -> bool:
 
 
 def reason(error: BaseException) -> str:
-    """Return why a write failed, in words of the system."""
+    """Return why a write failed, as the system reports it."""
     return (isinstance(error, OSError) and error.strerror) or str(error)
 
 
@@ -65,7 +65,7 @@ class CarefulStream:
         Args:
             stream: The stream; None for one whose descriptor was closed when Python started.
             name: stdout or stderr.
-            goes_on: Say on stderr at once that the command continues without this stream.
+            goes_on: True to print on stderr at once that the command continues without this stream.
         """
         self.closed_at_start = stream is None
         self.stream: TextIO = io.StringIO() if stream is None else stream
@@ -134,7 +134,7 @@ class CarefulOutput:
         self.stdout, self.stderr, self.is_product = stdout, stderr, is_product
 
     def exit_code(self, code: int) -> int:
-        """Return the exit code of a command that ends with ``code``: another one where its only product was not written."""
+        """Return ``code``, or that of a ResourceError if the command succeeded but its only result could not be written."""
         self.stdout.flush()
         self.stderr.flush()
         failure = self.stdout.failure
@@ -151,8 +151,8 @@ def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
     """Replace stdout and stderr by streams whose writes do not raise.
 
     Args:
-        is_product: True if stdout is the command's only result. Then a failure to write fails the command, except
-            if the reader of a pipe has closed it; otherwise the command continues with one line on stderr.
+        is_product: True if stdout is the command's only result. Then a failure to write fails the command,
+            unless the reader of a pipe has closed it. Otherwise the command continues with one line on stderr.
     """
     open_missing_descriptors()
     before = sys.stdout, sys.stderr

@@ -10,7 +10,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 def usable_cores() -> int:
-    """Return the number of cores that this process may run on, at least 1; all cores if the system cannot tell."""
+    """Return the number of cores that this process may run on, at least 1; all cores if that is unknown."""
     try:
         return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
     except (AttributeError, OSError):

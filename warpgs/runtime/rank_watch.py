@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 BEAT_SECONDS = 1.0
 """Time between two signs of life [s]."""
 LOST_SECONDS = 20.0
-"""Time without a sign of life after which a process on another machine counts as lost [s]; on this one its end is seen."""
+"""Time without a sign of life after which a process on another machine counts as lost [s]. The end of a process on this machine
+is detected directly."""
 
 
 def machine() -> str:
-    """Return a name of the machine and of its table of processes, in which process numbers mean something."""
+    """Return a name of the machine and of its process table; process numbers are valid only within one table."""
     try:
         return f"{Path('/proc/sys/kernel/random/boot_id').read_text().strip()} {os.stat('/proc/self/ns/pid').st_ino}"
     except OSError:  # a system other than Linux
@@ -44,7 +45,7 @@ def is_gone(process: int) -> bool:
 class RankWatch:
     """Signs of life in a store, and a thread that reads those of the others.
 
-    A store's calls wait for each other, so that the thread has a connection of its own.
+    Calls through one connection wait for each other, so the thread has its own connection.
     """
 
     def __init__(self, rank: int, count: int, store: Store, own: Store):
@@ -54,7 +55,7 @@ class RankWatch:
             rank: Number of this process.
             count: Number of processes.
             store: Store of the main thread.
-            own: Another connection to it.
+            own: Another connection to the store, for the thread.
         """
         self.rank, self.count, self.store = rank, count, store
         self.here = machine()
@@ -72,14 +73,14 @@ class RankWatch:
         """Wait until all processes have given a sign of life.
 
         Raises:
-            ResourceError: One has not within the time [s].
+            ResourceError: A process has given none after ``seconds`` [s].
         """
         until = time.monotonic() + seconds
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
                 raise ResourceError(
-                    f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s, without rank "
-                    f"{missing[0]}; start all of them, with the same MASTER_ADDR and MASTER_PORT"
+                    f"only {self.count - len(missing)} of {self.count} ranks connected within {seconds:.0f} s; rank "
+                    f"{missing[0]} is missing. Start all ranks with the same MASTER_ADDR and MASTER_PORT"
                 )
             time.sleep(0.05)
 
@@ -106,7 +107,7 @@ class RankWatch:
                 lost = 0
             if lost is not None and not self.leaving.is_set():
                 self.fail(
-                    f"warpgs: rank {lost} of {self.count} is gone, and this fit ends with it; --resume continues from the last "
+                    f"warpgs: rank {lost} of {self.count} was lost, so this fit stops; --resume continues from the last "
                     "checkpoint, with any number of ranks"
                 )
                 os._exit(ResourceError.exit_code)
@@ -125,7 +126,7 @@ class RankWatch:
         return gone and not self._own.check([f"left/{rank}"])
 
     def fail(self, line: str) -> None:
-        """Print why all ranks end, unless another one has printed it, or this one ends normally after the first."""
+        """Print why all ranks end, unless another rank has printed it, or this rank follows the first to a normal end."""
         if self.leaving.is_set() and self.rank != 0:
             return
         self.leaving.set()
@@ -150,11 +151,11 @@ class RankWatch:
         return all(there != self.here or is_gone(int(process)) for _, process, there in below)
 
     def settle(self, seconds: float) -> None:
-        """Wait at most so long [s] for the thread to end this process, which it does once the lost rank is known."""
+        """Wait a little more than ``seconds`` for the thread, which ends this process once it knows the lost rank."""
         time.sleep(seconds + 2 * BEAT_SECONDS)
 
     def leave(self) -> None:
-        """Tell the others that this process ends normally; all but the first wait for the first to do so."""
+        """Tell the others that this process ends normally; all but the first wait for the first to end."""
         try:
             self.store.set(f"left/{self.rank}", "")
             if self.rank != 0:

@@ -1,7 +1,7 @@
 """Processes that fit one scene together: their identity, their exchange, and their end when one is lost.
 
 They are started by torchrun, or with the variables that it sets: RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT.
-Numbers go by NCCL between GPUs and by gloo between CPUs. Neither reports a lost process in time (a kernel of NCCL waits
+Data are exchanged by NCCL between GPUs and by gloo between CPUs. Neither reports a lost process in time (a kernel of NCCL waits
 forever), so each process watches the others through a store that all are connected to.
 """
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     import torch.distributed as dist
 
 JOIN_SECONDS = 300.0
-"""Time in which all processes must have come [s]."""
+"""Time in which all processes must join [s]."""
 EXCHANGE_TIME = timedelta(days=1)
 """Time that an exchange may take: the first rank may write a checkpoint meanwhile, and a lost rank is detected separately."""
 
@@ -38,7 +38,7 @@ class Ranks:
     count = 1
     """Number of processes."""
     backend = "none"
-    """Library that exchanges numbers: nccl, gloo, or none."""
+    """Library that exchanges data: nccl, gloo, or none."""
 
     @property
     def first(self) -> bool:
@@ -69,7 +69,7 @@ class Ranks:
         """End all exchange, once all processes have done the same steps."""
 
     def leave(self) -> None:
-        """End normally; all but the first wait for the first to do so."""
+        """End normally; all but the first wait for the first to end."""
 
 
 ALONE = Ranks()
@@ -110,7 +110,7 @@ class Group(Ranks):
         except RuntimeError as e:
             self.watch.settle(LOST_SECONDS)
             raise ResourceError(
-                f"rank {self.rank} of {self.count} cannot exchange numbers with the others ({str(e).splitlines()[0][:200]}); "
+                f"rank {self.rank} of {self.count} cannot exchange data with the others ({str(e).splitlines()[0][:200]}); "
                 "--resume continues from the last checkpoint"
             ) from e
 
@@ -135,14 +135,14 @@ def _number(name: str, least: int, most: int, default: str | None = None) -> int
     text = os.environ.get(name, default)
     if text is None or not text.isdecimal() or not least <= int(text) <= most:
         raise UsageError(
-            f"the environment variable {name} is {text!r}, and must be a whole number from {least} to {most}; start the fit "
+            f"the environment variable {name} must be a whole number from {least} to {most}, not {text!r}; start the fit "
             "with `torchrun --nproc_per_node N -m warpgs fit ...`, or unset RANK and WORLD_SIZE"
         )
     return int(text)
 
 
 def place() -> tuple[int, int]:
-    """Return rank and number of the processes, 0 and 1 for a single one.
+    """Return the rank of this process and the number of processes, 0 and 1 for a single one.
 
     Raises:
         UsageError: The variables are not valid numbers.
@@ -154,13 +154,13 @@ def place() -> tuple[int, int]:
 
 
 def join(device: str) -> Ranks:
-    """Wait for the other processes that were started with this one; returns `ALONE` without others.
+    """Wait for the other processes that were started with this one; return `ALONE` if there are none.
 
     Args:
         device: auto, cpu or cuda; with CUDA each process takes the GPU of its number on this machine.
 
     Raises:
-        ResourceError: There are fewer GPUs than processes, the others do not come, or cannot be reached.
+        ResourceError: There are fewer GPUs than processes, or the others do not join or cannot be reached.
         UsageError: The variables of the environment are not those of torchrun.
     """
     global _joined
@@ -180,7 +180,7 @@ def join(device: str) -> Ranks:
         watch = RankWatch(rank, count, store, _store(address, port, count, home, hosts=False))
     except RuntimeError as e:
         raise ResourceError(
-            f"rank {rank} of {count} does not reach the others at {address}:{port} ({str(e).splitlines()[0][:200]})"
+            f"rank {rank} of {count} cannot reach the others at {address}:{port} ({str(e).splitlines()[0][:200]})"
         ) from e
     backend = "nccl" if cuda else "gloo"
     _joined = Group(rank, count, backend, watch)
@@ -218,16 +218,16 @@ def _take_gpu(rank: int, local: int) -> None:
 
     if torch.cuda.device_count() <= local:
         raise ResourceError(
-            f"rank {rank} needs GPU {local} of this machine, and torch sees {torch.cuda.device_count()}: NCCL takes one "
-            "GPU a process, so start as many as there are, or give --device cpu"
+            f"rank {rank} needs GPU {local} of this machine, but torch finds {torch.cuda.device_count()} GPUs, and NCCL needs "
+            "one for each process. Start fewer processes, or give --device cpu"
         )
     torch.cuda.set_device(local)
 
 
 def _stay_home(address: str) -> str | None:
-    """Have gloo and NCCL listen at the loopback interface where all ranks are on this machine; returns its address.
+    """Have gloo and NCCL listen at the loopback interface where all ranks are on this machine; return its address.
 
-    Interfaces that the user names stay.
+    Interfaces that the user has set are not changed.
 
     Args:
         address: Value of MASTER_ADDR.

@@ -36,7 +36,7 @@ def _handled(handler: Callable[..., Any] | signal.Handlers) -> Iterator[None]:
 
 
 def _send(number: signal.Signals) -> None:
-    """Send a signal to the main thread, which it wakes where the system can do that."""
+    """Send a signal to the main thread, and wake the thread where the system can do that."""
     if sys.platform == "win32":
         signal.raise_signal(number)
     else:
@@ -49,8 +49,8 @@ def _send(number: signal.Signals) -> None:
 def interrupting_signals() -> Iterator[None]:
     """Raise KeyboardInterrupt in the body when a signal comes.
 
-    Python throws an exception away that is raised in a destructor, or in a callback of a weak reference; where the signal came
-    during one, it is sent again.
+    Python discards an exception that is raised in a destructor or in a callback of a weak reference. A signal that comes during
+    one is sent again.
     """
     before = sys.unraisablehook
 
@@ -60,7 +60,7 @@ def interrupting_signals() -> Iterator[None]:
     def unraisable(thrown: sys.UnraisableHookArgs) -> None:
         if thrown.exc_type is not KeyboardInterrupt:
             before(thrown)
-        elif numbers:  # from a thread: here it would interrupt this function itself
+        elif numbers:  # from a thread: a signal sent here would interrupt this function
             timers.append(threading.Timer(AGAIN, _send, numbers[:1]))
             timers[-1].daemon = True
             timers[-1].start()

@@ -1,4 +1,4 @@
-"""Other processes. Those of Python import nothing from the folder that warpgs was called in; no shell is started."""
+"""Other processes. Python processes import nothing from the folder that warpgs was called in; no shell is started."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ENDS_WITH_PARENT = (
 
 
 def end_with_parent() -> None:
-    """Have this process end when the one that started it does, killed or not: its stdin ends then."""
+    """Have this process end when its parent ends, killed or not: its stdin ends then."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
 
 
@@ -42,17 +42,17 @@ def run_python(
 ) -> subprocess.CompletedProcess[str]:
     """Run Python code in another process, and return its exit code and its output.
 
-    It works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it nor what it starts
-    looks for modules in the current folder (``-P``, PYTHONSAFEPATH): that may be a scene from anywhere, with a numpy.py in it.
+    The process works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it nor its
+    children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene with a numpy.py.
 
     Args:
-        code: What to run.
+        code: The code.
         arguments: Its ``sys.argv[1:]``; paths must be absolute.
-        timeout: Seconds until it is ended.
+        timeout: Seconds until the process is ended.
         environment: Variables beside those of this process.
 
     Raises:
-        subprocess.TimeoutExpired: It took too long.
+        subprocess.TimeoutExpired: The process took too long.
     """
     with temporary_folder() as folder, shared_locks() as locks, _stdin_until_our_end() as stdin:
         return subprocess.run(
@@ -80,7 +80,7 @@ class ProcessFailed(Exception):
 
 
 def _environment(more: dict[str, str] | None) -> dict[str, str]:
-    """Return the variables of a process that runs this package, wherever that was imported from, and nothing of its folder."""
+    """Return variables with which a process imports this package from its place, and nothing from the current folder."""
     home = str(Path(__file__).parents[2])
     search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
     own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
@@ -90,8 +90,8 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
     """Run a module of this package in another process, and yield the lines of its stdout as they come.
 
-    Like `run_python`, it does not import modules from its folder. It ends when its output is no longer read, and calls
-    `end_with_parent` to end when this process is killed.
+    Like that of `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
+    The module calls `end_with_parent`, so that the process ends when this one is killed.
 
     Args:
         module: Full name of the module, run as ``__main__``.
@@ -100,7 +100,7 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
         environment: Variables beside those of this process.
 
     Raises:
-        ProcessFailed: It ended with another exit code than 0.
+        ProcessFailed: The process ended with another exit code than 0.
     """
     with tempfile.TemporaryFile() as errors, shared_locks() as locks, _stdin_until_our_end() as stdin:
         process = subprocess.Popen(
@@ -135,8 +135,8 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
         program: Name of the program, searched in PATH.
         options: Its arguments.
         stdin: Text for its stdin.
-        timeout: Seconds until it is ended.
-        hidden: Beginning of the names of variables that it does not get.
+        timeout: Seconds until the program is ended.
+        hidden: Prefix of the environment variables that are not passed on.
     """
     environment = {k: v for k, v in _environment(None).items() if not k.startswith(hidden)}
     try:
@@ -152,8 +152,8 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
 class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
-    It looks for modules in its folder no more than `run_python` does. Only its parent handles Ctrl-C. The process stops at the
-    end of its stdin, which also follows if the parent is killed.
+    Like that of `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
+    stops at the end of its stdin, which also follows if the parent is killed.
     """
 
     def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):

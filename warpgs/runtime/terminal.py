@@ -25,7 +25,7 @@ class Detail(str):
 
 
 def printable(text: object) -> str:
-    """Return text with every character that a terminal would obey, such as ESC, and bytes that are not text, as codes."""
+    """Return text with codes in place of control characters, such as ESC, and of bytes that are not text."""
     return "".join(
         c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c
         for c in readable(str(text))
@@ -37,7 +37,7 @@ _lost = False
 
 
 def be_quiet() -> None:
-    """Print no more lines but errors, since another process prints the same."""
+    """Print only errors from now on, since another process prints the same lines."""
     global _quiet
     _quiet = True
 
@@ -66,7 +66,7 @@ def answer(line: object) -> None:
     """Print one line to the process that started this one.
 
     Raises:
-        OSError: It has ended, so the answer is not needed.
+        OSError: That process has ended, so the answer is not needed.
     """
     _print(line, False)
 
@@ -83,9 +83,9 @@ def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: 
 
     Args:
         items: The items.
-        tell: Takes a line.
+        tell: Function that takes a line.
         what: Name of the work on the items.
-        unit: Word for several of them.
+        unit: Plural word for the items.
     """
     for done, item in enumerate(items):
         tell(f"{what}: {done} of {len(items)} {unit}")

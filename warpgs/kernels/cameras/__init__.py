@@ -1,1 +1,1 @@
-"""Camera models, one file each; `base` says what a model must supply."""
+"""Camera models, one file each; `base` defines their interface."""

@@ -46,7 +46,7 @@ class CameraModel:
         moves with the position; else it does not. The coefficients have no gradient.
 
         Raises:
-            TypeError: The class does not define it.
+            TypeError: The class does not define this function.
         """
         raise TypeError("a camera model must define make_functions(real); warpgs/kernels/cameras/pinhole.py is an example")
 
@@ -60,8 +60,8 @@ def check_camera(camera: Camera) -> type[CameraModel]:
     """Return the model of a camera, or of a batch.
 
     Raises:
-        UsageError: The model is unknown, the number of coefficients does not match it, or they require gradients, which are not
-            supported.
+        UsageError: The model is unknown, the number of coefficients does not match it, or the coefficients require gradients,
+            which are not supported.
     """
     model = CAMERA_MODELS.find(camera.model)
     found = 0 if camera.distortion is None else camera.distortion.shape[-1]
@@ -72,6 +72,6 @@ def check_camera(camera: Camera) -> type[CameraModel]:
         )
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError(
-            "coefficients of a lens have no gradient, and Camera.distortion requires one: detach it; pose and K have theirs"
+            "distortion coefficients have no gradient: detach Camera.distortion; gradients of the pose and of K are supported"
         )
     return model

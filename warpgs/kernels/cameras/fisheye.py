@@ -1,4 +1,4 @@
-"""The fisheye camera of Kannala and Brandt, as OpenCV's: the angle from the axis, bent, is the radius (docs/project.md)."""
+"""The fisheye camera of Kannala and Brandt, as in OpenCV: the radius is a polynomial of the axis angle (docs/project.md)."""
 
 import functools
 from types import SimpleNamespace
@@ -49,7 +49,7 @@ def _make_profile(real: type) -> SimpleNamespace:
 
     @wp.func
     def slope(t: real, lens: wp.array(dtype=real)) -> real:
-        """Return the derivative of the bent angle by the angle, whose square is t."""
+        """Return the derivative of the radius by the angle, whose square is t."""
         return real(1.0) + t * (
             real(3.0) * lens[0] + t * (real(5.0) * lens[1] + t * (real(7.0) * lens[2] + t * real(9.0) * lens[3]))
         )
@@ -128,7 +128,7 @@ def _make_functions(real: type) -> SimpleNamespace:
             return False
         angle = wp.atan2(r, unit[2])
         count = int(RIM_SAMPLES)  # a loop, not sixteen copies
-        for i in range(count):  # also beyond a fold the polynomial may rise again
+        for i in range(count):  # several samples, since the polynomial may rise again beyond a fold
             t = angle * (real(i + 1) / real(RIM_SAMPLES))
             if not (radial.slope(t * t, lens) > real(0.0)):
                 return False

@@ -30,7 +30,7 @@ def _make_distortion(real: type) -> SimpleNamespace:
 
     @wp.struct
     class Radial:
-        """The radial factor R = N / M at a squared radius, and its first two derivatives by that."""
+        """The radial factor R = N / M at a squared radius, and its first two derivatives by the squared radius."""
 
         value: real
         first: real
@@ -118,7 +118,7 @@ def _make_functions(real: type) -> SimpleNamespace:
         a = position[0] / position[2]
         b = position[1] / position[2]
         count = int(RIM_SAMPLES)  # a loop, not sixteen copies
-        for i in range(count):  # also beyond a fold the map may rise again
+        for i in range(count):  # several samples, since the map may rise again beyond a fold
             part = real(i + 1) / real(RIM_SAMPLES)
             s = wp.sqrt(part / (one + (one - part) * (a * a + b * b)))  # evenly spaced in the squared sine of the angle
             d = lensed.distort(s * a, s * b, lens)

@@ -1,4 +1,4 @@
-"""The orthographic camera: x and y times K[0, 0] and K[1, 1] [px/u], whatever the depth (docs/project.md, section 3)."""
+"""The orthographic camera: x and y times K[0, 0] and K[1, 1] [px/u], at any depth (docs/project.md, section 3)."""
 
 import functools
 from types import SimpleNamespace

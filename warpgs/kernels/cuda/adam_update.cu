@@ -2,8 +2,8 @@ if (skip.data[0] != 0)
     return;
 const float head_lr = lrs.data[0], lr = lrs.data[1], root_correction2 = lrs.data[2];
 const int size = parameter.shape[0];
-// Products and sums that the compiler might fuse are spelled with their rounding: it may choose otherwise in another kernel,
-// and all kernels that update must give the same bits.
+// Products and sums that the compiler might fuse have explicit rounding: fusing may differ between kernels, and all kernels
+// that update must give the same bits.
 auto one = [&](float g, float rate, float& p, float& m, float& s) {
     m = __fmaf_rn(beta1, m, __fmul_rn(rest1, g));
     s = __fmaf_rn(beta2, s, __fmul_rn(__fmul_rn(rest2, g), g));

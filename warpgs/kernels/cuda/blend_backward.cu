@@ -1,11 +1,11 @@
 #include "blend_common.cu"
 #include "blend_settings.cu"
 // One warp takes CHUNK instances back to front, for all pixels of their tiles: item = number of the chunk. The sums of an
-// instance go to its slot; if ATOMIC, they are added to its Gaussian's at once, in whatever order warps get there.
+// instance go to its slot; if ATOMIC, they are added to those of its Gaussian atomically, in no fixed order.
 __shared__ float4 s_a[WARPS][32], s_b[WARPS][32], s_rest[WARPS][REST][32];
 const int warp = threadIdx.x / 32;
 constexpr bool with_depth = WITH_DEPTH, atomic = ATOMIC, absgrad = ABSGRAD;
-const int total = (int)min(totals.data[0], (long long)capacity);  // of a cut list, what there is
+const int total = (int)min(totals.data[0], (long long)capacity);  // instances in the list, which may be cut short
 const int floor = item * CHUNK;
 constexpr int values = 6 + CHANNELS + (absgrad ? 3 : with_depth);  // magnitudes stand behind the place of the depth
 // an image may have more channels than this pass, or, in the last of several passes, fewer
@@ -64,7 +64,7 @@ while (top_instance > floor) {
         part_last = max(part_last, last[k]);
     }
     #pragma unroll
-    for (int distance = 16; distance > 0; distance /= 2)  // __reduce_max_sync is not there before sm_80
+    for (int distance = 16; distance > 0; distance /= 2)  // __reduce_max_sync needs sm_80
         part_last = max(part_last, __shfl_xor_sync(ALL, part_last, distance));
     if (part_last > first) {
         #pragma unroll

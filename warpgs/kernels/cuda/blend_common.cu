@@ -1,5 +1,5 @@
 // Declarations that the blending bodies share. Upper-case names are replaced by numbers before compilation (blend_cuda.py).
-// A tile is cut into blocks of 8 x 4 pixels, one pixel a lane. Products and sums that decide alpha are spelled with their
+// A tile is cut into blocks of 8 x 4 pixels, one pixel a lane. Products and sums that decide alpha have explicit
 // rounding: the compiler's choice of fused operations may differ between kernels, and both passes must see one alpha.
 constexpr unsigned ALL = 0xffffffffu;
 constexpr int WIDE = SIDE / 8, BLOCKS = WIDE * (SIDE / 4), PIXELS = SIDE * SIDE;
@@ -30,9 +30,9 @@ struct Splat {
         a.w *= SCALE;
         b.x *= SCALE;
     }
-    // Whether some pixel centre of the block at (left, top), 8 px wide and bottom + 0.5 px high, may have alpha at or above the
-    // cut, where 2^-limit does: the least |U d|^2 over the block lies on one of the two edges that face the mean. Distances are
-    // widened by what rounding can take from them. A NaN is kept; it changes nothing.
+    // Whether a pixel centre of the block at (left, top), 8 px wide and bottom + 0.5 px high, may have alpha at or above the
+    // cut, that is |U d|^2 <= limit. The least |U d|^2 over the block lies on one of the two edges that face the mean. Distances
+    // are widened by their largest rounding errors. A NaN is kept; it changes nothing.
     __device__ bool touches(float left, float top, float limit, float bottom = 3.5f) const {
         const float4 c = rest[REST - 1];
         const float slack_x = 0.01f + 2e-6f * (fabsf(a.x) + c.z), slack_y = 0.01f + 2e-6f * (fabsf(a.y) + c.w);

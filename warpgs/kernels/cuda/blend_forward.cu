@@ -1,7 +1,7 @@
 #include "blend_common.cu"
 #include "blend_settings.cu"
 // One warp composites PER blocks of 8 x 4 pixels, one below the other, a pixel of each in a lane:
-// item = place of the tile, those with long lists first, * (BLOCKS / PER) + part.
+// item = position of the tile in the order (long lists first) * (BLOCKS / PER) + part.
 constexpr int AHEAD = 4;  // alphas computed before they are blended: they do not wait for each other
 __shared__ float4 s_a[WARPS][32 + AHEAD], s_b[WARPS][32 + AHEAD], s_rest[WARPS][REST][32 + AHEAD];
 __shared__ int s_i[WARPS][32 + AHEAD];

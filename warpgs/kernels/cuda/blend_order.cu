@@ -1,4 +1,4 @@
-// Tiles by rank, so that those with long lists can start first and none of them when the others are done. The rank is 0 for the
+// Tiles by rank, so that tiles with long lists start first, not when the others are done. The rank is 0 for the
 // longest lists, 32 for empty ones: leading zeros of the length. A thread takes one tile. The order among equals differs from run
 // to run; no result depends on it.
 __shared__ int s_places[RANKS];  // tiles of the block by rank, then the place of the first of them among all of that rank
@@ -9,7 +9,7 @@ __syncthreads();
 int rank = RANKS;  // past the last tile
 if (tile < count)
     rank = __clz(ranges.data[2 * tile + 1] - ranges.data[2 * tile]);
-// one addition for all lanes of a rank: most tiles have one of a few ranks, and additions to one number are serial
+// one addition for all lanes of a rank: most tiles have one of a few ranks, and atomic additions to one number are serial
 const unsigned alike = __match_any_sync(0xffffffffu, rank);
 const int leader = __ffs(alike) - 1;
 int at = 0;

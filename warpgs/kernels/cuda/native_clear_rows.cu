@@ -11,7 +11,7 @@ auto clear = [&](int pieces) {
             reinterpret_cast<float4*>(from)[i] = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
 };
 if (size == 48)
-    clear(12);  // degree 3, the usual: to divide by what the compiler knows is much faster
+    clear(12);  // degree 3, the usual case: division by a constant is much faster
 else if (size % 4 == 0)
     clear(size / 4);
 else

@@ -9,7 +9,7 @@ auto give = [&](int i, float c, float& sum) {
     }
 };
 if (size % 4 == 0) {
-    // AHEAD loads before the stores that use them: the compiler cannot know that rows are apart, and would wait for each
+    // AHEAD loads before the stores that use them: the compiler cannot know that rows do not overlap, and would wait for each
     constexpr int AHEAD = 6;
     #pragma unroll
     for (int first = 0; first < (3 * BASES + 3) / 4; first += AHEAD) {

@@ -1,5 +1,5 @@
-// Hand each number of a row of K x 3 floats to `take`. Rows are a multiple of 16 bytes for K = 4 and 16, not for 25. What lies past the
-// count is loaded along, and not used: it may be anything, a NaN too.
+// Hand each number of a row of K x 3 floats to `take`. Rows are a multiple of 16 bytes for K = 4 and 16, not for 25. Numbers past
+// the count are loaded but not used: they may be anything, also NaN.
 if (size % 4 == 0) {
     #pragma unroll
     for (int q = 0; q < (3 * BASES + 3) / 4; ++q)
