@@ -26,9 +26,9 @@ class Engine(Protocol):
     """A place where jobs run."""
 
     name: str
-    """Name for people."""
+    """Name shown to the user."""
     slots: int
-    """Jobs that it runs at a time."""
+    """Largest number of jobs that run at a time."""
 
     def start(self, job: FarmJob) -> None:
         """Start a job; called while fewer than `slots` run."""

@@ -31,7 +31,7 @@ class Outcome:
     metrics: dict[str, Any] | None
     """Contents of metrics.json, or of eval.json if LPIPS was measured later; None if the run failed."""
     note: str = ""
-    """Note on this run for readers of the study; empty where nothing is special."""
+    """Note on this run for readers of the study; empty if there is none."""
     error: WarpgsError | None = None
     """Error that it failed with, if any."""
 
@@ -50,7 +50,7 @@ def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, spl
     """Name the properties in which a stored run differs from the requested one; empty if it does not differ."""
     wanted = {
         "configuration": (record.get("config_hash"), config.fingerprint()),
-        "code of your own": (record.get("own_code", {}), config.own_code()),
+        "user code": (record.get("own_code", {}), config.own_code()),
         "data": (record.get("fingerprint"), fingerprint),
         "training views": (record.get("train"), split and list(split.train)),
         "held-out views": (record.get("test"), split and list(split.test)),
@@ -124,9 +124,9 @@ def ensure_run(
 def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
     """Return the record of a run folder, or None and why it has none."""
     try:
-        return (read_record(folder) if (folder / CONFIG).exists() else None), "is no run"
+        return (read_record(folder) if (folder / CONFIG).exists() else None), "not a run folder"
     except DataError as e:
-        return None, f"cannot be used ({e})"
+        return None, f"unusable ({e})"
 
 
 def _outcome(
@@ -138,7 +138,7 @@ def _outcome(
         # the report is what a fit writes last
         metrics = _scores(folder / "metrics.json") if (folder / "report.html").is_file() else None
         if gap:
-            note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and fitted again"
+            note = f"the old run differs in {gap}; moved to {_set_aside(folder).name} and fitted again"
             state = "redone"
         elif metrics is not None:
             if (folder / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
@@ -147,10 +147,10 @@ def _outcome(
             try:
                 scores = _with_lpips(metrics, folder, request, variants) if variants else metrics
             except WarpgsError as e:
-                return Outcome("failed", None, f"scoring it again: {e}", e)
+                return Outcome("failed", None, f"scoring the finished run failed: {e}", e)
             return Outcome("kept", scores)
         else:
-            resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
+            resume, state, note = True, "continued", "was interrupted; continued from the last checkpoint"
     elif os.path.exists(folder) and not is_empty(folder):
         note = f"old results: {why}; moved to {_set_aside(folder).name} and fitted again"
         state = "redone"

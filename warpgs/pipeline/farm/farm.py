@@ -15,9 +15,9 @@ from warpgs.pipeline.farm.record import JobRecord, finished, read_record, write_
 from warpgs.runtime.folder_lock import hold_folder
 
 ATTEMPTS = 2
-"""Times that a job is started: once, and once more after a crash or where no memory was left."""
+"""Largest number of starts of a job; the second start follows a crash or a lack of memory."""
 POLL = 2.0
-"""Time after which a job that another farm works on is looked at again [s]."""
+"""Time between checks of a job that another farm works on [s]."""
 
 
 @dataclass
@@ -30,9 +30,9 @@ class JobStatus:
     step: int = 0
     """Steps done; 0 if unknown."""
     attempts: int = 0
-    """Times that it was started here."""
+    """Number of starts by this farm."""
     seconds: float = 0.0
-    """Time that it took here in all, 0 where it was not started here [s]."""
+    """Total time of its starts by this farm [s]; 0 if this farm did not start it."""
     began: float = 0.0
     """Time of its last start (`time.monotonic`)."""
     record: JobRecord | None = None
@@ -153,7 +153,7 @@ class _Farm:
             status.state, status.attempts = "elsewhere", status.attempts - 1
             waiting.append(status)
         elif event.state == "crashed" or record is None or (record.state == "failed" and record.again):
-            reason = event.message or (record.message if record is not None else "it left no record")
+            reason = event.message or (record.message if record is not None else "the job left no record")
             status.notes.append(f"attempt {status.attempts}: {reason}")
             if status.attempts < ATTEMPTS:
                 status.state = "waiting"

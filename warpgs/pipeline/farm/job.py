@@ -30,7 +30,7 @@ class FarmJob:
     folder: Path
     """Folder of the job's record, log and thumbnail, which is locked while a farm works on it."""
     results: Path | None = None
-    """Folder of all results, above ``folder``: below it no link is followed; None if it is ``folder``."""
+    """Folder of all results, which contains ``folder``; links below it are not followed. None if it is ``folder`` itself."""
 
     def identity(self) -> str:
         """Return the first 16 hexadecimal digits of the SHA-256 of all that the result depends on but the images."""
@@ -69,7 +69,7 @@ def job_of(text: str) -> FarmJob:
         try:
             module_of(place)
         except (ImportError, OSError) as e:
-            raise UsageError(f"your code {place} cannot be imported ({e}); put it where the farm's processes find it") from e
+            raise UsageError(f"your code {place} cannot be imported ({e}); put it where all processes can import it") from e
     STRATEGIES.load(config["strategy"])
     for term in config["loss_terms"]:
         LOSS_TERMS.load(term["name"])

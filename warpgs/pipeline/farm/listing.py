@@ -15,17 +15,17 @@ from warpgs.input_files import read_input, unread_reason
 from warpgs.io.readers import all_readers
 
 NAME = re.compile(r"(?:[^\W_]|[\udc80-\udcff])[^/\\:*?\"<>|\x00-\x1f]{0,99}")
-"""Names of jobs: those of a folder below the results on any system, and bytes that are not text where a folder has them."""
+"""Pattern of a job's name: a valid folder name on any system. Bytes that are not text are allowed, as folders may have them."""
 MOST_BYTES = 200
-"""Longest name of a job: file systems take 255 bytes, and names that begin with it, such as NAME.old1, must fit too."""
+"""Longest name of a job [bytes]: file systems allow 255, and longer names such as NAME.old1 must fit, too."""
 OWN_FILES = ("index.html", "results.csv")
 """Names in a results folder that do not belong to a job."""
 PLUGINS = ("preset", "strategy", "loss-terms", "view-modules", "reader")
-"""Flags that can name code: a file of jobs may name only that of warpgs."""
+"""Flags that can name code; in a file of jobs they may only name code of warpgs."""
 FARM_FLAGS = (
     "out", "resume", "view", "view-port", "device", "threads", "time-budget", "allow-outside", "help", "help-all", "h",
 )  # fmt: skip
-"""Flags of `warpgs fit` that a single job may not have."""
+"""Flags of `warpgs fit` that a single job may not set."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class ListedJob:
     scene: Path
     """Folder of the scene, or a video."""
     flags: tuple[str, ...] = ()
-    """Words for the command line of `warpgs fit`."""
+    """Arguments of `warpgs fit`."""
 
 
 def list_jobs(jobs: str) -> list[ListedJob]:
@@ -90,7 +90,7 @@ def _read(path: Path) -> list[ListedJob]:
         data = read_input(path, schema.MAX_BYTES)
     except OSError as e:
         raise DataError(
-            f"{path}: cannot be read ({unread_reason(e)}); give a file with a line of JSON for each job, or several farms"
+            f"{path}: cannot be read ({unread_reason(e)}); give a file with one line of JSON per job, and split a large one"
         ) from e
     found = []
     for number, line in enumerate(data.splitlines(), 1):

@@ -42,7 +42,7 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
         others = open_to_others(base)
         if others is not None:
             raise UsageError(
-                f"{base}: Slurm's job files cannot lie here, as other users can write to {others} and could run code as you; "
+                f"{base}: not safe for Slurm's job files: other users can write to {others} and could run code as you; "
                 "name a private folder that all nodes see with --slurm-folder"
             )
         with FileLock(base / LOCK, timeout=WAIT_FOR_OTHERS, mode=0o600):  # no other farm is between making and locking its own

@@ -104,6 +104,6 @@ def _connect(ray: Any, address: str) -> None:
         ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
     except (OSError, RuntimeError, ValueError) as e:
         remedy = "set TMPDIR to a folder with a short path" if own else "check RAY_ADDRESS and RAY_AUTH_TOKEN"
-        raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave --engine ray out") from e
+        raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave out --engine ray") from e
     if own:  # where Ray was imported before us it listens at every interface
         say_what_is_open(listeners())

@@ -25,7 +25,7 @@ CHECKED = (PLY, "metrics.json", CONFIG)
 """Files of a run with a checksum in the record."""
 FORMAT = 1
 MOST_FILES = 100_000
-"""Files, and folders, of a scene that are listed; one with more is read by the fit to know whether it is the same."""
+"""Largest number of files and folders of a scene to list. In a larger scene only the fit, which reads it, detects changes."""
 
 _DIGEST = schema.text
 _SCHEMA = schema.fields(

@@ -31,7 +31,7 @@ class EngineRequest:
     engine: str = "local"
     """local (processes of this machine), ray or slurm."""
     slots: int | None = None
-    """Number of concurrent jobs; None for ``per_gpu`` for each GPU, one on a CPU, or the capacity of the cluster."""
+    """Number of concurrent jobs; None: ``per_gpu`` for each GPU, one on a CPU, or as many as the cluster has capacity for."""
     per_gpu: int = 1
     """Jobs that share a GPU."""
     threads: int = 1

@@ -24,21 +24,21 @@ from warpgs.runtime.subprocesses import ProgramResult, run_program
 from warpgs.runtime.terminal import say
 
 QUEUED = 100
-"""Jobs that are handed to Slurm at a time, where nothing else is requested."""
+"""Default number of jobs that Slurm has at a time."""
 ASK_EVERY = 1.0
-"""Time between two looks for answers [s]."""
+"""Time between two checks for answers of jobs [s]."""
 QUEUE_EVERY = 15.0
 """Time between two calls of squeue, which lists all jobs [s]."""
 MISSED = 3
-"""Calls of squeue that do not list a job before it counts as ended: a network file system shows its answer late."""
+"""A job counts as ended once so many calls of squeue do not list it: a network file system may show its answer late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
 SECONDS_TO_SAVE = 120
 """Time before its limit at which Slurm interrupts a job, so that the fit saves its state [s]."""
 LAST_BYTES = 2000
-"""End of a job's output that is searched for its last line."""
+"""Length of the end of a job's output in which its last line is searched [bytes]."""
 PATIENCE = 60.0
-"""Time that a command of Slurm gets [s]."""
+"""Time limit of a command of Slurm [s]."""
 
 
 @dataclass
@@ -82,7 +82,7 @@ class SlurmEngine:
         """
         missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
         if missing:
-            raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: call it on a machine of the cluster")
+            raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: run warpgs on a machine of the cluster")
         self.slots, self._threads = slots or QUEUED, threads
         self._options = [
             f"--job-name={NAME}", f"--time={minutes}", "--ntasks=1", f"--cpus-per-task={threads}", "--open-mode=append",
@@ -156,7 +156,7 @@ class SlurmEngine:
     def _answered(self, name: str, job: _Queued) -> Event:
         state = (self._folder / f"{job.number}.answer").read_text("utf-8")
         if state not in STATES:
-            return Event(name, "crashed", f"Slurm's job {job.slurm_id} gave no known answer")
+            return Event(name, "crashed", f"Slurm's job {job.slurm_id} ended with an unknown answer")
         for kind in ("json", "answer", "log"):
             (self._folder / f"{job.number}.{kind}").unlink(missing_ok=True)
         return Event(name, state)

@@ -45,7 +45,7 @@ from warpgs.runtime.native_output import output_to
 from warpgs.runtime.terminal import say
 
 THUMBNAIL_SIDE = 480
-"""Longest side of a thumbnail: a render beside the photograph [px]."""
+"""Longest side of a thumbnail, which shows a render beside the photograph [px]."""
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:

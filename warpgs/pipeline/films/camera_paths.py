@@ -13,15 +13,16 @@ from warpgs.pipeline.films.rig import MIN_SWING, Rig
 from warpgs.scene import Camera
 
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
-"""Path of each kind of rig where none was requested."""
+"""Default path for each kind of rig."""
 WIDE_ARC = math.radians(75)
-"""Arc of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the captured area."""
+"""Range of azimuths of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the
+captured area."""
 SWING = 0.9
 """Fraction of the cameras' range that a film swings through: coverage is lower at its ends."""
 MAX_ELEVATION = math.radians(80)
 """Largest elevation of a film: above it, the upward direction is lost."""
 LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
-"""Smallest and largest side of a film [px], and vertical field of view [deg]."""
+"""Smallest and largest value of a film's sides [px], and of its vertical field of view [deg]."""
 
 
 def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | None = None, turned: bool = False) -> Camera:

@@ -33,7 +33,7 @@ SHEET = "sheet.png"
 SHEET_FRAMES = 6
 """Frames of a sheet, evenly spaced."""
 COVERAGE = "coverage"
-"""Subfolder for the images of what training views saw."""
+"""Subfolder for images that mark regions by the number of training views that saw them."""
 
 
 def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
@@ -55,7 +55,7 @@ class RenderedPath:
     """Result of `render_film`: files, and lines for the user."""
 
     files: list[Path]
-    """A PNG for each camera in order, unless only a film was requested; then the film, if any."""
+    """A PNG for each camera in order, unless only a film was requested; and last the film, if any."""
     notes: list[str]
     """Lines for the user: choices made, and frames that show nothing."""
 
@@ -74,7 +74,7 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
         raise UsageError(
-            f"{out}: the views differ in size, not allowed in a film or sheet; give --size, or a folder without --sheet"
+            f"{out}: the views differ in size, but a film or sheet needs one size; give --size, or a folder without --sheet"
         )
     if alone and coverage:
         raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")

@@ -23,16 +23,16 @@ from warpgs.scene import Camera, Gaussians
 from warpgs.suggestion import did_you_mean
 
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
-"""Names of paths; the name of a JSON file of keyframes is one, too."""
+"""Names of paths; a path may also be a JSON file of keyframes."""
 SECONDS = 3.0
 """Default duration of a film."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
-"""Duration of a film through training views: for each view, and at most."""
+"""Duration of a film through training views [s]: for each view, and largest in all."""
 MIN_FRAMES_PER_VIEW = 4
-"""Frames from one training view to the next; where a film has fewer, it passes through some of the views only."""
+"""Fewest frames from one training view to the next; a film with too few frames passes through some of the views only."""
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
-"""Field of a film's image above which it is wider than the photographs, as a fraction of theirs."""
+"""A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
 EMPTY_VIEW = "the model shows nothing there: `warpgs eval` scores each view"
 """Advice for training views that show nothing."""
 
@@ -45,7 +45,7 @@ class FilmSettings:
     """Number of frames; None for seconds times fps. The number of frames of ``views`` and of the user's own cameras is
     fixed."""
     seconds: float | None = None
-    """Duration [s]; None for what suits the path."""
+    """Duration [s]; None for the default of the path."""
     fps: int = 30
     """Frames per second."""
     size: tuple[int, int] | None = None
@@ -88,13 +88,13 @@ class FilmPlan:
     cameras: list[tuple[str, Camera]]
     """Stem of the file and camera of each frame, in scene units [u]."""
     coverage: float
-    """Fraction of a training view's pixels that the model covers; 0 where that is not known."""
+    """Fraction of a training view's pixels that the model covers; 0 if unknown."""
     remedy: str
     """Advice for frames that show nothing."""
     notes: list[str]
     """Lines for the user on the choices made."""
     nearer: str = "move the cameras nearer to those of the photographs"
-    """Advice for frames that show places outside the photographs."""
+    """Advice for frames that show areas outside the photographs."""
 
 
 @torch.no_grad()

@@ -15,7 +15,7 @@ NAMES = {
     "forward": "on one side of the scene", "ring": "around the scene", "room": "looking outwards, as in a room",
     "free": "without a known layout",
 }  # fmt: skip
-"""Words for each kind, after "training cameras"."""
+"""Description of each kind, to follow "training cameras"."""
 MIN_AGREEMENT = 0.8
 """Fraction of the cameras that must look at one point, or away from it."""
 MIN_COSINE = 0.8
@@ -23,7 +23,7 @@ MIN_COSINE = 0.8
 MIN_RING = math.radians(100)
 """Range of azimuths about a point below which cameras photographed it from one side."""
 MAX_GAP = math.radians(150)
-"""Largest gap between azimuths of neighbouring cameras that a film turns through: three even views leave 120 degrees."""
+"""Largest gap between azimuths of neighbouring cameras that a turntable crosses: three even views have gaps of 120 degrees."""
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
@@ -45,11 +45,11 @@ class Rig:
     first: np.ndarray
     """Level direction of azimuth 0, perpendicular to ``up``, length 1, shape [3]."""
     span: tuple[float, float] | None
-    """First and last azimuth of the cameras (of their viewing directions, in a room) [rad]; None if they are all around."""
+    """First and last azimuth of the cameras (of their viewing directions, in a room) [rad]; None if they cover all sides."""
     distance: float
     """Median distance of the cameras from ``center`` [u]."""
     elevation: float
-    """Mean elevation of the cameras above ``center``, or of the direction they look in, in a room [rad]."""
+    """Mean elevation of the cameras above ``center``, or of their viewing directions, in a room [rad]."""
     rise: float
     """Standard deviation of the elevations [rad]."""
     turned: bool

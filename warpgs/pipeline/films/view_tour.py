@@ -12,9 +12,9 @@ from warpgs.pipeline.films.keyframes import Keyframe
 from warpgs.scene import Camera
 
 MAX_DETOUR = 1.5
-"""Largest accepted length of a tour in order of names, as a multiple of the length from neighbour to neighbour."""
+"""Longest accepted tour in the order of names, as a multiple of the length of the tour from neighbour to neighbour."""
 MAX_IMPROVED = 200
-"""Number of views up to which every pair of legs is looked at; a tour of more is smooth enough without."""
+"""Largest number of views for which every pair of legs is checked; longer tours are smooth enough without the check."""
 
 
 def _distances(cameras: list[Camera]) -> list[list[float]]:

@@ -19,13 +19,13 @@ TOLERANCE = 0.02
 difference, the squared colour difference of two photographs is twice (3 dB) that at the best agreement of depths (decision
 019)."""
 MIN_ALPHA = 0.5
-"""Least opacity of a pixel that shows a surface, and so has a depth."""
+"""Least opacity of a pixel that shows a surface; other pixels have no depth."""
 MAX_COUNT = 255
-"""Largest count of views that is stored."""
+"""Largest number of views that is stored for a pixel; higher counts are clamped."""
 GRID = 32
-"""Points along the longer side of an image that `fraction_outside` looks at."""
+"""Number of points along the longer side of an image that `fraction_outside` checks."""
 MAX_PIXELS = 2**26
-"""Most pixels of all depth maps that are held at a time, 256 MiB; with more the maps are rendered smaller."""
+"""Most pixels of all depth maps together, 256 MiB; to stay below, maps are rendered at a smaller size."""
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ CLASSES = {
 }  # fmt: skip
 """Classes of pixels, with a description of each for the user. Where no view of a scene has an alpha, nothing is background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
-"""Upper ends of the classes of depth difference by which an error is expected; the last holds all that is beyond."""
+"""Upper bounds of the classes of depth difference, each with its expected error; the last class has no bound."""
 PROBED = 6
-"""Most training views that are compared with each other, evenly spaced: 30 pairs."""
+"""Most training views that are compared with each other, evenly spaced: 6 give 30 ordered pairs."""
 
 
 @torch.no_grad()
@@ -187,4 +187,4 @@ def _summary(rows: dict[str, dict[str, Any]]) -> str:
     if unseen is None:
         return "every held-out pixel was seen by a training view"
     pixels, error = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
-    return f"{pixels} of the held-out pixels were seen by no training view; they have {error} of the squared error"
+    return f"{pixels} of the held-out pixels were seen by no training view; they account for {error} of the squared error"

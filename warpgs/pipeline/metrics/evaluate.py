@@ -22,16 +22,16 @@ VARIANTS = {
     "ssim": "as in 3DGS papers: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
     "ssim_skimage": "scikit-image, as in NeRF papers: the same window, without the border; about 0.005 lower",
 }
-"""Definition of each score, for result files and reports. Every paper's table depends on these words."""
+"""Definition of each score, for result files and reports. Scores by other definitions are not comparable."""
 ALPHA_VARIANTS = {
-    "psnr_whole": "of a view with an alpha channel: over all unmasked pixels, over the background of the fit",
-    "psnr_foreground": "the same over the pixels of an opacity above 0.5",
-    "alpha_empty": "mean rendered alpha over the pixels of an opacity below 0.02: 0 is right",
-    "alpha_object": "mean rendered alpha over the pixels of an opacity above 0.98: 1 is right",
+    "psnr_whole": "of views with an alpha channel: over all unmasked pixels, with the background of the fit behind both images",
+    "psnr_foreground": "as for the whole image, over the pixels with an opacity above 0.5",
+    "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
+    "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
 }
 """Definition of each score of views with an alpha channel. A mean is over the views that have such pixels."""
 EMPTY, OPAQUE, OBJECT = 0.02, 0.5, 0.98
-"""Opacities below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
+"""Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
 NO_LPIPS = "not measured: no --lpips-weights were given"
 SSIM_WINDOW = 11

@@ -15,16 +15,16 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
 
 ROUNDS = 5
-"""Halvings of the interval in which the largest fraction is looked for."""
+"""Number of bisection steps in the search for the largest fraction."""
 PASSES = 8
 """Most rounds of merging: up to 2^8 neighbours become one."""
 DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
-"""Fractions of the allowed loss of a model that may be spent once degrees are lowered, and once neighbours are merged; removing
-may spend all of it."""
+"""Fractions of the allowed loss that may be used up after degrees are lowered, and after neighbours are merged; removal may use
+up the rest."""
 RAMP = 3
-"""Rounds of merging over which the loss that they may spend grows to all of it."""
+"""Number of rounds over which the loss allowed for merging grows to its full value."""
 WORTHWHILE = 0.02
-"""Fraction of the Gaussians that a round of merging must take; two rounds in a row that take less are the last."""
+"""Least fraction of the Gaussians that a round must merge away; merging ends after two rounds in a row with less."""
 
 
 def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
@@ -118,7 +118,7 @@ class ViewSet:
     cameras: list[Camera]
     """Cameras with tensors on the device of the model."""
     options: RasterizeOptions
-    """Settings that they are rendered with."""
+    """Options for rendering them."""
     seed: int
     """Seed of the random signs of `fisher`."""
 

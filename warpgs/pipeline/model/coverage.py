@@ -11,7 +11,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255
-"""Least blending weight at which a view sees a Gaussian: below, it changes no pixel by more than four of 255 levels."""
+"""Least blending weight at which a view sees a Gaussian: with less, it changes no pixel by more than four of 255 levels."""
 PROBES = 2
 """Random images per view for the Fisher sensitivity."""
 

@@ -20,12 +20,12 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 NOTHING = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 """No points."""
 FREE_SPACE = 0.95
-"""A filled point nearer to another view than this fraction of that view's depth would occlude its surface."""
+"""A filled point occludes the surface of another view if its depth there is below this fraction of the view's depth."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
-"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: few planes for
-distant surfaces, many for near ones."""
+"""Factors of the 2nd and of the 98th percentile of the depths of known points; the planes lie between the two products. Few
+planes are at distant surfaces, many at near ones."""
 MIN_KNOWN = 10
-"""Known points that a view must hold to bound its depths."""
+"""Fewest known points in a view that can bound its depths."""
 
 
 def joined(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -106,9 +106,9 @@ class KnownPoints:
     cloud: PointCloud
     """Points and colours, N of them."""
     widths: np.ndarray
-    """Width of a pixel at each in the nearest view that saw it [u], shape [N]."""
+    """Width of a pixel at the depth of each point in the nearest view that saw it [u], shape [N]."""
     pixels: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """Rows and columns of the points that each view saw, and their z-depths [u], the farthest first; shape [S] each."""
+    """For each view, rows, columns and z-depths [u] of the points that it saw, the farthest first; shape [S] each."""
 
     @staticmethod
     def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:

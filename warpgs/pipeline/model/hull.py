@@ -15,26 +15,26 @@ from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
 from warpgs.scene import Camera, PointCloud, View
 
 MARGIN = 1.5
-"""Distance from the nearest opaque pixel at which a point is in the empty region of a view [px]."""
+"""Least distance from the nearest opaque pixel of a point in the empty region of a view [px]."""
 FINEST = 1.5
-"""Largest width of the finest cells in the views, their median [px]."""
+"""Largest width of the finest cells, as the median over the views [px]."""
 PROJECTIONS = 2**25
-"""Projections of a cell into a view that one level of the octree may take: a few seconds."""
+"""Most projections of cells into views at one level of the octree; they take a few seconds."""
 MAX_LEVELS = 20
-"""Most levels: the finest cells are a millionth of the first one."""
+"""Most levels of the octree: the finest cells are then a millionth as wide as the first one."""
 TOLERANT = 12
-"""Number of views per tolerated error: with this many views, two empty ones make a cell empty; with twice as many, three."""
+"""Number of views per tolerated error: from this many views on, two must find a cell empty to remove it; from twice as many on,
+three."""
 SEEN = 0.9
-"""Fraction of the views that must have a cell in their image: space that few look into cannot be carved."""
+"""Least fraction of the views that have a cell in their image: space that few views look into cannot be carved."""
 OPAQUE_COLOR = 0.9
-"""Opacity from which a pixel shows only the object, and has its colour."""
+"""Least opacity of a pixel whose colour is that of the object alone."""
 LEAST_VIEWS = 2
-"""Number of views that must see a cell, because unseen cells are inside the object or outside the photographs."""
+"""Fewest views that must see a cell, because unseen cells are inside the object or outside the photographs."""
 LIKE = 0.15
-"""Largest standard deviation of a cell's colour over views at which the colours are similar, in the channel that differs
-most."""
+"""Largest standard deviation over views of similar colours of a cell, in the channel that differs most."""
 BEHIND_CELLS = 3.0
-"""Distance behind the first cell of a pixel from which on a cell is hidden, as a multiple of the width of a cell."""
+"""A cell is hidden if it is farther than this behind the first cell at its pixel, in widths of a cell."""
 
 
 class Silhouette:
@@ -174,4 +174,4 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     total, cells, colors = len(cells), cells[kept], colors[kept]
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))
     cloud = merge(cells, colors, merge_cells(cells, np.full(len(cells), wide)))
-    return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of its {total:,} cells"
+    return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of {total:,} cells"

@@ -12,13 +12,13 @@ from warpgs.priors.matches import triangulate_matches
 from warpgs.scene import PointCloud, View
 
 OBJECTS = ("foreground", "object")
-"""Names of the regions of an object (`fitted_region`): on black, and cut out."""
+"""Names of the regions of an object (`fitted_region`): object on black, and object that an alpha channel cuts out."""
 MIN_MATCHES = 10
-"""Fewest matched points of a view from which its random points take their depths."""
+"""Fewest matched points of a view for its random points to take their depths from them."""
 NEIGHBORS = 5
-"""Matched points that a random pixel takes its depth from."""
+"""Number of nearest matched points from which a random pixel takes its depth."""
 PAIRS = 2**20
-"""Distances that are held at a time while neighbours are searched."""
+"""Most distances in memory at a time while neighbours are searched."""
 DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
@@ -124,7 +124,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
     objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
     if objects:
-        how += f", on the object that {objects} views show on black"
+        how += f", on the object ({objects} views show it on black)"
     if cut_out:
-        how += f", where {cut_out} views are opaque"
+        how += f", in the opaque areas of {cut_out} views"
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how

@@ -17,13 +17,13 @@ from warpgs.kernels.pixel_size import pixel_size
 from warpgs.scene import Camera, Gaussians, PointCloud
 
 WITHIN = 0.9
-"""Fraction of the first points that the radius of a scene holds; the farthest are often wrong."""
+"""Fraction of the initial points within the radius of a scene; the farthest points are often wrong."""
 NEEDLE = 30.0
-"""Longest over middle axis above which a Gaussian is counted as a needle."""
+"""Ratio of the longest to the middle axis above which a Gaussian is counted as a needle."""
 MAX_CENTERS = 32
-"""Most cameras that a Gaussian's distance is measured to in every step."""
+"""Most cameras to which the distance of every Gaussian is measured in a step."""
 ROUNDING = 1e-5
-"""Distance of logarithms up to which an axis at its limit is within it: ten times what float32 rounds them by."""
+"""Tolerance of the logarithm of an axis at its limit: ten times the rounding error of float32."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +81,13 @@ class LimitConfig:
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
     max_reach: float = 1 / 3
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
-    a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras are fog in front of
-    other views."""
+    a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras would be fog in other
+    views."""
     min_pixels: float = 0.2**0.5
     """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
     most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
     ratio_from: float = 0.7
-    """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
+    """Fraction of the steps after which ``max_ratio`` applies, in [0, 1]. Long Gaussians help the first steps."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_size <= 1e6:
@@ -120,7 +120,7 @@ class TrainingCameras(NamedTuple):
     centers: torch.Tensor
     """Result of `camera_centers`, shape [K, 3]."""
     rows: torch.Tensor
-    """All of them as `pixel_size` takes them, float32, shape [C, 9]."""
+    """All cameras as `pixel_size` takes them, float32, shape [C, 9]."""
 
     @staticmethod
     def of(cameras: Sequence[Camera], device: torch.device) -> TrainingCameras:
@@ -220,5 +220,5 @@ def shape_summary(figures: dict[str, Any]) -> str:
         f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, "
         f"{f['largest_over_extent']:.2g} of the cameras' extent, and {f['largest_over_distance']:.2g} of the distance to the "
         f"nearest camera; {f['needles']:.1%} of the Gaussians are needles, more than "
-        f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} beyond the limits"
+        f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} exceed the limits"
     )

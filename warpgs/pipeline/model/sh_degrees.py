@@ -7,7 +7,7 @@ import torch
 from warpgs.kernels.sh import MAX_DEGREE
 
 FLOAT = 4
-"""Bytes of a stored number."""
+"""Size of a stored number [bytes]."""
 
 
 def model_bytes(degrees: torch.Tensor) -> int:
@@ -43,7 +43,7 @@ def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     count = 3 * int((degrees.long() + 1).square().sum()) if whole else -1
     if packed.shape != (count,):
         raise ValueError(
-            f"{list(packed.shape)} packed coefficients do not go with {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
+            f"{list(packed.shape)} packed coefficients do not match {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
         )
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0

@@ -36,16 +36,16 @@ class DensityUpdate:
     """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended."""
 
     keep: torch.Tensor
-    """Numbers of the surviving rows in ascending order, int64, shape [S]."""
+    """Indices of the surviving rows in ascending order, int64, shape [S]."""
     added: Mapping[str, torch.Tensor]
     """New rows of each parameter, shape [A, ...]; their moments start at zero."""
     parents: torch.Tensor
-    """Parent of each new row, by its number before the change, -1 for none, int64, shape [A]."""
+    """Parent of each new row, by its index before the change, -1 for none, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
-    """Values for new rows without a parent, and for columns that are not inherited; columns left out take their ``fill``."""
+    """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
     overwritten: torch.Tensor | None = None
-    """Numbers, before the change, of the rows to overwrite: parameters are replaced, and moments start again at zero. Int64,
-    shape [R]; None for none."""
+    """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
+    [R]; None for none."""
     values: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
@@ -164,8 +164,8 @@ class Table:
         rows = {n: len(update.added[n]) if n in update.added else None for n in self.params}
         if any(count != len(update.parents) for count in rows.values()):
             raise UsageError(
-                f"a DensityUpdate names {len(update.parents)} parents and adds {rows} rows: each parameter needs one "
-                "row for each parent (-1 for none)"
+                f"a DensityUpdate has {len(update.parents)} parents but adds {rows} rows: each parameter needs one row for "
+                "each entry of parents (-1 for a row without a parent)"
             )
         if update.overwritten is not None:
             self._overwrite(update.overwritten, update.values)
@@ -234,8 +234,8 @@ class Table:
             t = state[name]
             if len(rows) > 1 or t.shape[1:] != own_tensor.shape[1:] or t.dtype != own_tensor.dtype:
                 raise DataError(
-                    f"the stored table does not fit together: {name} has shape {list(t.shape)} and type {t.dtype}, where "
-                    f"[N, {', '.join(map(str, own_tensor.shape[1:]))}] and {own_tensor.dtype} are needed, with one N for all"
+                    f"the stored table is inconsistent: {name} has shape {list(t.shape)} and type {t.dtype}, expected "
+                    f"[N, {', '.join(map(str, own_tensor.shape[1:]))}] and {own_tensor.dtype}, with one N for all tensors"
                 )
         for group, tensors in self._groups().items():
             for name in tensors:

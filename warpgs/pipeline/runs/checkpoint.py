@@ -19,7 +19,7 @@ from warpgs.version import __version__
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
-"""Number of the format of run folders: config.json and the checkpoint. 1 was that of warpgs 0.1.0."""
+"""Version of the format of run folders: config.json and the checkpoint. warpgs 0.1.0 wrote version 1."""
 DTYPES = {
     torch.float64: "F64",
     torch.float32: "F32",
@@ -99,9 +99,9 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     except FileNotFoundError as e:
         raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first") from e
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore the file, or fit again") from e
     if hashlib.sha256(body).digest() != digest:
-        raise DataError(f"{path}: the checksum does not match, so the file was truncated or altered; fit again, or restore it")
+        raise DataError(f"{path}: the checksum does not match: the file was truncated or altered; restore it, or fit again")
     try:
         tensors = load(body)
         length = int.from_bytes(body[:8], "little")
@@ -118,5 +118,5 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
         state = schema.parse(metadata["state"])
         schema.mapping(schema.anything)(state, "")
     except (KeyError, schema.SchemaError) as e:
-        raise DataError(f"{path}: its state is incomplete or damaged ({e}); fit again, or restore it") from e
+        raise DataError(f"{path}: the stored state is incomplete or damaged ({e}); restore the file, or fit again") from e
     return tensors, state

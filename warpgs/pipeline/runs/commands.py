@@ -32,10 +32,13 @@ from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
-VP9 = "the film is VP9, for browsers and VLC; for other players: ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
-"""Note on a film in .mp4, of which {} is the path."""
+VP9 = (
+    "the film is VP9, which browsers and VLC play; convert it for other players: "
+    "ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
+)
+"""Note on a film in .mp4; {} stands for its path."""
 ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
-"""Scores of the rendered alpha, with the words for each view's line."""
+"""Scores of the rendered alpha, with their names in the line of a view."""
 
 
 def scene_of(
@@ -53,7 +56,7 @@ def scene_of(
     """
     scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
-        raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
+        raise DataError(f"{scene.path}: images or cameras have changed since the fit of {stored.folder}; restore them")
     if stored.record["config"]["view_modules"]:
         scene = with_cameras(scene, stored.scene_cameras)
     scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
@@ -185,4 +188,4 @@ def repeat_failed_step(path: Path, device_name: str) -> list[str]:
         ResourceError: The device is missing.
     """
     device, where = choose_device(device_name)
-    return [f"{path}, computed again {where}:", *findings(read_failed_step(path, device))]
+    return [f"{path}, repeated {where}:", *findings(read_failed_step(path, device))]

@@ -20,8 +20,8 @@ from warpgs.scene import Gaussians, View
 FOLDER = "coverage"
 """Folder in a run folder with an image of each held-out view."""
 EXPECTED = (
-    "The expected PSNR compares training photographs with each other where their depths differ as much: an estimate from "
-    "training data, not a bound."
+    "The expected PSNR is that between training photographs at points whose depths differ as much: an estimate from training "
+    "data, not a bound."
 )
 """Meaning of the expected PSNR, as text for the user."""
 

@@ -100,7 +100,7 @@ def _written(
     """Filter Gaussians in file units, and write them; returns lines for the user."""
     gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned)
     if not len(gaussians):
-        raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
+        raise DataError(f"{target}: not written, because no Gaussian is left; give a larger --crop, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
         lines.append(f"harmonics above degree {kind.max_degree} are dropped, because {kind.suffix} files cannot store them")
         gaussians = limit_degree(gaussians, kind.max_degree)
@@ -156,4 +156,4 @@ def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, f
         lines += write_cameras(target, cameras)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
-    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px, named by number, in {target}"]
+    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}, named by numbers"]

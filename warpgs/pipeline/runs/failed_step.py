@@ -85,7 +85,7 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give the {FILE} of a run folder") from e
     except (SafetensorError, KeyError, ValueError, RecursionError) as e:
-        raise DataError(f"{path}: not a failed step ({e}); give the {FILE} of a run folder") from e
+        raise DataError(f"{path}: not the inputs of a failed step ({e}); give the {FILE} of a run folder") from e
 
 
 def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
@@ -138,10 +138,10 @@ def findings(bundle: Bundle) -> list[str]:
                 continue
             of = torch.autograd.grad(value, list(params.values()), retain_graph=True, allow_unused=True)
             broken = [n for n, g in zip(params, of) if g is not None and not bool(torch.isfinite(g).all())]
-            lines += [f"    its gradient by {n} is not finite" for n in broken]
+            lines += [f"    gradient with respect to {n}: not finite" for n in broken]
         lines += [f"  view module {n}: {float(t.detach()):g}" for n, t in found.of_views.items()]
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as e:
-        raise DataError(f"the failed step is incomplete ({e!r}); fit again to write it again") from e
+        raise DataError(f"the stored step is incomplete ({e!r}); fit again to store it again") from e
     return lines
 
 

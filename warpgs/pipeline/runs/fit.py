@@ -61,8 +61,8 @@ from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Camera, Scene
 
-COMPILING = "compiling kernels, once on this machine, a minute or two in all"
-"""Line on a wait for kernels."""
+COMPILING = "compiling kernels: once on this machine, one to two minutes"
+"""Message while kernels are compiled."""
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""
 
@@ -131,7 +131,7 @@ def fit(
     """
     out = None if out is None else Path(out)
     if resume and out is None:
-        raise UsageError("resume needs the run folder that it continues: give out")
+        raise UsageError("resume requires out, the run folder to continue")
     check_overrides(overrides)
     config, origin = chosen_settings(preset, overrides)
     spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
@@ -182,7 +182,7 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
     job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
     job.notes += [*([background] if background else []), *chosen]
     if job.config.antialiased:
-        job.notes.append("antialiased: other programs show exported files correctly only in their antialiased mode")
+        job.notes.append("antialiased: other programs must use their antialiased mode to show exported files correctly")
     check_renders(job.config.batch, job.config.steps or 0)
 
 
@@ -200,7 +200,7 @@ def fit_request(request: FitRequest, **others: Any) -> FitResult:
         )  # fmt: skip
     except KeyboardInterrupt as e:
         saved = r.out is not None and (r.out / TENSORS).is_file()
-        again = "--resume continues from the last checkpoint" if saved else "no step was saved: the same command begins again"
+        again = "--resume continues from the last checkpoint" if saved else "no step was saved; the same command begins again"
         raise KeyboardInterrupt(again) from e
 
 
@@ -238,7 +238,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
     with background_warmup(c, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
-            job.notes.append(f"camera model {models}: photographs are not compared; coverage is not measured")
+            job.notes.append(f"camera model {models}: photographs cannot be compared, so coverage is not measured")
         else:
             job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background

@@ -73,7 +73,7 @@ class StepTeller:
         """Start before the first step; ``progress`` is None for a fit that shows none."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
-        """The last step that compiled kernels and so took longer; the number of kernels compiled by then."""
+        """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""
 
     def __call__(self, r: StepReport) -> None:
         """Take one report."""
@@ -126,8 +126,8 @@ def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteErr
     save_failed_step(out / FAILED, failed_step(trainer, error.view, name, error.slot))
     return NotFiniteError(
         f"{error}, on {name}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` names the non-finite values. --resume repeats the same step; fit again into a new --out with "
-        "lower learning rates"
+        f"{out / FAILED}` names the non-finite values. --resume would fail at the same step; fit again into a new --out "
+        "with lower learning rates"
     )
 
 

@@ -34,11 +34,11 @@ from warpgs.version import __version__
 
 CONFIG = "config.json"
 METRICS_FILE = "metrics.json"
-"""Scores, sizes and times, which a fit writes at its end."""
+"""File of scores, sizes and times, written at the end of a fit."""
 IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
 """Folders in a run folder with the images that its fit writes."""
 POSED_SCENE = "scene"
-"""Folder in a run folder with the scene that was made of photographs without cameras."""
+"""Folder in a run folder with the scene made from photographs without cameras."""
 
 
 def versions() -> dict[str, str]:
@@ -152,7 +152,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         check_record(record)
     except schema.SchemaError as e:
-        raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again into a new --out") from e
+        raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again into a new --out") from e
     return record
 
 
@@ -164,7 +164,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
     """
     if "pruned" in stored:
         raise UsageError(
-            f"--resume: {out} is a pruned model without the state of its fit; continue the run it came from, "
+            f"--resume: {out} is a pruned model without the state of its fit; resume the original run, "
             f"{stored['pruned']['source']}"
         )
     _check_named_again(record["config"], stored["config"], out)
@@ -173,8 +173,8 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         if now != then:
             if key == "own_code":
                 raise UsageError(
-                    f"--resume: the code of {', '.join(now or then or {})} was edited since the run in {out} began, or its "
-                    "version is not recorded; restore that file, or give a new --out"
+                    f"--resume: the code of {', '.join(now or then or {})} has changed since the run in {out} began, or the "
+                    "run did not record its version; restore the code, or give a new --out"
                 )
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
@@ -187,7 +187,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             was = f" ({', '.join(o for o in options if not o.startswith('path '))})" if key != "device" else ""
             raise UsageError(
                 f"--resume: {words.get(key, key)} differs from the run in {out}{was if len(was) > 3 else ''}. To continue with "
-                f"the flags that it was started with, use only --out {shlex.quote(str(out))} --resume; else give a new --out"
+                f"the run's own flags, give only --out {shlex.quote(str(out))} --resume; for other flags, give a new --out"
             )
 
 
@@ -204,7 +204,7 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
                 key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
             raise DataError(
                 f"--resume: {out / TENSORS} and {CONFIG} beside it belong to different fits: {key} differs. Restore both "
-                "from the same run, or fit again into a new --out"
+                "files of one run, or fit again into a new --out"
             )
 
 
@@ -220,8 +220,8 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
     for flag, names in outside(then).items():
         if set(names) - set(outside(now)[flag]):
             raise UsageError(
-                f"--resume: the run in {out} was fitted with {', '.join(names)}, code from outside warpgs. A run folder never "
-                f"decides which code is loaded: name it again with {flag} {','.join(names)}"
+                f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; give "
+                f"{flag} {','.join(names)} again"
             )
 
 
@@ -238,8 +238,8 @@ class StoredRun(FittedModel):
         """Return a note for the user if the fit has not ended; nothing for a finished or a pruned run."""
         if "pruned" in self.record or (self.folder / METRICS_FILE).is_file():
             return []
-        why = f"unfinished, the fit stopped after step {self.step:,}"
-        return [f"{self.folder}: {why}; to finish it, repeat its command with --resume"]
+        why = f"the fit stopped after step {self.step:,}"
+        return [f"{self.folder}: {why}; to finish, repeat the fit's command with --resume"]
 
     def scene_request(self, reader: str | None = None) -> SceneRequest:
         """Return the fitted scene with the options for reading it.
@@ -259,15 +259,15 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
     """Return the scene of a run's record, as `StoredRun.scene_request` does."""
     if record["scene"]["path"] is None:
         raise DataError(
-            f"{folder}: its scene was passed from Python and has no folder; score the model there with warpgs.evaluate"
+            f"{folder}: the scene was passed from Python and has no folder; score the model in Python with warpgs.evaluate"
         )
     request = SceneRequest(**record["scene"])
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
         raise UsageError(
-            f"{folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never decides which "
-            f"code is loaded: name it again with --reader {request.reader}"
+            f"{folder}: the scene was read with user code. A run folder never decides which code is loaded; give --reader "
+            f"{request.reader} again"
         )
     return request
 
@@ -284,11 +284,11 @@ def stored_request(folder: Path) -> FitRequest:
         scene = _stored_scene(folder, record, None)
         _check_named_again({}, record["config"], folder)
     except UsageError as e:
-        raise UsageError(f"{e}, beside the scene and all other flags that the run was started with") from e
+        raise UsageError(f"{e}, with the scene and all other flags of the run") from e
     try:
         config = FitConfig.from_json(record["config"])
     except (UsageError, schema.SchemaError) as e:
-        raise DataError(f"{folder / CONFIG}: its settings are invalid ({e}); restore it, or fit the scene again") from e
+        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); restore the file, or fit the scene again") from e
     return FitRequest(scene, folder, config, record["device"], resume=True)
 
 
@@ -326,11 +326,11 @@ def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Pat
     try:
         MODEL_STATE(state, "")
     except schema.SchemaError as e:
-        raise DataError(f"{path}: its state is incomplete or damaged: {e}; restore it, or fit the scene again") from e
+        raise DataError(f"{path}: stored state incomplete or damaged: {e}; restore the file, or fit the scene again") from e
     found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
     if "sh_packed" in found and "degrees" in tensors:
         try:
             found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
         except ValueError as e:
-            raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again") from e
+            raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again") from e
     return checked_gaussians(found, str(path)), state["step"]

@@ -57,8 +57,8 @@ def given_figures(
             cosine = (given[both] * found[both]).sum(-1).clip(-1, 1)
             rows["normals"].append(_row(view.name, at, np.degrees(np.arccos(cosine))))
     words = {
-        "depth": "given depth: rendered depth differs from it by {:.2%} in the median (worst view {:.2%})",
-        "normals": "given normals: those of rendered depth differ by {:.1f} degrees in the median (worst view {:.1f})",
+        "depth": "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})",
+        "normals": "given normals: median difference of the normals of rendered depth {:.1f} degrees (worst view {:.1f})",
     }
     found = {}
     for name, own in rows.items():
@@ -66,7 +66,7 @@ def given_figures(
             continue
         off = [r["difference"] for r in own if np.isfinite(r["difference"])] or [float("nan")]
         share = float(np.mean([r["coverage"] for r in own]))
-        summary = f"{words[name].format(float(np.median(off)), max(off))}, at {share:.1%} of the pixels of {len(own)} views"
+        summary = f"{words[name].format(float(np.median(off)), max(off))}, over {share:.1%} of the pixels of {len(own)} views"
         found[name] = {"views": own, "summary": summary}
     return found
 

@@ -19,7 +19,7 @@ from warpgs.rules import rule_named
 from warpgs.scene import Camera, Normalization
 
 RULE = "inria"
-"""Rule that files of Gaussians are rendered with where none is named: most were trained with it."""
+"""Default rule for files of Gaussians: most models were trained with it."""
 
 
 def open_file(
@@ -53,7 +53,7 @@ def open_file(
     for name, c in found.items():
         if c.width * c.height > MAX_PIXELS:
             raise DataError(
-                f"{cameras}, {name}: an image of {c.width} x {c.height} px has more than {MAX_PIXELS:,} pixels; write less"
+                f"{cameras}, {name}: an image of {c.width} x {c.height} px has over {MAX_PIXELS:,} pixels; give a smaller size"
             )
     # the unit stays that of the file, since the near plane of a rule is in that unit
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
@@ -61,9 +61,9 @@ def open_file(
     gaussians = gaussians.to(where)
     notes += [note] if (note := format_of(path).note) else []
     if declared:
-        notes.append(f"{path.name} is antialiased, and so are its renders, with a pixel filter of {LOW_PASS:g} px²")
+        notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")
     if rule is None:
-        notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat-1.6 or gsplat-1.5 suits models of gsplat")
+        notes.append(f"rendered with the cut-offs of {RULE}; for models of gsplat, give --rule gsplat-1.6 or gsplat-1.5")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
     shown = (in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
     model = FittedModel(gaussians, normalization, *shown, antialiased=antialiased or declared)

@@ -102,13 +102,13 @@ class Precompiled:
     device: str
     """cpu, or the name of the CUDA device."""
     kernel: str
-    """File and name of one of its kernels."""
+    """File and name of one kernel of the module."""
     block: int
-    """Threads of a block that it was compiled for."""
+    """Threads of a block that the module was compiled for."""
     compiled: bool
-    """False where the cache had it already."""
+    """False if the cache already had the module."""
     seconds: float
-    """Time to compile and load it [s]."""
+    """Time to compile and load the module [s]."""
 
 
 def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
@@ -149,6 +149,6 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
     compiled, folder = [w for w in results if w.compiled], Path(wp.config.kernel_cache_dir)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     say(
-        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were there, "
+        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were in the cache, "
         f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
     )

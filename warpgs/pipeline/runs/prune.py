@@ -94,7 +94,7 @@ def prune(
         UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
     """
     if not 0 < keep_psnr < math.inf:
-        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 is invisible")
+        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 dB is invisible")
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
@@ -137,9 +137,7 @@ def _pruned(
     device = before.means.device
     whole = mean_psnr(before, train, options)
     if not math.isfinite(whole):
-        raise DataError(
-            f"{stored.folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
-        )
+        raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
     kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
     view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
     tried = itertools.count(1)

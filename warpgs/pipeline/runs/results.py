@@ -96,11 +96,11 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     else:
         lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no view is held out, so there are no scores)"]
     compiling = metrics["seconds"].get("compiling", 0.0)
-    once = f", {duration(compiling)} of it for kernels, once on this machine" if compiling >= 1 else ""
+    once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
     if out is None:
-        return [*lines, "nothing is written to disk, because no run folder (out) was given"]
+        return [*lines, "nothing was written to disk, because no run folder (out) was given"]
     run = shlex.quote(str(out))
     commands = {
         f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",

@@ -22,7 +22,7 @@ from warpgs.scene import Camera, Gaussians, View
 VIEWS = 3
 """Number of training views that are compared, sampled at random."""
 SIDE = 64
-"""Side of the part of each that is compared [px], a multiple of the tile's."""
+"""Side of the part of each view that is compared [px], a multiple of the tile size."""
 
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
@@ -130,5 +130,5 @@ def _summary(r: dict[str, Any]) -> str:
             f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
         )
     if r["half_resolution"] > 0:
-        words += f"; {r['half_resolution']:.0%} of the steps used views at half their size, a quarter of the pixels"
+        words += f"; {r['half_resolution']:.0%} of the steps used views of half size, with a quarter of the pixels"
     return words

@@ -24,7 +24,7 @@ from warpgs.schema import (
 )
 
 MAX_SIDE = 2**16
-"""Largest width and height of a stored camera [px], far above what any image has."""
+"""Largest width and height of a stored camera [px], far above those of any image."""
 
 
 def _view_name(value: Any, place: str) -> None:
