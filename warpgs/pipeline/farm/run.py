@@ -107,7 +107,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
             write_index(results, statuses, time.monotonic() - began)
             return statuses
     except KeyboardInterrupt:
-        say("repeat the command to continue: finished jobs are kept, interrupted ones continue")
+        say("repeat the command to continue: finished jobs are kept, and interrupted jobs continue")
         raise
     finally:
         engine.close()
@@ -124,6 +124,6 @@ def check_failures(statuses: list[JobStatus]) -> None:
         first = failed[0].record
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
         raise ResourceError(
-            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. The first: "
+            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. First message: "
             f"{first.message.rstrip('.') if first else 'unknown'}. The same command tries them again"
         )

@@ -159,7 +159,9 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
             "folder idrmasks, or give them with --score-masks"
         )
     for test, train in coincident_views(scene, split):
-        notes.append(f"{test} is held out, but training view {train} is at the same place: this score is not of a new view")
+        notes.append(
+            f"{test} is held out, but training view {train} is at the same place, so the score is not that of a new view"
+        )
     return split, notes
 
 

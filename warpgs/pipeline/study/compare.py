@@ -25,7 +25,7 @@ from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 
 SCORES = ("s_render", "s_semantic", "s_geometry")
-"""Switches of the scores that the importance map is the sum of."""
+"""Switches of the scores whose weighted sum is the importance map."""
 PAPER = "paper-literal"
 """Preset with the paper's hyper-parameters, a row of each ablation."""
 ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
@@ -38,9 +38,9 @@ ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
     **{f"with {name}": {name: True} for name in SWITCHES},
     PAPER: None,
 }
-"""Switches of each row of the ablation: those of the preset; pixels sampled uniformly, by the residual, and by one score more
-at a time; each part that is on switched off alone, and each that is off switched on. None for preset `PAPER`. A row that equals
-an earlier one is left out."""
+"""Switches that each row of the ablation changes in the preset. The rows: no change; pixels sampled uniformly, by the residual,
+then by one more score at a time; each part that is on switched off alone, and each that is off switched on. `PAPER` is a preset
+of its own. A row that equals an earlier one is left out."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
@@ -97,7 +97,7 @@ def _places(request: StudyRequest, device: str) -> list[Place]:
             say(f"{wanted.path}: {note}")
             wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
-            raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
+            raise DataError(f"{wanted.path}: no view is held out, so there are no scores to compare; choose another --split")
         places.append(
             Place(
                 scene_name(wanted),
@@ -189,11 +189,11 @@ def run_study(request: StudyRequest) -> list[str]:
         try:
             runs = _run_all(request, places, device, lpips)
         except KeyboardInterrupt:
-            say("repeat the command to continue: finished runs are kept, the interrupted one continues")
+            say("repeat the command to continue: finished runs are kept, and the interrupted run continues")
             raise
         for name in request.variants:
             failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]
             if len(failed) == len(places) * request.seeds:
-                raise DataError(f"every run of {name} failed, so nothing can be compared; the first: {failed[0]}")
+                raise DataError(f"every run of {name} failed, so nothing can be compared; first error: {failed[0]}")
         lines = write_study(request, runs, places, device, where.removeprefix("on "))
         return [*lines, f"in {request.out}: {', '.join(FILES)}"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 CONFIDENCE = 0.95
-"""Probability that an interval holds the true mean."""
+"""Probability that an interval contains the true mean."""
 
 
 def family_confidence(count: int, confidence: float = CONFIDENCE) -> float:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from warpgs.pipeline.study.statistics import Difference, Sample
 
 NONE = "-"
-"""Sign for a figure that was not measured."""
+"""Sign for a value that was not measured."""
 NOT_EXERCISED = "not exercised"
-"""Words for a difference between runs that gave the same files."""
+"""Text in place of a difference if both variants gave the same files."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Row:
     marks: tuple[bool, ...] = ()
     """Check marks, one for each of the table's switches."""
     exercised: bool = True
-    """False where every run gave the same file as the base: its settings made no difference to test."""
+    """False if every run gave the same file as the base, so that the settings made no difference."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +61,13 @@ class Table:
     metrics: tuple[Metric, ...]
     """Columns of figures."""
     rows: tuple[Row, ...]
-    """Variants, the base among them."""
+    """Variants, including the base."""
     switches: tuple[str, ...] = ()
     """Headings of the columns of check marks, in LaTeX without dollar signs; empty for a table of methods."""
 
     def __post_init__(self) -> None:
         if any(len(r.marks) != len(self.switches) for r in self.rows):
-            raise ValueError("every row needs a check mark for each switch, and none where there are no switches")
+            raise ValueError("every row needs one check mark per switch")
 
     def best(self, metric: Metric) -> float:
         """Return the best mean of a column as printed; NaN where nothing was measured."""
@@ -76,8 +76,8 @@ class Table:
         return (max if metric.upwards else min)(means, default=math.nan)
 
 
-INTERVALS = ("a 95 % t interval", "t intervals that hold together for a column with 95 % (Bonferroni)")
-"""Words on the intervals of a table with one difference, or with several."""
+INTERVALS = ("a 95 % t interval", "simultaneous 95 % t intervals per column (Bonferroni)")
+"""Description of the intervals of a table with one difference, or with several."""
 
 
 def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:

@@ -17,9 +17,9 @@ Color = tuple[float, float, float]
 """Red, green and blue in [0, 1]."""
 NAMED: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 CHOSEN = ("auto", "mean", "scene")
-"""Names of colours that follow from the scene."""
+"""Names of colours that depend on the scene."""
 BEHIND = 0x62616B67
-"""Key that sets random backgrounds apart from other random numbers of a fit."""
+"""Seed component that makes random backgrounds independent of other random numbers of a fit."""
 LEVELS = 2**16 - 1
 """Levels that colours are rounded to before they are added: sums of integers are exact in any order."""
 
@@ -83,8 +83,8 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
         color = mean_color(train)
         return color, f"background: the mean colour of the training views, {_words(color)}; change it with --background"
     if wish == "auto":
-        return scene.background, f"background: {_words(scene.background)}, since the views show an object cut out"
-    return scene.background, f"background: {_words(scene.background)}, that of the scene" if cut_out else ""
+        return scene.background, f"background: {_words(scene.background)}, since the views show a cut-out object"
+    return scene.background, f"background: {_words(scene.background)}, from the scene's files" if cut_out else ""
 
 
 def over_background(scene: Scene, color: Color) -> Scene:

@@ -30,8 +30,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
-"""Positions in the last summed tensor, after loss and squared error: the number of processes that were asked to stop; and the
-first of the slots' reasons to stop the step."""
+"""Positions in the last summed tensor, after loss and squared error: of the number of processes that were asked to stop, and of
+the first slot's reason to stop the step."""
 
 
 class SumUpdate:
@@ -128,11 +128,11 @@ class BatchSteps:
         self.slots = StepBuffers(buffers.device, 1, steps_at_once(tree.batch) * len(tree.slots))
         """Settings and results of this process's slots, step by step."""
         self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device)
-        """Sums of what the slots said in the last step, or in the one that a slot stopped."""
+        """Sums of the slots' losses, errors and flags in the last step, or in the step that a slot stopped."""
         self.told_to_stop = False
-        """True if this process was asked to stop; the next step tells all others."""
+        """True if this process was asked to stop; the next step tells all other processes."""
         self.sums: SlotSums | None = None
-        """Sums over slots, of the sizes of the last step."""
+        """Sums over slots, with the shapes of the last step."""
         self._graphs = self._updates = None
         if buffers.device.type == "cuda":
             self._graphs = StepGraphs(learned, self.slots, options, view_gradients)

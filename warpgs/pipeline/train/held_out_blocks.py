@@ -17,15 +17,15 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 FLOOR = (2 / 255) ** 2
-"""Mean squared error that is added to that of every block, so that errors below two levels of an 8-bit photograph hardly
-count."""
+"""Constant that is added to the mean squared error of every block, so that errors below two levels of an 8-bit photograph have
+little effect."""
 SIDES = 16, 32
-"""Bounds of the side of a block [px]: a sixteenth of the image's shorter side, within these bounds, but never more than an
+"""Bounds of the side of a block [px]. The side is a sixteenth of the image's shorter side, within these bounds, and at most an
 eighth."""
 MIN_BLOCKS = 12
 """Smallest number of blocks over all views for a significant gain."""
 MAX_FRACTION = 0.1
-"""Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was requested."""
+"""Largest fraction of the pixels that may be held out in small images to reach `MIN_BLOCKS`, even if less was requested."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Blocks:
     side: int
     """Width and height [px]."""
     corners: torch.Tensor
-    """Row and column of the first pixel of each, int64 on the CPU, shape [B, 2]; no two overlap."""
+    """Row and column of the first pixel of each block, int64 on the CPU, shape [B, 2]; no two blocks overlap."""
 
     def __len__(self) -> int:
         """Return the number of squares."""
@@ -123,9 +123,9 @@ class Gain:
     """Gain of a change on the left-out blocks."""
 
     mean: float
-    """Mean drop of the error of a block [dB]."""
+    """Mean decrease of the error of a block [dB]."""
     noise: float
-    """Standard error of that mean [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
+    """Standard error of ``mean`` [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
     error may be larger."""
 
     def upper_bound_below(self, least: float, noises: float) -> bool:

@@ -27,7 +27,7 @@ class LearnedView:
     modules: tuple[ViewModule, ...]
     """View modules of the fit."""
     given: Camera
-    """Given camera, from which modules start."""
+    """Given camera, which modules change."""
     values: Tensors
     """Current values, by name, [...], overwritten in place."""
 

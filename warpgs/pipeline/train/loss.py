@@ -41,7 +41,9 @@ class _Outputs(dict[str, torch.Tensor]):
         self.term = term
 
     def __missing__(self, name: str) -> torch.Tensor:
-        raise UsageError(f"the loss term {self.term.name!r} reads the output {name!r} without asking: name it in needs_outputs")
+        raise UsageError(
+            f"the loss term {self.term.name!r} reads the output {name!r}, but did not request it; add it to needs_outputs"
+        )
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,8 @@ class LossInputs:
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
     tensors. Where poses are refined, the pose is that of the step and differentiable."""
     step: torch.Tensor
-    """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed with
-    other numbers; `LossTerm.active` has the number on the host."""
+    """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
+    for later steps; `LossTerm.active` has the number on the host."""
 
     def of(self, term: LossTerm) -> LossInputs:
         """Return the inputs of one term, with only the outputs that it needs."""
@@ -77,7 +79,7 @@ class LossTerm:
     needs_outputs: ClassVar[tuple[str, ...]] = ("rgb",)
     """Images of the render that the term reads (`LossInputs.outputs`). Other images have no gradient."""
     needs_priors: ClassVar[bool] = False
-    """True if `needs` reads the priors of the views; they are then computed before the fit."""
+    """True if `needs` reads the priors of the views, which are then computed before the fit."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the maps of a view that the term reads, by name, each of shape [H, W] or [H, W, C].

@@ -31,7 +31,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
 RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views.step_bytes)
-"""Parts of every step: their bytes by moment."""
+"""Functions that return the bytes of a part of every step, by moment."""
 
 
 @dataclass(frozen=True)
@@ -41,15 +41,15 @@ class Layout:
     sizes: StepSizes
     """Sizes of every step, without Gaussians and instances."""
     parts: tuple[Callable[[StepSizes], Needs], ...]
-    """Parts of a step: their bytes by moment."""
+    """Functions that return the bytes of a part of a step, by moment."""
     table: Table
     """The Gaussians with their columns."""
     view_bytes: int
     """Bytes of all views, including data kept beside them."""
     graphs: int = 0
-    """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
+    """CUDA graphs that exist at a time, one for each size of view; 0 if steps are not captured."""
     sums: int = 0
-    """Sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
+    """Number of sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
 
     def held(self, count: int) -> int:
         """Return the bytes that last from step to step: parameters, two Adam moments, columns, sums over slots, and views."""
@@ -111,7 +111,7 @@ class MemoryPlan:
     available: int
     """Bytes that the device had free."""
     gaussians: int
-    """Number at the start."""
+    """Number of Gaussians at the start."""
     instances: int
     """Most (Gaussian, tile) instances of a view at the start."""
     planned: int
@@ -121,13 +121,13 @@ class MemoryPlan:
     planned_at_cap: int
     """Bytes of steps at the cap, if each Gaussian then touches as many tiles as at the start."""
     lowered_from: int | None = None
-    """Cap that was requested, where the limit lowered it."""
+    """Requested cap, if the limit lowered it; else None."""
     chunked: bool = False
-    """True where the first steps render images in chunks."""
+    """True if the first steps render images in chunks."""
     chunked_at_cap: bool = False
-    """True where steps at the cap do."""
+    """True if steps at the cap render images in chunks."""
     graph_refused: bool = False
-    """True if captured steps would exceed the limit, so that steps are taken one by one."""
+    """True if captured steps would exceed the limit, so that steps are not captured."""
 
     def to_json(self) -> dict:
         """Return plain values for metrics.json."""
@@ -147,7 +147,7 @@ class MemoryPlan:
             if self.planned_at_cap > self.available:
                 fraction = (self.available - self.planned) / max(1, self.planned_at_cap - self.planned)
                 reached = int(self.gaussians + max(0.0, fraction) * (self.cap - self.gaussians))
-                text += f"; the free {format_bytes(self.available)} are used up at about {reached:,}; set --memory-limit"
+                text += f"; the free {format_bytes(self.available)} suffice for about {reached:,} Gaussians; set --memory-limit"
                 return text
             return text if self.chunked else Detail(text)
         text += f"; limit {format_bytes(self.limit)}"

@@ -10,7 +10,7 @@ import torch
 from warpgs.kernels.opacity_decay import opacity_decay
 
 LEAST_LOGIT = -15.0
-"""Logit below which no opacity decays further: the pruning threshold is far above it."""
+"""Logit below which no opacity decays further, far below the pruning threshold."""
 
 
 @torch.no_grad()

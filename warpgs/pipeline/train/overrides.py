@@ -20,13 +20,13 @@ from warpgs.schema import SchemaError, of_type
 from warpgs.suggestion import did_you_mean
 
 Path = tuple[str, ...]
-"""Names of fields from a `FitConfig` to a setting; a number among them is the place of a loss term or a view module."""
+"""Path from a `FitConfig` to a setting, as names of fields; a number is the index of a loss term or a view module."""
 WITHOUT_PREFIX = "priors"
 """Group without a prefix in its flags."""
 PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
 """Fields that hold parts of a registry, each with settings of its own."""
 OTHERS = ("preset", "strategy", "strategy_config", *PARTS)
-"""Fields with their own way of setting, such as a name to look up."""
+"""Fields whose values are converted in their own way, such as a name to look up."""
 
 
 def setting_names(config: FitConfig) -> list[str]:
@@ -135,7 +135,7 @@ def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> t
     if isinstance(names, str):
         names = [n.strip() for n in names.split(",") if n.strip() not in ("", "none")]
     if not isinstance(names, (list, tuple)):
-        raise UsageError(f"{field} must be names with commas between, not {names!r}")
+        raise UsageError(f"{field} must be names separated by commas, not {names!r}")
     return tuple(p if isinstance(p, registry.base) else _found(registry, p, own_code)() for p in names)
 
 
@@ -214,6 +214,8 @@ def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
     last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # as in `opacity` for `init.opacity`
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
     if name in groups:
-        return f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or one of them by its name"
+        return (
+            f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
+        )
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"{place}: unknown setting {name[:60]!r}; {hint}"

@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent / "preset_files"
 """Folder of the presets of warpgs."""
 SUFFIX = ".toml"
-"""End of the names of files with a preset."""
+"""Suffix of preset files."""
 MAX_BYTES = 2**16
 """Size of the largest file that is read [bytes]."""
 MAX_DEPTH = 8
-"""Number of tables and lists that may lie in each other."""
+"""Largest depth of nested tables and lists."""
 MAX_DOTS = 100
-"""Number of dots in a line: the time of Python's TOML reader grows with the square of the parts of a key."""
+"""Largest number of dots in a line: the time of Python's TOML reader grows with the square of the number of parts of a key."""
 MAX_BASES = 8
-"""Number of presets that may start from each other."""
+"""Longest chain of preset files, each the base of the next one."""
 DEFAULT_PRESET = "default"
 """Preset where the user names none."""
 NO_BASE = "none"
-"""Base of a preset that starts from the defaults of `FitConfig`."""
+"""Name of the base for a preset that starts from the defaults of `FitConfig`."""
 OWN_KEYS = ("base", "about")
 """Keys of a preset that are not settings."""
 
@@ -62,7 +62,7 @@ class Presets(Mapping[str, "FitConfig"]):
             UsageError: A built-in preset has that name, or no flag could name it.
         """
         if name in self._files or ":" in name or name.endswith(SUFFIX) or not name.strip():
-            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without colon that warpgs does not use")
+            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without a colon that is not built in")
         self._made[name], self._about[name] = config, about
 
     def described(self) -> dict[str, str]:
@@ -210,10 +210,10 @@ def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path |
     elif base.endswith(SUFFIX):
         path = (Path() if folder is None else folder) / base
         if above >= MAX_BASES:
-            raise UsageError(f"{place}: base {base!r} is circular, or a chain of over {MAX_BASES} files; name another")
+            raise UsageError(f"{place}: base {base!r} is circular, or a chain of over {MAX_BASES} files; give another base")
         start, origin = _config_of_file(path, path.name, above)
     elif ":" in base:
-        raise UsageError(f"{place}: base {base!r} is code, which is never imported because a file names it; name a preset")
+        raise UsageError(f"{place}: base {base!r} is code; a preset file never loads code; give the name of a preset")
     elif base not in PRESETS:
         raise UsageError(f"{place}: base {base!r} is not one of {', '.join(PRESETS)}; choose one, a {SUFFIX} file or {NO_BASE}")
     else:

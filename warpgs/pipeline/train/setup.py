@@ -34,11 +34,11 @@ class Preparation:
     """Points, priors and notes, found before the first step."""
 
     views: list[View]
-    """The views to fit, with depth by a network where that guides the fit."""
+    """The views to fit, with depth from a network if depth guides the fit."""
     start: Start
-    """The first points, and the depths that views confirm."""
+    """The initial points, and the depths that other views confirm."""
     priors: list[Prior] | None
-    """One for each view; None if not needed."""
+    """Prior of each view; None if not needed."""
     notes: list[str]
     """Notes on choices, assumptions and missing inputs."""
 
@@ -78,7 +78,7 @@ def prepare(
 
     @functools.cache
     def start() -> Start:
-        progress("finding start points")
+        progress("finding initial points")
         return _start_of(train, points, config, generator, usable, progress)
 
     notes = []
@@ -122,7 +122,7 @@ def _unused_networks(config: FitConfig) -> list[str]:
     """Return notes on the networks that are named although nothing in the fit reads priors."""
     switches = {"depth": "--depth-guides or --method.s-geometry", "segmentation": "--method.s-semantic"}
     named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
-    return [f"--{kind}-model is not used: this fit needs no such map; to use it, add {switches[kind]}" for kind in named]
+    return [f"--{kind}-model is not used by this fit; to use it, add {switches[kind]}" for kind in named]
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
@@ -130,7 +130,7 @@ def _check_models(train: list[View], config: FitConfig) -> None:
     others = sorted({v.camera.model for v in train} - {*CENTRAL})
     if others and (config.init.source != "points" or samples(config)):
         raise UsageError(
-            f"camera model {others[0]}: this start or strategy compares views, which needs one of {', '.join(CENTRAL)}; fit "
+            f"camera model {others[0]}: this start or strategy compares views, which requires {' or '.join(CENTRAL)}; fit "
             "with --preset 3dgs --init.source points, or undistort the images"
         )
 

@@ -17,18 +17,19 @@ from warpgs.errors import UsageError
 from warpgs.runtime.ranks import Ranks
 
 SUMMED = 2
-"""Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
+"""Number of statistics of a Gaussian that are summed with the gradients of several views: sum of its gradients, and number of
+renders."""
 Node = tuple[int, int]
-"""Slots of a subtree: the first, and the one behind the last."""
+"""Slots of a subtree: the first, and the one after the last."""
 ALIGNMENT = 16
 """Alignment of the parts of a sum, in floats: Adam reads four at a time."""
 FLOAT_BYTES = 4
-"""Bytes of a number."""
+"""Size of a float [bytes]."""
 DIVIDED_BYTES = 2**26
-"""Size of a tensor from which its rows are divided among processes: smaller ones are updated faster than two more exchanges
-begin."""
+"""Least size of a tensor whose rows are divided among processes [bytes]: updating a smaller tensor takes less time than
+two more exchanges need to begin."""
 MAX_RENDERS = 2**24
-"""Number of renders that a fit must stay below: it is a float32, from which each takes its random numbers."""
+"""Upper bound of the number of renders of a fit: each render takes its random numbers from its number, a float32."""
 
 
 def check_ranks(batch: int, ranks: Ranks) -> None:
@@ -39,8 +40,8 @@ def check_ranks(batch: int, ranks: Ranks) -> None:
     """
     if batch < ranks.count:
         raise UsageError(
-            f"--batch {batch} gives a step fewer views than the {ranks.count} ranks that share them; give --batch "
-            f"{ranks.count} or a multiple of it, or start fewer ranks"
+            f"--batch {batch} is less than the number of ranks, {ranks.count}; give --batch {ranks.count} or a multiple "
+            "of it, or start fewer ranks"
         )
 
 
@@ -156,9 +157,9 @@ class SlotSums:
         ends = list(accumulate(-(-counts[k] // ALIGNMENT) * ALIGNMENT for k in order))
         starts = dict(zip(order, [0, *ends[:-1]], strict=True))
         self.starts = [starts[k] for k in range(len(counts))]
-        """Start of each tensor in a sum; the large one is the first."""
+        """Offset of each tensor in a sum; the large tensor comes first."""
         self.divided = 0
-        """Rows of the large tensor that are divided, from the first; the few others are treated as all other tensors."""
+        """Number of rows of the large tensor, the first ones, that are divided; the last few are treated like other tensors."""
         self._width = 1
         if large is not None and tree.ranks.count > 1 and FLOAT_BYTES * counts[large] >= DIVIDED_BYTES:
             rows = self.shapes[large][0]
@@ -166,7 +167,7 @@ class SlotSums:
         self.rows = torch.zeros(tree.rows, -(-ends[-1] // unit) * unit, device=device)
         """The sums, shape [R, L]."""
         self.means = [(self.starts[k], self.starts[k] + counts[k]) for k in range(means)]
-        """Numbers of a sum that become means: the first of each tensor, and the one behind the last."""
+        """Ranges of a sum that become means: for each tensor, the first entry and the one after the last."""
 
     @property
     def own_rows(self) -> slice:

@@ -30,9 +30,10 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, Render
 
 MAX_STEPS = 100
-"""Largest number of steps after which results are read back from the device."""
+"""Largest number of steps between two reads of results from the device."""
 MAX_VIEWS = 400
-"""The same as a number of rendered views, for steps of several views: a request to stop waits for them."""
+"""Largest number of rendered views between two such reads, for steps of several views: a request to stop waits for the next
+read."""
 
 
 def steps_at_once(batch: int) -> int:
@@ -55,7 +56,7 @@ class StepPlan:
     limits: Limits = NO_LIMITS
     """Limits that the step holds every Gaussian to."""
     opacity_decay: float = 0.0
-    """Fraction of every opacity that the step takes."""
+    """Fraction by which the step lowers every opacity."""
     spares_unused: bool = False
     """True to keep the opacity of Gaussians that the step does not use."""
 
@@ -75,7 +76,7 @@ class StepBuffers:
         self.setting_rows = torch.zeros(rows, len(Setting), device=device)
         """Settings of each step, by `Setting`."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
-        """Number of the current step in its series. It stays once a step stops, and so do all Gaussians."""
+        """Number of the current step in its series. After a step stops, neither this number nor any Gaussian changes."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
         """0 while steps continue, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device)
@@ -166,7 +167,7 @@ class Learned:
     dropout_seed: int | None
     """Seed of the opacity dropout; None for none."""
     cameras: TrainingCameras
-    """Training cameras, which limits of sizes refer to."""
+    """Training cameras, to which limits of sizes refer."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class ViewGradients:
     settings: torch.Tensor
     """Settings of the step, shape [7]."""
     going: torch.Tensor
-    """True where nothing stops the step, bool, shape [1]."""
+    """True if nothing stops the step, bool, shape [1]."""
 
 
 @dataclass(frozen=True)

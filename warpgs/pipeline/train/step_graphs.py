@@ -19,9 +19,9 @@ from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Gaussians
 
 CAPACITY_FACTOR = 1.3
-"""Capacity of a captured step for instances, as a multiple of the most that any view has when it is captured."""
+"""Capacity of a captured step for instances, as a multiple of the largest number of any view at the time of capture."""
 DEAD_BYTES = 2**30
-"""Bytes of unused graphs that are kept. Freeing them takes milliseconds, in which the device waits."""
+"""Largest memory of unused graphs that is kept [bytes]. Freeing it takes milliseconds, in which the device waits."""
 
 
 class OverLimitError(ResourceError):
@@ -80,7 +80,7 @@ class StepGraphs:
             capacity = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
             if max_instances is not None and capacity > max_instances:
                 raise OverLimitError(
-                    f"a captured step would need capacity for {capacity:,} instances, the limit allows {max_instances:,}"
+                    f"a captured step would need capacity for {capacity:,} instances, but the limit allows {max_instances:,}"
                 )
             self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
             render = captured_renderer(self.options, capacity, self.buffers.stop)
@@ -118,7 +118,7 @@ def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, optio
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
         raise ResourceError(
-            f"a step would touch {wanted:,} tiles, which needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB; "
-            f"{budget / 2**30:.2f} GiB may be used. Fit smaller images with --downscale, or limit --max-gaussians."
+            f"a step needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB for {wanted:,} (Gaussian, tile) instances, but "
+            f"{budget / 2**30:.2f} GiB may be used; fit smaller images with --downscale, or lower --max-gaussians"
         )
     return wanted

@@ -43,7 +43,7 @@ class Trainer:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
     chosen: list[int] | None = None
-    """Numbers of the views of the steps in progress; None between steps."""
+    """Indices of the views of the steps in progress; None between steps."""
 
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
@@ -71,7 +71,7 @@ class Trainer:
                 what a view module learns.
         """
         if not train:
-            raise DataError("there is no training view; name at least one in --split")
+            raise DataError("there is no training view; leave at least one in --split")
         for module in config.view_modules:
             module.check(train)
         self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
@@ -79,16 +79,16 @@ class Trainer:
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
         train = made.views
         self.notes: list[str] = made.notes
-        """Sentences on what was chosen for the user before the first step."""
+        """Notes on choices made before the first step, for the user."""
         self.messages: list[str] = []
-        """Sentences for the user that were not shown yet."""
+        """Messages for the user that were not shown yet."""
         cloud, cameras = made.start.cloud, [v.camera for v in train]
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
         assert config.half_resolution is not None  # `settings_by_views` has chosen
         self.half_resolution = config.half_resolution
-        """Fraction of the planned steps, from the first, in which views are half their size."""
+        """Fraction of the planned steps, the first ones, in which views have half size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
@@ -96,9 +96,9 @@ class Trainer:
         self.terms = terms_of(config, self.cutout, **given)
         self.step = 0  # taken
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
-        """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
+        """Memory limit of steps [bytes], None for no limit; and whether steps may be captured (`spare_memory`)."""
         self.order: list[int] = []
-        """Views that are still to come before any comes again, the next one last."""
+        """Views that are still to come in the current pass over all views, the next one last."""
         self.extrapolated = made.start.extrapolated > 0
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
         self._make_parts(train, made.start, scene_extent(cameras, cloud))
@@ -228,7 +228,7 @@ class Trainer:
                 raise
             raise self._no_memory(e) from e
         self.messages.append(
-            f"memory: step {self.step + 1} ran out of memory; steps run without CUDA graphs from here on, within "
+            f"memory: step {self.step + 1} ran out of memory; from now on, steps run without CUDA graphs, within "
             f"{format_bytes(self.memory_limit)}"
         )
 
@@ -282,7 +282,7 @@ class Trainer:
             self.taker.clear()
             self.layout = dataclasses.replace(self.layout, graphs=0)
             self.count_changed()
-            self.messages.append(f"memory: steps run without CUDA graphs from here on, because {e}")
+            self.messages.append(f"memory: from now on, steps run without CUDA graphs, because {e}")
             return False
         return True
 

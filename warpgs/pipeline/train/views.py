@@ -34,7 +34,7 @@ class TrainingView:
     geometry: torch.Tensor | None = None
     """S_geometry in [0, 1], shape [H, W]; None if the strategy does not use it."""
     consistent: torch.Tensor | None = None
-    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None without any."""
+    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None if not computed."""
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Maps for loss terms (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
@@ -142,7 +142,7 @@ def half_size(view: TrainingView) -> TrainingView:
 
 
 Rows = torch.Tensor | tuple[torch.Tensor, ...]
-"""One entry for each view: a tensor [V, ...], or on a CPU a tensor for each."""
+"""One entry for each view: a tensor [V, ...], or on a CPU one tensor per view."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class ViewStack:
     maps: Mapping[str, Rows]
     """Maps that loss terms requested, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
-    """Number of each view among all training views, int64, shape [V]."""
+    """Index of each view among all training views, int64, shape [V]."""
     alphas: Rows | None = None
     """Opacity of the subject, shape [V, H, W]; None if no training view has one."""
 

@@ -25,9 +25,9 @@ from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import Camera, PointCloud, Prior, View
 
 STEPS = 3
-"""Steps of the tiny fit: one for each phase."""
+"""Number of steps of the tiny fit, one for each phase."""
 SIDE, POINTS, PLANES = 48, 200, 8
-"""Sides of the tiny fit's views [px]; its number of points, and of planes."""
+"""Sides of the tiny fit's views [px]; its numbers of points and of sweep planes."""
 
 
 def _views(generator: np.random.Generator) -> list[View]:

@@ -21,11 +21,11 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.scene import Prior
 
 MIN_ALPHA = 0.5
-"""Opacity above which a pixel shows a surface, whose depth counts."""
+"""Opacity above which a pixel shows a surface, so that its depth counts."""
 DEPTH_MAPS = 8
-"""Maps of one float a pixel that the depth term holds at the loss, with its gradient."""
+"""Number of maps with one float per pixel that the depth term and its gradient hold at the loss."""
 NORMAL_MAPS = 26
-"""The same of the normal term, whose points, differences and normals have three numbers each."""
+"""Number of such maps for the normal term; points, differences and normals count as three each."""
 
 
 def inverse_depth_difference(

@@ -32,8 +32,7 @@ class Strategy:
     Config: ClassVar[type | None] = None
     """Frozen dataclass of the strategy's settings; None for none. They become flags, grouped under the strategy's name."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
-    """Schema (`warpgs.schema`) of the plain values that `state` returns; values from files are checked against it before
-    `load`."""
+    """Schema (`warpgs.schema`) of the plain values that `state` returns; stored values are checked against it before `load`."""
 
     def __init__(self, context: StrategyContext):
         """Keep the context, which the strategy works with; nothing is trained yet.

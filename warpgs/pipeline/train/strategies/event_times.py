@@ -10,9 +10,9 @@ class EventTimes:
     """Events at equal distances, in steps done."""
 
     after: int
-    """Steps after which the first event comes."""
+    """Step after which the first event comes."""
     every: int
-    """Steps between two events, which are at multiples of this."""
+    """Steps between two events; events are at multiples of this number."""
     until: int
     """Last step with an event."""
 

@@ -13,9 +13,9 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Camera
 
 EVERY = 2
-"""Distance of the pixels for which gains are computed [px]; those between repeat them, since a footprint is wider."""
+"""Distance between pixels for which gains are computed [px]; pixels between repeat them, since a footprint is wider."""
 HIDDEN = 1.05
-"""Depth, as a multiple of the rendered one, beyond which a point is hidden in a view."""
+"""A point is hidden in a view if its depth exceeds the rendered depth by this factor."""
 
 
 class Residual(NamedTuple):

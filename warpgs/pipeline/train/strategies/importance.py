@@ -15,7 +15,7 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.quantiles import quantiles
 
 PERCENTILES = (0.02, 0.98)
-"""Quantiles of a view's score that map to 0 and 1, so that a few extreme pixels do not flatten the rest."""
+"""Quantiles of a view's score that map to 0 and 1, so that a few extreme pixels do not compress the range of the rest."""
 BLUR = 1.0
 """Standard deviation [px] of the blur of residuals and disparities, so that single noisy pixels attract no samples."""
 
@@ -31,8 +31,8 @@ class ImportanceConfig:
     geometry: float = 0.4
     """Weight of the geometric score (paper, w3)."""
     residual: str = "length"
-    """Rendering residual: length (the paper) of the colour difference in the view; or gain, the estimated drop of the squared
-    error of all training views by a fine Gaussian at the pixel."""
+    """Rendering residual: length (the paper), that of the colour difference in the view; or gain, the estimated decrease of the
+    squared error over all training views by a fine Gaussian at the pixel."""
     curvature: float = 0.5
     """Weight of the second derivatives in the geometric score (lambda_curv; the paper gives no value)."""
 

@@ -29,9 +29,9 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 
 COARSE = 0
-"""Layer of the Gaussians that were not sampled; that of the others is `FINE`."""
+"""Layer of the Gaussians that were not sampled; sampled Gaussians have `FINE`."""
 NOT_SAMPLED = -(2**30)
-"""``created_step`` of Gaussians that were not sampled: the coarse layer."""
+"""``created_step`` of the coarse layer, whose Gaussians were not sampled."""
 _COUNT = schema.whole(0)
 EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
 """Schema of a stored event."""

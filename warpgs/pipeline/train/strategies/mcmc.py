@@ -24,11 +24,11 @@ from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
 MAX_COPIES = 51
-"""Largest number of Gaussians that one may become at a time, as in the authors' program."""
+"""Largest number of Gaussians that replace one at an event, as in the authors' program."""
 MAX_OPACITY = 1 - 2**-24
-"""Largest opacity in relocation: below 1 the logit is finite."""
+"""Largest opacity in relocation; it is below 1, so that the logit is finite."""
 NOISE_STREAM = 0x6D636D63
-"""Mixed into the seed, so that noise and opacity dropout do not take the same random numbers."""
+"""Constant mixed into the seed, so that noise and opacity dropout use different random numbers."""
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Perturbation fades above this opacity: sigmoid(-slope (opacity - this)), eq. 8 with k = 100 and t = 0.995 of 1 - opacity."""
 
@@ -38,9 +38,9 @@ class MCMCConfig:
     """Settings of strategy mcmc; the defaults are the paper's."""
 
     start: int = 500
-    """Steps before Gaussians are relocated and added; a quarter of the fit if that is less."""
+    """Steps before Gaussians are first relocated and added; at most a quarter of the fit."""
     every: int = 100
-    """Steps between these events."""
+    """Steps between events that relocate and add Gaussians."""
     stop_fraction: float = 0.83
     """Fraction of the fit after which no Gaussians are added or relocated; 25,000 of 30,000 steps in the paper."""
     growth: float = 0.05
@@ -48,7 +48,7 @@ class MCMCConfig:
     min_opacity: float = 0.005
     """Largest opacity of a dead Gaussian, in [0, 0.5]."""
     noise_lr: float = 5e5
-    """Size of the perturbation, times the learning rate of the means."""
+    """Size of the perturbation, as a multiple of the learning rate of the means."""
     opacity_weight: float = 0.01
     """Weight of the mean opacity in the loss."""
     scale_weight: float = 0.01

@@ -14,7 +14,7 @@ from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.scene import Camera
 
 SUPPORT = 4
-"""Fewest pixels that a gate leaves, as a multiple of those to be sampled; with fewer its quantile is lowered."""
+"""Fewest pixels that must pass a gate, as a multiple of those to be sampled; with fewer, the gate's quantile is lowered."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class SamplerConfig:
     """Placement of fine Gaussians at one event."""
 
     depth: str = "rendered"
-    """Depth of new Gaussians: rendered (the paper), or consistent, the depth of the start where other views confirm it. With
-    consistent, only pixels with such depth are reliable, in views that have some."""
+    """Depth of new Gaussians: rendered (the paper), or consistent, the initial depth that other views confirm. With consistent,
+    the gate lets only pixels with such depth pass, in views that have some."""
     fraction: float = 0.005
     """Gaussians per event and view, as a fraction of the view's pixels."""
     gate_quantile: float = 0.6
@@ -33,9 +33,9 @@ class SamplerConfig:
     border: int = 2
     """Width of the image border in which no pixel is sampled [px]."""
     opacity: float = 0.1
-    """First opacity of a fine Gaussian, in (0, 1)."""
+    """Initial opacity of a fine Gaussian, in (0, 1)."""
     footprint: float = 1.0
-    """First standard deviation of a fine Gaussian [px], in the view of its pixel."""
+    """Initial standard deviation of a fine Gaussian [px], in the view of its pixel."""
     max_fraction: float = 0.5
     """Largest number of fine Gaussians, as a fraction of the coarse ones."""
 

@@ -34,9 +34,9 @@ from warpgs.scene import Gaussians, Prior, ViewDepth
 FINE = 1
 """Layer of sampled Gaussians."""
 MAX_VIEWS = 8
-"""Largest number of views that one event samples in; chosen at random where there are more."""
+"""Largest number of views in which one event samples; of more views, a random choice."""
 MAX_WEIGHED = 32
-"""Largest number of views over which blending weights are summed for an eviction."""
+"""Largest number of views over which blending weights are summed to choose Gaussians for eviction."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,10 @@ class ProtectConfig:
     """Protection of new Gaussians."""
 
     steps: int = 500
-    """Age up to which a sampled Gaussian is protected [steps] (T_protect; the paper gives no value): five refinements."""
+    """Age up to which a sampled Gaussian is protected [steps] (T_protect; the paper gives no value). The default is five
+    densification intervals."""
     opacity: float = 0.05
-    """Smallest opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times the pruning threshold."""
+    """Smallest opacity of a protected Gaussian, in (0, 1) (alpha_minimum). The default is ten times the pruning threshold."""
 
     def __post_init__(self):
         if self.steps < 0 or not 0 < self.opacity < 1:
@@ -63,7 +64,7 @@ class MethodConfig:
     """Switches of the paper's parts (its Table 2), and their settings. With all off it is plain 3D Gaussian splatting."""
 
     events: bool = False
-    """Sampling events: fine Gaussians are added in phase 2."""
+    """Sampling events, which add fine Gaussians in phase 2."""
     hier: bool | None = False
     """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: by the number
     of views."""
@@ -78,15 +79,15 @@ class MethodConfig:
     """Reliability gate: sample only pixels above gate_quantile of the geometric score and, with sampler.depth consistent, only
     pixels with consistent depth, in views that have some."""
     agp: bool = True
-    """Adaptive Gaussian placement: sample pixels at random in proportion to importance; off takes those of highest
+    """Adaptive Gaussian placement: sample pixels at random in proportion to importance. If off, take the pixels of highest
     importance."""
     pm: bool = True
     """Protection mechanism: new fine Gaussians keep a minimum opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
     """Factor of the learning rate of the means of the coarse layer from phase 2 on, in [0, 1]."""
     keep: float = 1.0
-    """Fraction of the Gaussians that are kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
-    over the training views."""
+    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights over
+    the training views."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
@@ -137,17 +138,17 @@ class SampledView:
     """Maps and samples of an event in one view, on the device of the fit."""
 
     view: int
-    """Number of the training view."""
+    """Index of the training view."""
     rendered: torch.Tensor
     """Colours before the event, shape [H, W, 3]."""
     scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-    """Render, semantic and geometric score, each [H, W] in [0, 1]; 0 everywhere where nothing was computed."""
+    """Residual, semantic and geometric score, each [H, W] in [0, 1]; all 0 if the score was not computed."""
     score: torch.Tensor
-    """Their weighted sum, shape [H, W]."""
+    """Importance, the weighted sum of ``scores``, shape [H, W]."""
     gate: torch.Tensor
     """Pixels that could be sampled, bool, shape [H, W]."""
     quantile: float
-    """Quantile of the geometric score that the gate used; lower than requested where too few pixels passed."""
+    """Quantile of the geometric score that the gate used; lower than requested if too few pixels passed."""
     at: torch.Tensor
     """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
 

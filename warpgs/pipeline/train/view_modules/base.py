@@ -15,9 +15,9 @@ from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 
 CAMERA_BYTES = 4 * (16 + 9)
-"""Bytes for each Gaussian where cameras are learned: the gradient of view matrix and intrinsics, until it is summed."""
+"""Bytes per Gaussian if cameras are learned: its gradient of view matrix and intrinsics, until these are summed."""
 Tensors = Mapping[str, torch.Tensor]
-"""Parameters of views, or values made of them, by name."""
+"""Parameters of views, or values computed from them, by name."""
 
 
 @dataclass(frozen=True)
@@ -161,4 +161,4 @@ def check_modules(modules: Sequence[ViewModule]) -> None:
                 'with @register("name") of warpgs.pipeline.train.view_modules.base above the class, or name it as module:Class'
             )
         if any(type(m) is kind for m in modules[:i]):
-            raise UsageError(f"the view module {module.name!r} is given twice; leave one out")
+            raise UsageError(f"the view module {module.name!r} is given twice; remove one")

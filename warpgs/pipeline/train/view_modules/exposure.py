@@ -81,7 +81,7 @@ class Exposure(ViewModule):
     lr: float = 5e-3
     """Learning rate of the exposures at the start."""
     decay: float = 0.1
-    """Fraction of the learning rate at the last step; log-linear between."""
+    """Ratio of the last to the first learning rate; log-linear between."""
     weight: float = 0.01
     """Weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
 
@@ -99,7 +99,7 @@ class Exposure(ViewModule):
         for v in views:
             if v.alpha is not None:
                 raise UsageError(
-                    f"--exposure does not support images with an alpha channel, as {v.name} has; leave --exposure out"
+                    f"--exposure does not support images with an alpha channel, such as {v.name}; leave out --exposure"
                 )
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
@@ -144,7 +144,7 @@ class Exposure(ViewModule):
         views = [{"name": n, "affine": m.tolist(), "gain": float(g)} for n, m, g in each]
         summary = (
             f"exposures learned: the training views are {gains.min():.2f} to {gains.max():.2f} times as bright as the model, "
-            "which has their mean exposure; all scores use renders without a learned exposure"
+            "which has their mean exposure; scores use renders without learned exposures"
         )
         renders = ((v, render_view(fitted.gaussians, v, fitted.options)[0]) for v in fitted.test)
         scores = [s for v, image in renders if np.isfinite(s := matched_psnr(v, image))]

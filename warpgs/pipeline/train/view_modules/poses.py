@@ -30,11 +30,11 @@ from warpgs.scene import Camera, View
 ROTATION, TRANSLATION = "pose_rotation", "pose_translation"
 """Names of the parameters: w [rad] and t [u], shape [V, 3] each."""
 FOCAL, CAMERA_NUMBER = "pose_focal", "pose_camera"
-"""Names of the parameters of a learned focal length: z, and the number of the view's camera, which stays; shape [V, 1] each."""
+"""Names of the parameters of a learned focal length: z, and the index of the view's camera, a constant; shape [V, 1] each."""
 SHOWN_LENSES = 3
-"""Cameras whose focal length the summary names."""
+"""Largest number of cameras whose focal length is in the summary."""
 RULE = (
-    "held-out views are moved by the similarity that best maps the given training cameras to the refined ones; their own "
+    "held-out cameras are moved by the similarity that best maps the given training cameras to the refined ones; held-out "
     "images are not used"
 )
 """Rule for the poses of held-out views, as text for the user."""
@@ -204,15 +204,15 @@ class RefinePoses(ViewModule):
     """Learn a small correction of each training camera except the first, for inexact poses (docs/your-photos.md)."""
 
     start: float = 0.2
-    """Fraction of the steps before poses are refined, in [0, 1), because the first Gaussians are inaccurate."""
+    """Fraction of the steps before poses are refined, in [0, 1), because the initial Gaussians are inaccurate."""
     rotation_lr: float = 2e-4
     """Learning rate of the rotations of the training cameras [rad], when refinement starts."""
     translation_lr: float = 2e-4
-    """Learning rate of their translations, times the scene's extent."""
+    """Learning rate of the translations of the training cameras, in units of the scene's extent."""
     focal_lr: float | None = None
     """Learning rate of the logarithm of each camera's focal length, shared by all its views; None to keep it fixed."""
     decay: float = 0.1
-    """Fraction of these learning rates at the last step; log-linear between."""
+    """Ratio of the last to the first of these learning rates; log-linear between."""
 
     def __post_init__(self) -> None:
         lrs = {"rotation_lr": self.rotation_lr, "translation_lr": self.translation_lr, "focal_lr": self.focal_lr}
