@@ -148,7 +148,7 @@ def test_render_paths(run, tmp_path, path, pictures, capsys):
     assert main(["render", str(run), *flags]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures + 1 and (tmp_path / "film.mp4").stat().st_size > 0
     said = capsys.readouterr().out
-    assert said.count("the film is VP9, for browsers and VLC; ") == 1
+    assert said.count("the film is VP9, which browsers and VLC play; ") == 1
     assert f"sheet of {min(6, pictures)} frames in {tmp_path / 'sheet.png'}" in said
 
 
@@ -167,7 +167,7 @@ def test_plot(run, tmp_path, capsys):
     [
         (["--points", "stars"], "gaussians, start"), (["--color", "red"], "own, coverage"),
         (["--size", "9", "9"], "64 to 8192"),
-        (["--background", "red"], "white, black"), (["--points", "start", "--color", "coverage"], "coverage is measured"),
+        (["--background", "red"], "white, black"), (["--points", "start", "--color", "coverage"], "coverage needs Gaussians"),
         (["--out", "a.jpg"], "a plot is a .png"),
     ],
 )  # fmt: skip

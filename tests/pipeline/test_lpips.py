@@ -141,7 +141,7 @@ def test_conversion_notes_unknown_sources(files, tmp_path):
     """Weights that are not the published ones are converted, and it is said."""
     _, _, _, backbone, heads = files
     notes = convert_lpips(backbone, heads, tmp_path / "x.safetensors")
-    assert len(notes) == 3 and "not the file that torchvision publishes" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
+    assert len(notes) == 3 and "not torchvision's published file" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
 
 
 class Evil:

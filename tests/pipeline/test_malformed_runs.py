@@ -46,7 +46,7 @@ def test_settings_of_a_continued_run_are_checked(run, name, value):
     record = json.loads((run / "config.json").read_text())
     record["config"][name] = value
     (run / "config.json").write_text(json.dumps(record))
-    with pytest.raises(DataError, match=r"config\.json: its settings are invalid .*; restore it, or fit the scene again"):
+    with pytest.raises(DataError, match=r"config\.json: invalid settings .*; restore the file, or fit the scene again"):
         stored_request(run)
 
 

@@ -76,7 +76,7 @@ def test_cameras_turn_with_their_gaussians(tmp_path):
     turn = Filters(rotate="1,2,3,70")
     convert(tmp_path / "a.ply", tmp_path / "b.ply", turn)
     lines = convert(tmp_path / "cameras.json", tmp_path / "b" / "transforms.json", turn)
-    assert "turned by 70.0 degrees" in lines[0] and "3 cameras for images of 64 x 48 px, named by number" in lines[-1]
+    assert "rotated by 70.0 degrees" in lines[0] and "3 cameras for images of 64 x 48 px in" in lines[-1]
     models = [open_file(tmp_path / f"{x}.ply", tmp_path / y, "inria", "cpu")[0] for x, y in (
         ("a", "cameras.json"), ("b", "b/transforms.json"))]  # fmt: skip
     images = [rasterize(m.gaussians(), torch_camera(list(m.cameras().values())[1])).rgb for m in models]

@@ -61,7 +61,7 @@ from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Camera, Scene
 
-COMPILING = "compiling kernels: once on this machine, one to two minutes"
+COMPILING = "compiling kernels, once on this machine, for a minute or two"
 """Message while kernels are compiled."""
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""

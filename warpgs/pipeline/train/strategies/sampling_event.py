@@ -86,8 +86,8 @@ class MethodConfig:
     coarse_lr_factor: float = 0.1
     """Factor of the learning rate of the means of the coarse layer from phase 2 on, in [0, 1]."""
     keep: float = 1.0
-    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights over
-    the training views."""
+    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
+    over the training views."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
