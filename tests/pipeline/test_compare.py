@@ -141,7 +141,7 @@ def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_p
     assert states(request) == ["kept", "kept", "continued", "kept"] and (half / "report.html").is_file()
     assert metrics_of(request, "a", 1)["test"] == before
     assert [p.parent for p, t in times.items() if p.stat().st_mtime_ns != t] == [half]
-    assert "continued from its last checkpoint" in capsys.readouterr().out
+    assert "continued from the last checkpoint" in capsys.readouterr().out
     assert "still, a, seed 1: was interrupted" in (request.out / "table.md").read_text()
 
 
@@ -308,7 +308,7 @@ def test_requests_that_make_no_sense(scene, tmp_path):
         StudyRequest((scene,), {"a": A, "b": B}, 0, tmp_path)
     with pytest.raises(UsageError, match="at least two settings"):
         StudyRequest((scene,), {"a": A}, 2, tmp_path)
-    with pytest.raises(UsageError, match="have one name"):
+    with pytest.raises(UsageError, match="have the same name"):
         StudyRequest((scene, scene), {"a": A, "b": B}, 2, tmp_path)
     with pytest.raises(UsageError, match="name at least one scene"):
         StudyRequest((), {"a": A, "b": B}, 2, tmp_path)

@@ -129,7 +129,7 @@ def test_runs_tell_their_exposures(tmp_path):
 
 def test_views_that_know_their_opacity_have_no_exposure():
     views = [dataclasses.replace(v, alpha=np.ones(v.image.shape[:2], np.float32)) for v in scenes.photos(3)]
-    with pytest.raises(UsageError, match=r"--exposure does not support images with an alpha channel, as 00.png has"):
+    with pytest.raises(UsageError, match=r"--exposure does not support images with an alpha channel, such as 00.png"):
         Trainer(views, scenes.seeds(), FitConfig(steps=4, view_modules=(Exposure(),)), CPU)
 
 

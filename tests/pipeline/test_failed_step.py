@@ -83,7 +83,7 @@ def test_what_is_not_finite_is_counted(tmp_path, capsys):
     assert any(line == "  image: 18 of 3,840 NOT FINITE" for line in lines)
     assert any("photometric: nan" in line for line in lines)
     (tmp_path / "other").write_bytes(b"12345678")
-    for name, what in (("other", "not a failed step"), ("none", "cannot be read")):
+    for name, what in (("other", "not the inputs of a failed step"), ("none", "cannot be read")):
         with pytest.raises(DataError, match=what):
             read_failed_step(tmp_path / name, CPU)
     del bundle[0]["K"]

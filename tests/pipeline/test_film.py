@@ -129,11 +129,11 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     )
     assert 0.02 < plan.coverage < 0.9
     done = render_film(model, plan, tmp_path / "a.webp", FilmSettings())
-    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing, numbers 3 to 4: the path leaves the captured area")
+    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing (frames 3 to 4): the path leaves the captured area")
     assert "--path interpolate" in done.notes[-1] and done.files == [tmp_path / "a.webp"]
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
     done = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())
-    assert "4 of 6 frames are black, numbers 0 to 2 and 5" in done.notes[-1]
+    assert "4 of 6 frames are black (frames 0 to 2 and 5)" in done.notes[-1]
     check = FrameCheck(0.5)
     for alpha in (0.04, 0.06):  # a tenth of what a training view shows is nearly nothing, however much that is
         check.look(np.ones((4, 4, 3)), np.full((4, 4), alpha))
@@ -141,7 +141,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     check = FrameCheck(0.0)
     for i in range(40):
         check.look(np.ones((4, 4, 3)), np.full((4, 4), i % 3))
-    assert "numbers 0, 3, 6, 9, 12 and 9 more" in check.notes("", "")[0]
+    assert "(frames 0, 3, 6, 9, 12 and 9 more)" in check.notes("", "")[0]
 
 
 @pytest.mark.parametrize(

@@ -108,7 +108,7 @@ class KnownPoints:
     widths: np.ndarray
     """Width of a pixel at the depth of each point in the nearest view that saw it [u], shape [N]."""
     pixels: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """For each view, rows, columns and z-depths [u] of the points that it saw, the farthest first; shape [S] each."""
+    """Rows, columns and z-depths [u] of the points that each view saw, the farthest first; shape [S] each."""
 
     @staticmethod
     def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:

@@ -44,7 +44,7 @@ class FitConfig:
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """On a CPU, limit the steps that the number of views sets to the work of two cores in 1 to 20 minutes."""
+    """Limit the steps on a CPU, if the number of views sets them, to the work of two cores in 1 to 20 minutes."""
     seed: int = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"

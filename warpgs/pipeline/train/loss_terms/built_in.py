@@ -34,7 +34,7 @@ class LossConfig:
     1000]; 0 to disable."""
 
     exposure_weight: float = 0.01
-    """With learned exposures: weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
+    """Weight of the squared difference between each learned exposure and the identity, in [0, 1000]."""
 
     def __post_init__(self) -> None:
         for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
