@@ -202,7 +202,8 @@ class Two(ranks.Ranks):
 
 
 @pytest.mark.parametrize(
-    "changed", ["a different version of warpgs", "a different scene", "a different split", "different settings", "a different checkpoint"]
+    "changed",
+    ["a different version of warpgs", "a different scene", "a different split", "different settings", "a different checkpoint"],
 )
 def test_ranks_that_do_not_fit_the_same_are_refused(tmp_path, changed):
     """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""
