@@ -34,7 +34,7 @@ class Engine(Protocol):
         """Start a job; called while fewer than `slots` run."""
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return new events; waits up to this time."""
+        """Return new events, after at most ``seconds`` [s]."""
 
     def close(self) -> None:
         """Stop all jobs. A fit saves its state if it can, and the next farm continues it."""

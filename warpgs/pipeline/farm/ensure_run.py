@@ -33,7 +33,7 @@ class Outcome:
     note: str = ""
     """Note on this run for readers of the study; empty if there is none."""
     error: WarpgsError | None = None
-    """Error that it failed with, if any."""
+    """Error that ended the run, if any."""
 
 
 def _scores(path: Path) -> dict[str, Any] | None:
@@ -78,7 +78,7 @@ def _set_aside(folder: Path) -> Path:
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
-    """Return the scores of a finished run with LPIPS of the weights requested, measured now where they are missing yet."""
+    """Return the scores of a finished run with LPIPS for the requested weights; LPIPS is measured now if it is missing."""
     for found in (metrics, _scores(folder / "eval.json")):
         if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
             return metrics | {k: found[k] for k in ("test", "views", "variants")}
@@ -96,19 +96,19 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the finished run that is requested.
+    """Ensure that a run folder holds the requested run, finished.
 
-    A finished run of the same configuration, code of the user's own, data, views, kind of device and version is kept. A
-    half-finished one is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
+    A finished run with the same configuration, user code, data, views, kind of device and version is kept. An interrupted run
+    is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
 
     Args:
-        request: The fit; ``out`` is its folder, ``resume`` is decided here.
+        request: The fit; ``out`` is its folder, ``resume`` is ignored.
         fingerprint: Fingerprint of the scene's data.
         split: Training and held-out views; None if no existing run can match.
         device: cpu or cuda.
         variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
-        resolved: The settings of ``request`` with those chosen that it leaves open; None where it leaves none open.
-        others: As `fit` takes them: on_step, verbose.
+        resolved: The settings of ``request`` with automatic ones chosen; None if no setting is automatic.
+        others: Further arguments of `fit`: on_step, verbose.
 
     Returns:
         The outcome. It contains the error of this run, if any, so that other runs continue.
@@ -122,7 +122,7 @@ def ensure_run(
 
 
 def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
-    """Return the record of a run folder, or None and why it has none."""
+    """Return the record of a run folder, or None and the reason why there is no record."""
     try:
         return (read_record(folder) if (folder / CONFIG).exists() else None), "not a run folder"
     except DataError as e:

@@ -53,15 +53,15 @@ def run_farm(
 ) -> list[JobStatus]:
     """Run jobs until each is done or has failed.
 
-    A job that is finished and valid is skipped. If the process of a job dies or runs out of memory, the job is started once
-    more after the others, from its checkpoint. A folder of a job is locked while it is worked on here; one that another farm
-    has locked is looked at again later, and its result is taken over.
+    A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more after the
+    others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has locked is checked
+    again later, and its result is used.
 
     Args:
         jobs: The jobs.
         engine: Where they run; it is not closed.
         show: Called with the status of all jobs whenever one changed, and every ``poll`` seconds.
-        poll: Time after which a job that another farm works on is looked at again [s].
+        poll: Time between checks of a job that another farm works on [s].
 
     Returns:
         The status of each job.
@@ -73,7 +73,7 @@ def run_farm(
 
 
 class _Farm:
-    """The jobs of a farm and who holds them."""
+    """The jobs of a farm and the locks of their folders."""
 
     def __init__(self, jobs: list[FarmJob], engine: Engine, show: Callable[[list[JobStatus]], object], poll: float):
         self.all = [JobStatus(job, before=read_record(job.folder)) for job in jobs]
@@ -185,7 +185,7 @@ class _Farm:
 
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
-    """Return the time until all jobs are done [s], by the mean time of those done here; None before the first one is."""
+    """Estimate the time until all jobs are done [s] from the mean time of jobs done by this farm; None before the first."""
     took = [s.seconds for s in statuses if s.state == "done" and s.seconds]
     if not took:
         return None

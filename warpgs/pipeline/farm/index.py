@@ -1,4 +1,4 @@
-"""Results of a farm for people and for tables: index.html and results.csv, from the records of all its jobs."""
+"""Results of a farm: index.html and results.csv, from the records of all its jobs."""
 
 from __future__ import annotations
 

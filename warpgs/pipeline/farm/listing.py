@@ -30,7 +30,7 @@ FARM_FLAGS = (
 
 @dataclass(frozen=True)
 class ListedJob:
-    """A scene to fit, and the flags that it adds to those of all jobs."""
+    """A scene to fit, and the job's flags in addition to those of all jobs."""
 
     name: str
     """Name, unique in the farm; the folder of its results."""
@@ -76,7 +76,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
 
 
 def _named(scenes: list[Path]) -> list[ListedJob]:
-    """Name scenes by their folders, or by the whole path below the folder of all where two folders have one name."""
+    """Name scenes by their folders; if two folders have the same name, by their paths below the common folder."""
     scenes = [Path(os.path.abspath(s)) for s in scenes]
     if len({s.name.casefold() for s in scenes}) == len(scenes):
         return [ListedJob(s.name, s) for s in scenes]
@@ -85,7 +85,7 @@ def _named(scenes: list[Path]) -> list[ListedJob]:
 
 
 def _read(path: Path) -> list[ListedJob]:
-    """Read a file of jobs: ``{"scene": FOLDER}`` a line, with a ``name`` and flags of `warpgs fit` beside it."""
+    """Read a file of jobs: ``{"scene": FOLDER}`` per line, optionally with a ``name`` and flags of `warpgs fit`."""
     try:
         data = read_input(path, schema.MAX_BYTES)
     except OSError as e:
@@ -114,7 +114,7 @@ def _job(values: Any, folder: Path) -> ListedJob:
 
 
 def _flag(key: str, value: Any) -> list[str]:
-    """Return a setting of a line as words of a command line."""
+    """Return a setting of a line as arguments of a command line."""
     name = key.replace("_", "-")
     if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
         raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")

@@ -29,7 +29,7 @@ class Slot:
     threads: int
     """CPU threads."""
     environment: dict[str, str] = field(default_factory=dict)
-    """Variables of its process: the GPU that it sees."""
+    """Environment variables of the slot's process, which select its GPU."""
 
 
 def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
@@ -80,7 +80,7 @@ class _Process:
 
 
 class LocalEngine:
-    """Runs each job in the process of a slot, which serves job after job until one fails or it dies."""
+    """Runs each job in the process of a slot; the process runs job after job until a job fails or the process dies."""
 
     name = "local"
 

@@ -54,7 +54,7 @@ class JobRecord:
     message: str = ""
     """Error of a failed job, or a note on a finished one."""
     again: bool = False
-    """True where a failed job may succeed when it is tried again."""
+    """True if a failed job may succeed when it is repeated."""
     source: str = ""
     """SHA-256 of the scene's file names, sizes and times; empty if unknown."""
     seconds: float = 0.0
@@ -78,7 +78,7 @@ def write_record(folder: Path, record: JobRecord) -> None:
     """Write the record of a job.
 
     Raises:
-        ResourceError: It cannot be written.
+        ResourceError: The record cannot be written.
     """
     write_json(folder / RECORD, asdict(record))
 
@@ -97,7 +97,7 @@ def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits.
 
     Raises:
-        ResourceError: It cannot be read.
+        ResourceError: The file cannot be read.
     """
     try:
         return input_digest(path, path.parent)

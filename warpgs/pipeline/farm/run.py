@@ -19,14 +19,14 @@ from warpgs.runtime.terminal import say
 
 ENGINES = ("local", "ray", "slurm")
 SHOW_INTERVAL = 0.2
-"""Shortest time between two states of the table [s]."""
+"""Shortest time between two updates of the table [s]."""
 INDEX_INTERVAL = 30.0
-"""Time between two writings of the index while jobs run [s]."""
+"""Time between two updates of the index while jobs run [s]."""
 
 
 @dataclass(frozen=True)
 class EngineRequest:
-    """An engine and how many jobs it runs at a time."""
+    """An engine and its number of concurrent jobs."""
 
     engine: str = "local"
     """local (processes of this machine), ray or slurm."""
@@ -49,7 +49,7 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
 
     Raises:
         ResourceError: The device is missing.
-        UsageError: The engine is unknown or not installed, it cannot have so many slots, or other users can write to
+        UsageError: The engine is unknown or not installed, it does not have so many slots, or other users can write to
             ``slurm_folder``.
     """
     r = request
@@ -117,7 +117,7 @@ def check_failures(statuses: list[JobStatus]) -> None:
     """Check that no job failed.
 
     Raises:
-        ResourceError: Some did; the message names them.
+        ResourceError: A job failed; the message names up to five failed jobs.
     """
     failed = [s for s in statuses if s.state == "failed"]
     if failed:

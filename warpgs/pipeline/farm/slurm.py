@@ -1,6 +1,7 @@
-"""The engine for clusters that Slurm runs: a job of Slurm for each scene, by sbatch, squeue and scancel.
+"""The engine for Slurm clusters: a Slurm job for each scene, by sbatch, squeue and scancel.
 
-A job goes to its node as JSON and comes back as one word, both in a private folder. All else is read from the job's record.
+A job is sent to its node as JSON, and its state comes back as one word, both in a private folder. All other results are in the
+job's record.
 """
 
 from __future__ import annotations
@@ -43,13 +44,13 @@ PATIENCE = 60.0
 
 @dataclass
 class _Queued:
-    """A job that Slurm has."""
+    """A job that was handed to Slurm."""
 
     slurm_id: str
     number: int
-    """Number in the names of its files in the private folder."""
+    """Number in the names of the job's files in the private folder."""
     missed: int = 0
-    """Calls of squeue that did not list it."""
+    """Number of calls of squeue that did not list the job."""
 
 
 class SlurmEngine:
@@ -78,7 +79,7 @@ class SlurmEngine:
 
         Raises:
             ResourceError: The private folder cannot be written.
-            UsageError: There is no Slurm here, or other users can write to the folder.
+            UsageError: Slurm is not installed, or other users can write to the folder.
         """
         missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
         if missing:
@@ -162,7 +163,7 @@ class SlurmEngine:
         return Event(name, state)
 
     def _output(self, job: _Queued) -> str:
-        """Return the end of what a job wrote outside its log."""
+        """Return the end of a job's output outside its log."""
         try:
             with (self._folder / f"{job.number}.log").open("rb") as f:
                 f.seek(0, os.SEEK_END)
@@ -182,7 +183,7 @@ class SlurmEngine:
 
 
 def _call(program: str, *options: str, script: str = "") -> ProgramResult:
-    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT hold; those of squeue are dropped, as they would hide jobs."""
+    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply; those of squeue are removed: they could hide jobs."""
     return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
 
 

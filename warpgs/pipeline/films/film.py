@@ -37,7 +37,7 @@ COVERAGE = "coverage"
 
 
 def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
-    """Return the depths of the training views of a model; with their masks where the views themselves are given."""
+    """Return the depths of the training views of a model; masks apply if the views themselves are given."""
     masks = [v.mask for v in views] if isinstance(views, Sequence) else None
     cameras = [v.camera for v in views] if isinstance(views, Sequence) else [model.cameras()[n] for n in model.train]
     return depth_views(model.gaussians(), cameras, options, masks)
@@ -124,7 +124,7 @@ def _frames(
 
 
 def _older_images(folder: Path, files: list[Path]) -> list[str]:
-    """Return notes on images of an earlier film that lie between those of this one."""
+    """Return notes on images of an earlier film in the same folder."""
     older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
     return [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
 
@@ -144,10 +144,10 @@ def render_film(
     Args:
         model: The model.
         plan: The frames.
-        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, which is
-            then all that is written.
+        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, to write
+            only the film.
         settings: Settings of the film.
-        coverage: As in `render_path`; of a folder only.
+        coverage: As in `render_path`; only if ``out`` is a folder.
         sheet: True to also write six frames in one image: sheet.png in the folder, or beside the film.
         tell: Called with a line before each frame is rendered, and before the film is finished.
 

@@ -18,7 +18,7 @@ OUTSIDE = 0.1
 
 
 def _ranges(numbers: list[int]) -> str:
-    """Return rising numbers in words: 3 to 7, 9 and 12 to 20; after five ranges the rest is counted."""
+    """Return ascending numbers as text such as "3 to 7, 9 and 12 to 20"; after five ranges, the number of the others."""
     runs: list[list[int]] = []
     for n in numbers:
         if runs and n == runs[-1][1] + 1:
@@ -47,7 +47,7 @@ class FrameCheck:
     """Number of checked frames."""
 
     def look(self, image: np.ndarray, alpha: np.ndarray, outside: float = 0.0) -> None:
-        """Look at the next frame: image [H, W, 3] and alpha [H, W] in [0, 1], and its fraction outside all photographs."""
+        """Check the next frame: image [H, W, 3] and alpha [H, W] in [0, 1], and its fraction outside all photographs."""
         if float(alpha.mean(dtype=np.float64)) < max(EMPTY * self.coverage, MIN_COVERAGE):
             self.empty.append(self.count)
         elif float(image.max(2).mean(dtype=np.float64)) < BLACK:
@@ -57,7 +57,7 @@ class FrameCheck:
         self.count += 1
 
     def notes(self, remedy: str, nearer: str) -> list[str]:
-        """Return a line for the user on each fault, with what to do; ``nearer`` for frames that show other places too."""
+        """Return a line for the user on each fault, with advice: ``nearer`` on frames outside the photographs, else ``remedy``."""
         return [
             f"{len(numbers)} of {self.count} frames {words} (frames {_ranges(numbers)}): {advice}"
             for numbers, words, advice in (

@@ -75,7 +75,7 @@ class FilmSettings:
             raise UsageError(f"a film must have 1 to {MAX_FRAMES:,} frames, not {self.frames}")
 
     def count(self, seconds: float) -> int:
-        """Return the number of frames of a film that lasts ``seconds`` where no duration is given."""
+        """Return the number of frames of a film; ``seconds`` is its duration if the settings have none."""
         if self.frames is not None:
             return self.frames
         return min(max(1, round((self.seconds or seconds) * self.fps)), MAX_FRAMES)
@@ -101,7 +101,7 @@ class FilmPlan:
 def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[float, float]:
     """Return the median rendered depth [u] over covered pixels and the median alpha of at most five cameras' images.
 
-    The depth is 1 where nothing is covered.
+    The depth is 1 if no pixel is covered.
     """
     depths, alphas = [], []
     for camera in cameras[:: max(1, len(cameras) // 5)]:
@@ -185,7 +185,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
 
 
 def _nearer(cameras: Sequence[Camera], train: Sequence[Camera], path: str) -> str:
-    """Return advice for frames that show places outside the photographs: their shape where the film is wider, else ``path``."""
+    """Return advice for frames that show areas outside the photographs: on size if the film is wider, else ``path``."""
     (wide, high), photo = _field(cameras[0]), [_field(c) for c in train]
     if min(wide, high) > WIDER * min(map(min, photo)) or max(wide, high) > WIDER * max(map(max, photo)):
         return "keep the shape and the field of view of the photographs"

@@ -56,7 +56,7 @@ class Rig:
     """True if the photographs are rotated by a quarter turn, so that an upright film swaps width and height."""
 
     def describe(self) -> str:
-        """Return a phrase on where the cameras are."""
+        """Return a phrase on the positions of the cameras."""
         if self.span is None:
             return f"{NAMES[self.kind]}, from all sides" if self.kind == "ring" else NAMES[self.kind]
         degrees = math.degrees(self.span[1] - self.span[0])
@@ -68,7 +68,7 @@ class Rig:
         return math.cos(elevation) * level + math.sin(elevation) * self.up
 
     def is_watched(self, cameras: list[Camera]) -> bool:
-        """Return whether cameras all look at the point that matters."""
+        """Return whether all cameras look at a common point."""
         to_center = [self.center - c.center for c in cameras]
         cosines = [(d * c.viewmat[2, :3]).sum() / max(math.sqrt((d * d).sum()), 1e-12) for c, d in zip(cameras, to_center)]
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
@@ -85,10 +85,10 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _plane_normal(points: np.ndarray) -> np.ndarray | None:
-    """Return the unit normal [3] of the plane that points [N, 3] lie in; None where they fill space or lie on a line.
+    """Return the unit normal [3] of the plane of points [N, 3]; None if the points fill space or lie on a line.
 
-    The eigenvector of the smallest eigenvalue of their covariance, by squaring its inverse, without LAPACK (see
-    `warpgs.geometry.matmul`).
+    The normal is the eigenvector of the smallest eigenvalue of their covariance, computed by squaring the inverse, without
+    LAPACK (see `warpgs.geometry.matmul`).
     """
     offsets = points - points.mean(0)
     covariance = (offsets[:, :, None] * offsets[:, None, :]).mean(0)
@@ -109,8 +109,8 @@ def _plane_normal(points: np.ndarray) -> np.ndarray | None:
 def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the upward direction [3] of a film, and whether the photographs lie on their side.
 
-    Cameras on a level circle name it by the plane they stand in, which a turned photograph does not change; else it is the
-    mean of the cameras' own upward directions.
+    For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. Else
+    it is the mean of the cameras' own upward directions.
     """
     rights, ups, forwards = (sign * np.array([c.viewmat[i, :3] for c in cameras]) for i, sign in ((0, 1), (1, -1), (2, 1)))
     centers = np.array([c.center for c in cameras])
@@ -175,8 +175,8 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
 def rig_of(cameras: list[Camera], depth: float) -> Rig:
     """Return the arrangement of cameras around their subject.
 
-    Cameras whose optical axes meet stand around the point nearest to all axes, unless they see it from one side. Then, and
-    where axes are nearly parallel, the point is ``depth`` in front of their mean centre.
+    If the optical axes meet, the subject is the point nearest to all axes. If the cameras see it from one side, or the axes are
+    nearly parallel, the subject is ``depth`` in front of their mean centre.
 
     Args:
         cameras: Training cameras, at least one.

@@ -1,4 +1,4 @@
-"""Scores of a model on images it has not seen: PSNR, SSIM in two variants, LPIPS, and baselines without a fit."""
+"""Scores of a model on held-out images: PSNR, SSIM in two variants, LPIPS, and baselines without a fit."""
 
 from __future__ import annotations
 
@@ -89,8 +89,8 @@ def _opacity_scores(
 def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
     """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view.
 
-    With a mask the recipe is that of DTU's protocol (Niemeyer et al. 2022 and all since): PSNR over the mask's pixels alone,
-    SSIM and LPIPS on both images with white outside of it.
+    Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
+    LPIPS on both images with white outside the mask.
     """
     from skimage.metrics import structural_similarity
 
@@ -147,8 +147,8 @@ def evaluate(
 def baselines(train: list[View], test: list[View]) -> dict[str, float]:
     """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats.
 
-    ``mean_photo``: the mean of the training images; ``nearest_photo``: the training image taken from nearest by. Images of
-    another size than the test view's are left out; a baseline that no view allows is left out too.
+    ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
+    images whose size differs from the test view's are left out, and so is a baseline without any score.
     """
     scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
     for view in test:

@@ -47,7 +47,7 @@ class Lpips:
 
     @torch.no_grad()
     def distance(self, image: np.ndarray, target: np.ndarray, mode: str) -> float:
-        """Return LPIPS of two images [H, W, 3] in [0, 1]: 0 for equal ones; NaN where they are too small for the network."""
+        """Return LPIPS of two images [H, W, 3] in [0, 1]: 0 for equal images; NaN if they are too small for the network."""
         if min(image.shape[:2]) < self.net.smallest:
             return math.nan
         device = self.tensors["lin0.model.1.weight"].device

@@ -131,7 +131,7 @@ def _mapped(file: BinaryIO) -> str | BinaryIO:
 
 
 def _check_unpacked(file: BinaryIO) -> None:
-    """Check that an archive unpacks to no more than its own size, for torch packs nothing, and has no large pickle.
+    """Check that an archive has no large pickle and unpacks to no more than its own size, since torch does not compress.
 
     Raises:
         ValueError: The archive unpacks to more, or has a large pickle.
@@ -173,7 +173,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
         Lines for the user: the written file, and whether a source differs from the published one.
 
     Raises:
-        DataError: A source is missing, no state dict, of another network, or not finite.
+        DataError: A source is missing, is not a state dict, belongs to another network, or is not finite.
         ResourceError: The file cannot be written.
         UsageError: ``out`` exists.
     """

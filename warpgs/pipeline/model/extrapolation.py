@@ -1,7 +1,7 @@
 """Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
 
-Between few cameras, renders show much that no photograph shows. The points extrapolate into these areas: colour and depth of an
-image's border outwards, and a far surface a little behind the near one that occludes it
+With few cameras, renders of other views show large areas that no photograph shows. The points extrapolate into these areas: colour
+and depth of an image's border continue outwards, and a far surface continues a little behind the near one that occludes it
 (docs/decisions/026-extrapolated-points.md).
 """
 
@@ -76,11 +76,11 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
 
 
 def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequence[np.ndarray]) -> PointCloud:
-    """Return points of far surfaces behind near ones in view ``i``; none lies before confirmed depth of another view.
+    """Return points of far surfaces behind near ones in view ``i``; none occludes confirmed depth of another view.
 
     Args:
         views: All views.
-        i: Number of the view.
+        i: Index of the view.
         depth: Its z-depth [u], known everywhere, shape [H, W].
         confirmed: Consistent depth of each view, 0 where there is none, shape [H, W] each.
     """

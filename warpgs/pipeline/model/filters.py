@@ -46,7 +46,7 @@ class Box:
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Return finite numbers of a shape; UsageError if ``value`` is not that."""
+    """Return finite numbers of a shape; UsageError if ``value`` is anything else."""
     try:
         array = np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -60,8 +60,8 @@ def box_of(text: str) -> Box:
     """Return the box of a user's text.
 
     Args:
-        text: JSON with center, size and perhaps rotation; the name of a .json file that holds it; or six numbers with commas:
-            the least x, y, z and the largest.
+        text: JSON with center, size and optionally rotation; the name of a .json file with this JSON; or six numbers separated
+            by commas: the least x, y, z and the largest x, y, z.
 
     Raises:
         DataError: The file cannot be read, or holds something else.
@@ -90,7 +90,7 @@ def box_of(text: str) -> Box:
 
 
 def _box_of_file(path: Path) -> Box:
-    """Return the box of a JSON file, such as the viewer saves; DataError where it holds none."""
+    """Return the box of a JSON file, as the viewer saves it; DataError if the file has no box."""
     try:
         text = read_input(path, MAX_BOX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
@@ -110,7 +110,7 @@ def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
 
 
 def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
-    """Return whether each mean is in a box, bool [N]; both in the same units."""
+    """Return whether each mean is in a box, bool [N]; box and Gaussians are in the same units."""
     offsets = gaussians.means.double() - torch.tensor(box.center, dtype=torch.float64, device=gaussians.means.device)
     directions = np.array(box.rotation).T
     out = torch.ones(len(gaussians), dtype=torch.bool, device=offsets.device)
@@ -162,7 +162,7 @@ def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
     """Return the matrix that turns coefficients with the scene, float64 [25, 25] (Wigner's D for degrees 0 to 4, real).
 
-    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), which a product rule of 50 points takes exactly.
+    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), exact by a product rule of 50 points.
 
     Args:
         rotation: The rotation, shape [3, 3].
@@ -180,11 +180,11 @@ def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
 
 
 def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
-    """Return Gaussians turned about the origin: means, shapes and the directions that colours depend on.
+    """Return Gaussians rotated about the origin: means, shapes and the directions that colours depend on.
 
     Args:
         gaussians: N Gaussians.
-        rotation: New axes from old ones, shape [3, 3], determinant 1.
+        rotation: Rotation matrix, new from old coordinates, shape [3, 3].
     """
     like = {"dtype": torch.float64, "device": gaussians.means.device}
     turn = torch.tensor(np.asarray(rotation), **like)
@@ -205,7 +205,7 @@ def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation [3, 3] by an angle [rad] about an axis [3] of any length (Rodrigues).
 
     Raises:
-        UsageError: The axis has no length.
+        UsageError: The axis has length 0, or a number is not finite.
     """
     length = math.sqrt(float((np.asarray(axis) ** 2).sum()))
     if not (math.isfinite(length) and length > 0 and math.isfinite(angle)):

@@ -1,6 +1,6 @@
 """The visual hull: the largest object that explains all silhouettes (Laurentini 1994), carved from an octree.
 
-Where views stand far apart a sweep finds little, but the opacity of each view says which space is empty.
+If views are far apart, a sweep finds few depths, but the alpha channel of each view shows which space is empty.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Silhouette:
     """The opaque pixels of a view, and their number in any rectangle."""
 
     def __init__(self, view: View):
-        """Sum up the pixels: those of `fitted_region`, all where a view has no such region."""
+        """Sum up the pixels of `fitted_region`, or all pixels if a view has no such region."""
         region, _ = fitted_region(view)
         opaque = np.ones(view.image.shape[:2], bool) if region is None else region
         self.view, self.size = view, np.array([view.camera.width, view.camera.height])
@@ -79,7 +79,7 @@ def silhouettes(views: Sequence[View]) -> list[Silhouette]:
 
 
 def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndarray:
-    """Return a mask [N], True if a point [N, 3] is at least `MARGIN` px from opaque pixels in more views than may err."""
+    """Return a mask [N]: points [N, 3] at least `MARGIN` px from opaque pixels in more views than `TOLERANT` allows."""
     votes = sum((s.look(points, 0.0, MARGIN)[0].astype(int) for s in shapes), np.zeros(len(points), int))
     return votes > len(shapes) // TOLERANT
 
@@ -87,8 +87,8 @@ def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndar
 def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     """Return the centres [N, 3] [u] of the finest cells on the surface of the hull, and their width [u].
 
-    A cell is empty if more views than may err show nothing there, and inside if all views that see it show only the object.
-    Other cells are divided, until cells are `FINEST` px wide in the views, or as many as `PROJECTIONS` allows.
+    A cell is empty if more views than `TOLERANT` allows show nothing there, and inside if all views that see it show only the
+    object. Other cells are divided until they are `FINEST` px wide in the views, or `PROJECTIONS` is reached.
 
     Args:
         shapes: At least two silhouettes.
@@ -131,8 +131,8 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean colours [N, 3] of cells of that width [u] where they are seen, and the cells that are kept, bool [N].
 
-    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in similar colours; the
-    others may be empty parts of the hull.
+    A cell is kept if at least `LEAST_VIEWS` views see it at an opaque pixel, unoccluded by other cells, and in similar colours;
+    other cells may be empty parts of the hull.
     """
     total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
     for shape in shapes:
@@ -158,10 +158,10 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
 
     Args:
         views: Training views; those with an alpha channel carve.
-        merge_px: Width of the cells in which points become one [px]; 0 keeps one for every pixel.
+        merge_px: Width of the cells in which points are merged into one [px]; 0 merges none.
 
     Returns:
-        The cloud, empty where fewer than two views have an alpha channel or nothing is in all of them.
+        The cloud, empty if fewer than two views have an alpha channel or the silhouettes do not overlap.
     """
     shapes = silhouettes(views)
     nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))

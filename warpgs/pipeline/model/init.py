@@ -1,4 +1,4 @@
-"""The first Gaussians: from depths that views confirm, from the reconstruction's points, or at random."""
+"""The initial Gaussians: from depths that views confirm, from the reconstruction's points, from a visual hull, or at random."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ MIN_POINTS = 100
 
 @dataclass(frozen=True)
 class InitConfig:
-    """Source and first values of the Gaussians."""
+    """Source and initial values of the Gaussians."""
 
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
@@ -87,7 +87,7 @@ class InitConfig:
         """Return the settings of depth from flow.
 
         Raises:
-            UsageError: One of them is out of range.
+            UsageError: A setting is out of range.
         """
         return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
 
@@ -135,7 +135,7 @@ def consistent_points(
 ) -> Start:  # fmt: skip
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
-    With fewer than `MIN_POINTS` such points the start is random, with a note.
+    If fewer than `MIN_POINTS` points are found, the start is random, with a note.
     """
     reason, depths, given, source = "depth needs at least two views", None, [], config.source
     if len(views) > 1:
@@ -168,7 +168,7 @@ def _number_extrapolated(views: list[View], count: int) -> str:
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
     """Return the reconstruction's points that two of the views saw, or the only view; none without a reconstruction.
 
-    A point that only one of them saw was triangulated with held-out views.
+    A point that only one of several views saw was triangulated with held-out views.
     """
     return NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
 
@@ -179,7 +179,7 @@ def sweeps(config: InitConfig, views: int) -> bool:
 
 
 def extrapolates(config: InitConfig, views: list[View]) -> bool:
-    """Return whether the start of a fit of these views has extrapolated points, where it finds depth."""
+    """Return whether the start of a fit of these views has extrapolated points, if it finds depth."""
     if not config.extrapolate or len(views) < 2:
         return False
     searches = config.source == "flow" or sweeps(config, len(views)) or (config.source == "auto" and any_given(views))
@@ -190,7 +190,7 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
     """Check that a start from points has points that the training views saw.
 
     Raises:
-        DataError: There are none, and ``config`` needs them.
+        DataError: The training views saw no points, and ``config`` needs them.
     """
     if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
@@ -202,7 +202,7 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
 def on_object(start: Start, views: list[View]) -> Start:
     """Return the start without points that are empty in a view with an alpha channel.
 
-    If fewer than `MIN_POINTS` are left, it is unchanged.
+    If fewer than `MIN_POINTS` points would be left, the start is unchanged.
     """
     shapes = silhouettes(views)
     if not shapes:
@@ -247,7 +247,7 @@ def _found_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
     device: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
-    """Return the points of any source but the hull."""
+    """Return the points of a source other than the hull."""
     usable = seen_points(views, points)
     if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
         return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
@@ -262,7 +262,7 @@ def _found_points(
 
 
 def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
-    """Return the start with at most that many points, sampled at random; their Gaussians are wider, since they are sparser."""
+    """Return the start with at most ``most`` points, sampled at random; sparser points get wider Gaussians."""
     count = len(start.cloud)
     if count <= most:
         return start
@@ -273,7 +273,7 @@ def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
 
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
-    """Return the size of the scene [u]: that of the camera set, or a tenth of the cloud's if all cameras are in one place."""
+    """Return the size of the scene [u]: that of the camera set, or a tenth of the cloud's size if all cameras coincide."""
     extent = geometry.camera_extent(cameras)
     spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
@@ -288,7 +288,7 @@ def initial_gaussians(
         cloud: At least one point.
         config: Opacity, and the factor of the widths.
         sh_degree: Degree of the spherical harmonics, 0 to 4.
-        extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
+        extent: Size of the scene [u]; widths are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
         device: Device of the tensors, float32.
         extrapolated: Number of points, the last ones, that start with `EXTRAPOLATED_OPACITY`.
 

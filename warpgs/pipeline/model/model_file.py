@@ -151,7 +151,7 @@ def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussi
         where: Path of their file, for messages.
 
     Raises:
-        DataError: One is missing or not finite, or their shapes or types do not go together.
+        DataError: A tensor is missing or not finite, or shapes or types do not match.
     """
     names = Gaussians.__dataclass_fields__
     missing = [n for n in names if n not in tensors]

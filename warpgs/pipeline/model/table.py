@@ -1,7 +1,7 @@
-"""One table of what training learns: parameters, their Adam moments and named columns, one row each.
+"""A table of learned values: parameters, their Adam moments and named columns, one row per Gaussian or view.
 
-A fit has a table of Gaussians. A second one, of its training views, has a row a view; it is empty unless view modules ask for
-parameters of each view.
+A fit has a table of Gaussians. A second table has a row for each training view; it has no parameters unless view modules learn
+some.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Table:
         return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
 
     def growth_bytes(self, before: int, after: int) -> int:
-        """Return the bytes needed to add rows: the new rows, one tensor before and after, and numbers of rows and parents."""
+        """Return the bytes needed to add rows: the new rows, one tensor before and after, and indices of rows and parents."""
         added = min(2 * (after - before), after)  # a split replaces one row by two
         largest = max(t.element_size() * t[0].numel() for t in self.params.values())
         return self.row_bytes * added + largest * (before + after) + 8 * after
@@ -120,7 +120,7 @@ class Table:
         Args:
             lrs: Learning rate of each parameter, for steps of one view.
             step: Number of the step, from 1.
-            head_lrs: Learning rate of the first 3 numbers of each row, for parameters with a different one.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters whose first numbers have their own.
         """
         row, factor = [], math.sqrt(self.batch)
         for name in self.params:
@@ -139,8 +139,8 @@ class Table:
             gradients: Gradients of all or some parameters by name.
             lrs: A row of `lr_row`, float32, shape [3 P].
             skip: 0, or the reason for skipping the step, int32, shape [1].
-            factors: Fraction of its step that each mean takes, shape [N]; None for 1. It scales the step, because Adam's step
-                does not depend on the scale of the gradient. All rows are updated then.
+            factors: Factor of the step of each mean, shape [N]; None for 1. Steps are scaled, not gradients, because Adam's
+                step does not depend on the scale of the gradient. With factors, all rows are updated.
             rows: Rows to update.
         """
         before = None if factors is None else self.params["means"].detach().clone()
