@@ -57,7 +57,7 @@ class FrameCheck:
         self.count += 1
 
     def notes(self, remedy: str, nearer: str) -> list[str]:
-        """Return a line for the user on each fault, with advice: ``nearer`` on frames outside the photographs, else ``remedy``."""
+        """Return a line for the user on each fault, with advice: ``nearer`` for frames outside photographs, else ``remedy``."""
         return [
             f"{len(numbers)} of {self.count} frames {words} (frames {_ranges(numbers)}): {advice}"
             for numbers, words, advice in (

@@ -147,7 +147,8 @@ def merge_neighbours(
         kinds: Only Gaussians of the same number are paired, int, shape [N].
         view_set: Training views.
         accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent. The fraction
-            grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last of the round before.
+            grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last of the round
+            before.
     """
     idle = 0
     for number in range(PASSES):

@@ -49,8 +49,8 @@ def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOption
     """Estimate the change of the images when a Gaussian moves by its own width or its axes grow.
 
     The result is the trace of PUP-3DGS' sensitivity (arXiv 2406.10219, eq. 6: the sum over pixels of the outer product of the
-    gradient of the colour in mean and scale), in units of the Gaussian's width; PUP uses the log-determinant instead. With random
-    signs e as the gradient of an image, the backward pass gives J^T e; the mean of its square is the diagonal of J^T J.
+    gradient of the colour in mean and scale), in units of the Gaussian's width; PUP uses the log-determinant instead. With
+    random signs e as the gradient of an image, the backward pass gives J^T e; the mean of its square is the diagonal of J^T J.
 
     Args:
         gaussians: N Gaussians.

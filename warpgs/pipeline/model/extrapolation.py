@@ -1,8 +1,8 @@
 """Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
 
-With few cameras, renders of other views show large areas that no photograph shows. The points extrapolate into these areas: colour
-and depth of an image's border continue outwards, and a far surface continues a little behind the near one that occludes it
-(docs/decisions/026-extrapolated-points.md).
+With few cameras, renders of other views show large areas that no photograph shows. The points extrapolate into these areas:
+colour and depth of an image's border continue outwards, and a far surface continues a little behind the near one that occludes
+it (docs/decisions/026-extrapolated-points.md).
 """
 
 from __future__ import annotations

@@ -132,8 +132,8 @@ class TrainingCameras(NamedTuple):
 def _camera_row(camera: Camera) -> np.ndarray:
     """Return a camera as `pixel_size` takes it, shape [9]; its cone holds eight points of the border of the image.
 
-    If a lens does not reach one of these points, the cone is all that the model can see. For a model without centre, pixels have
-    size 0 and limit nothing.
+    If a lens does not reach one of these points, the cone is all that the model can see. For a model without centre, pixels
+    have size 0 and limit nothing.
     """
     f, center = np.array([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
     ends = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
@@ -184,11 +184,11 @@ def shape_figures(
         cameras: Training cameras, at least one.
 
     Returns:
-        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], absolute, over the radius and over the extent, and
-        the largest ratio to the distance of the nearest camera, of those that `camera_centers` chooses; ``needles``, the fraction
-        of Gaussians whose longest axis is more than `NEEDLE` times the middle one; ``needles_by_opacity``, the same weighted by
-        opacity; ``thin``, the fraction whose longest axis is more than `NEEDLE` times the shortest; and the number of Gaussians
-        ``beyond`` the limits.
+        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], absolute, over the radius and over the extent,
+        and the largest ratio to the distance of the nearest camera, of those that `camera_centers` chooses; ``needles``, the
+        fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one; ``needles_by_opacity``, the same
+        weighted by opacity; ``thin``, the fraction whose longest axis is more than `NEEDLE` times the shortest; and the number
+        of Gaussians ``beyond`` the limits.
     """
     scales = gaussians.log_scales.detach().cpu().double()
     longest, middle = long_axes(scales)

@@ -29,8 +29,7 @@ def check_batched(
         resume: Whether a run is continued.
 
     Raises:
-        UsageError: A step has fewer views than there are processes, or each process would choose settings or find poses of its
-            own.
+        UsageError: A step has fewer views than processes, or each process would choose its own settings or find its own poses.
     """
     check_ranks(config.batch, ranks)
     if ranks.count == 1:
@@ -56,7 +55,7 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
         ranks: The processes.
 
     Raises:
-        UsageError: One of them differs from the first, in every process.
+        UsageError: A process differs from the first one; raised in every process.
     """
     if ranks.count == 1:
         return

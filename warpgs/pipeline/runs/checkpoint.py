@@ -32,7 +32,7 @@ DTYPES = {
 
 
 def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
-    """Return a safetensors file in pieces; those of tensors on the CPU are their own memory, so nothing is held twice."""
+    """Return a safetensors file in pieces; pieces of CPU tensors share their memory, so nothing is copied."""
     ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
     parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
     header: dict[str, Any] = {"__metadata__": metadata}
@@ -46,9 +46,9 @@ def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
-    """Write one checkpoint, replacing the last one only once the new one is complete on disk.
+    """Write a checkpoint; it replaces the last one only once it is complete on disk.
 
-    ``state`` travels in the header of the same file, so tensors and state can never be of two different steps.
+    ``state`` is stored in the header of the same file, so tensors and state always belong to the same step.
 
     Args:
         folder: The run folder.

@@ -72,14 +72,14 @@ def evaluate(
 ) -> list[str]:
     """Score a run on its held-out views and render them again; returns lines for the user.
 
-    The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
+    The scores are written to eval.json; metrics.json, which the fit wrote, is not changed.
 
     Args:
         folder: The run folder.
         device_name: auto, cpu or cuda.
         lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
-        by_coverage: Whether to split the scores by how many training views saw what a pixel shows.
+        by_coverage: Whether to split the scores by the number of training views that saw each pixel's point.
 
     Raises:
         DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the file of
@@ -127,12 +127,13 @@ def render(
     """Render a run or a file of Gaussians along a path to PNG files and a film, or only to a film; returns lines for the user.
 
     Args:
-        folder: The run folder; or the file, where ``file_of`` is given.
+        folder: The run folder; or the file, if ``file_of`` is given.
         path: One of `PATHS`, or a JSON file of keyframes.
         out: Folder or film to write; None for `path-PATH` in the run folder, or beside the file.
-        settings: Settings of the film; their background is not looked at.
+        settings: Settings of the film; their background is ignored.
         device_name: auto, cpu or cuda.
-        background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
+        background: Colour behind the scene; auto for that of the fit, and for transparent images if the scene's images have an
+            alpha channel.
         coverage: True to also write images of the coverage by training views.
         sheet: Whether to write six frames in one image, too.
         file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.

@@ -50,7 +50,7 @@ def filtered(
         cleaned: Default for cleaning.
 
     Returns:
-        The Gaussians that are left, the rotation [3, 3] that turned them (None for none), and lines for the user.
+        The remaining Gaussians, their rotation [3, 3] (None for no rotation), and lines for the user.
 
     Raises:
         UsageError: A filter is invalid, or needs the cameras of a run.
@@ -97,7 +97,7 @@ def _maxima(stored: StoredRun) -> torch.Tensor:
 
 
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
-    """Return the rotation [3, 3] of a user's text, None for none.
+    """Return the rotation [3, 3] of a user's text; None for no rotation.
 
     Args:
         wish: Axis and angle as x,y,z,degrees; level; or None.
@@ -129,7 +129,7 @@ def turned_line(rotation: np.ndarray) -> str:
 
 
 def rotate_camera(camera: Camera, rotation: np.ndarray) -> Camera:
-    """Return a camera turned about the origin with its scene by a rotation [3, 3]; both in the same units, numpy arrays."""
+    """Return a camera after a rotation [3, 3] of the scene about the origin; numpy arrays."""
     viewmat = np.array(camera.viewmat, np.float64)
     viewmat[:3, :3] = matmul(viewmat[:3, :3], rotation.T)
     return replace(camera, viewmat=viewmat)

@@ -1,4 +1,4 @@
-"""The step with a non-finite loss, in one small file: enough to compute that loss again without the scene."""
+"""The step with a non-finite loss, in one small file, from which the loss can be computed again without the scene."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
 
     Args:
         trainer: The fit, in the state before the step.
-        view: Number of the step's view.
-        name: Its name.
-        slot: Its number among the views of the step.
+        view: Index of the step's view.
+        name: Name of the view.
+        slot: Index of the view among those of the step.
     """
     number = trainer.step + 1
     plan = trainer.plan_of(number)
@@ -71,7 +71,7 @@ def save_failed_step(path: Path, bundle: Bundle) -> None:
 
 
 def read_failed_step(path: Path, device: torch.device) -> Bundle:
-    """Read what `save_failed_step` wrote, tensors of shape [...] on a device.
+    """Read a file of `save_failed_step`; tensors, of shape [...], are on ``device``.
 
     Raises:
         DataError: The file is missing or not a failed step.
@@ -116,10 +116,9 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
 
 
 def findings(bundle: Bundle) -> list[str]:
-    """Compute a failed step again; returns a line for everything that it reads and computes, and whether that is finite.
+    """Compute a failed step again; returns a line for every input and result, with its range or its non-finite values.
 
-    Terms of the loss from outside warpgs are computed where their modules are loaded. The strategy's terms of the loss are not
-    computed.
+    User-defined loss terms are computed if their modules are loaded. The strategy's loss terms are not computed.
 
     Raises:
         DataError: A tensor or a value is missing or of another shape.
@@ -146,7 +145,7 @@ def findings(bundle: Bundle) -> list[str]:
 
 
 def _state(values: torch.Tensor) -> str:
-    """Describe numbers: their range, or how many are not finite."""
+    """Describe values: their range, or the number of non-finite ones."""
     values = values.detach()
     if not values.numel():
         return "empty"

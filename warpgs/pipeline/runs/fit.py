@@ -164,7 +164,7 @@ def fit(
 def _opened(
     out: Path | None, resume: bool, verbose: bool | Literal["progress"]
 ) -> Iterator[tuple[list[str], Callable[[str], object], list[float]]]:
-    """Hold the run folder; yields notes on it, the function that shows progress, and seconds spent on compiling."""
+    """Lock the run folder; yields notes on it, the function that shows progress, and the time spent on compiling [s]."""
     nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     folder = nothing if out is None else run_folder(out, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
@@ -173,7 +173,7 @@ def _opened(
 
 
 def _settle(job: FitJob, time_budget: float | None) -> None:
-    """Put the scene over its background, and choose the settings that are left open."""
+    """Composite the scene over its background, and choose the automatic settings."""
     if time_budget is not None:
         job.config, note = within_budget(job.config, time_budget, job.train, job.device)
         job.notes.append(note)
@@ -187,7 +187,7 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
-    """Run `fit` for the command line, a study or a farm; ``others`` are its on_model, on_step and ranks.
+    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`.
 
     Raises:
         KeyboardInterrupt: A signal ended the fit; the message explains how to continue.
@@ -211,7 +211,7 @@ def _scene_of(
     device: str,
     progress: Callable[[str], object],
 ) -> tuple[SceneRequest, Scene, Split, list[str]]:
-    """Read and split a scene that is given in one of four ways; its notes come last."""
+    """Read and split a scene that is given in one of four ways; returns it, the split and notes."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
         return SceneRequest("", spec, 1).with_scale(device), scene, split, [*scene.notes, *notes]
@@ -249,7 +249,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
 
 
 def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
-    """Take the steps, score the model, and write the run folder where there is one."""
+    """Take the steps, score the model, and write the run folder, if any."""
     if job.out is not None and not resume:
         write_json(job.out / CONFIG, record)
     if state is not None:

@@ -1,4 +1,4 @@
-"""Run folders: what config.json records, the format it is in, and reading a run back."""
+"""Run folders: contents and format of config.json, and reading of runs."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ POSED_SCENE = "scene"
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of everything that a result depends on, by name."""
+    """Return the versions of all software that a result depends on, by name."""
     names = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "scikit-image", "safetensors")
     found = {"warpgs": __version__, "python": platform.python_version(), "system": platform.platform(terse=True)}
     for name in names:
@@ -55,14 +55,14 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
-    """Hold a run folder for a fit: a new or an empty one, or one with a run to continue; yields notes for the user.
+    """Lock a run folder for a fit: a new or empty one, or one with a run to continue; yields notes for the user.
 
-    One that holds found poses alone, as a fit leaves it that ended before its first step, is taken in both cases.
+    A folder with found poses only, from a fit that ended before its first step, is accepted in both cases.
 
     Raises:
         FolderHeldError: Another process writes into the folder.
-        ResourceError: It cannot be written.
-        UsageError: The folder holds something already, or no run to continue.
+        ResourceError: The folder cannot be written.
+        UsageError: The folder is not empty, or has no run to continue.
     """
     _check_folder(out, resume)
     with hold_folder(out, *IMAGE_FOLDERS) as notes:
@@ -71,7 +71,7 @@ def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
 
 
 def _check_folder(out: Path, resume: bool) -> None:
-    """Raise a UsageError for a folder that holds no run to continue, or that must be new and is not."""
+    """Raise a UsageError if a folder has no run to continue, or must be new but is not."""
     try:
         if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
             return
@@ -91,7 +91,7 @@ def camera_values(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any]) -> Camera:
-    """Return the camera of values that `camera_values` made; UsageError where its model is missing."""
+    """Return the camera from the result of `camera_values`; UsageError if its camera model is missing."""
     arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
     camera = Camera(**(values | arrays))
     check_camera(camera)
@@ -99,7 +99,7 @@ def _camera(values: dict[str, Any]) -> Camera:
 
 
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
-    """Return cameras by name that a file holds; DataError where a model is missing."""
+    """Return the cameras of a file by name; DataError if a camera model is missing."""
     try:
         return {n: _camera(c) for n, c in stored.items()}
     except UsageError as e:
@@ -124,11 +124,11 @@ def record_of(
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read config.json of a run folder, its format first.
+    """Read config.json of a run folder; its format is checked first.
 
     Raises:
-        DataError: The folder is not a run, its record is incomplete, or another version of warpgs wrote it in a format that
-            this one does not read; the message names that version and the remedy.
+        DataError: The folder is not a run, its record is incomplete, or another version of warpgs wrote it in an unsupported
+            format; the message names that version and the fix.
     """
     path = folder / CONFIG
     try:
@@ -157,10 +157,10 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Check that a continued run is the same run: same data, views, settings and kind of device.
+    """Check that a continued run has the same data, views, settings, user code and kind of device as before.
 
     Raises:
-        UsageError: It is another, or code of the user's own is not named again.
+        UsageError: The run differs, or its user code is not named again.
     """
     if "pruned" in stored:
         raise UsageError(
@@ -195,7 +195,7 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
     """Check that a checkpoint belongs to the fit of its config.json: same settings, data and training views.
 
     Raises:
-        DataError: It is of another.
+        DataError: The checkpoint belongs to another fit.
     """
     for key in ("config", "fingerprint", "train"):
         found, wanted = plain(state.get(key)), stored.get(key)
@@ -209,7 +209,7 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
 
 
 def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
-    """Raise a UsageError where a run used code from outside warpgs that is not named again."""
+    """Raise a UsageError if a run used code from outside warpgs that is not named again."""
 
     def outside(config: dict[str, Any]) -> dict[str, list[str]]:
         names = {"--strategy": [config.get("strategy")]}
@@ -273,7 +273,7 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
 
 
 def stored_request(folder: Path) -> FitRequest:
-    """Return the request that continues a run, with everything as the run was started.
+    """Return the request that continues a run, with the scene and all settings that the run was started with.
 
     Raises:
         DataError: The folder is not a run, its settings are invalid, or its scene was passed from Python.
@@ -322,7 +322,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
 
 
 def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Path) -> tuple[Gaussians, int]:
-    """Return the Gaussians of a checkpoint and the number of steps done; DataError where the two are not in it."""
+    """Return the Gaussians of a checkpoint and the number of steps done; DataError if either is missing."""
     try:
         MODEL_STATE(state, "")
     except schema.SchemaError as e:

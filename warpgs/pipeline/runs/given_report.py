@@ -1,4 +1,4 @@
-"""Rendered depth and normals of training views beside those that were given, in figures for metrics.json and the report."""
+"""Comparison of rendered with given depth and normals of training views, for metrics.json and the report."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ def given_figures(
 
     Args:
         train: The views to fit.
-        views: The same with the maps of the loss terms.
+        views: The same views, with the maps of the loss terms.
         gaussians: The fitted model.
-        options: Settings of its renders.
+        options: Options for rendering it.
 
     Returns:
-        By ``depth`` and ``normals``, each only where a loss term compared it: ``views`` with name, fraction of the pixels with
-        a map and median difference (relative, and in degrees), NaN where nothing was rendered; and ``summary``.
+        For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a
+        given value, and median difference (relative for depth, in degrees for normals; NaN without rendered pixels); and
+        ``summary``.
     """
     rows: dict[str, list[dict[str, Any]]] = {"depth": [], "normals": []}
     for view, mapped in zip(train, views, strict=True):

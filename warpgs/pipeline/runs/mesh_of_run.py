@@ -68,7 +68,7 @@ def mesh(
 
 
 def _lines(found: FusedMesh, views: int) -> list[str]:
-    """Return the size of a mesh as a line for the user."""
+    """Return lines for the user on the size and the coverage of a mesh."""
     mesh, lines = found.mesh, []
     lines.append(
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; "

@@ -1,4 +1,4 @@
-"""Files of Gaussians, trained anywhere, with cameras from another file: models that render as runs do."""
+"""Files of Gaussians, trained with any program, with cameras from another file: models that render like runs."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ def open_file(
     device: str = "auto",
     antialiased: bool = False,
 ) -> tuple[FittedModel, list[str]]:
-    """Read a file of Gaussians and the cameras that it is seen through; returns the model and notes for the user.
+    """Read a file of Gaussians and a file of cameras; returns the model and notes for the user.
 
     Args:
         path: The file, in any format of `warpgs.export.formats`.
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
-        rule: Name of the cut-offs that it was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
+        rule: Name of the cut-offs of its training: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
         antialiased: True for a model that was trained with `RasterizeOptions.antialiased`, if its file does not declare it.
 
     Raises:
-        DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
+        DataError: The model or the cameras cannot be read, or an image would be larger than the limit for photographs.
         ResourceError: The device is missing.
         UsageError: No cameras are given, or the rule is unknown.
     """

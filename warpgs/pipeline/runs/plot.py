@@ -1,4 +1,4 @@
-"""Plots of a run: its cameras among its Gaussians or start points, in their colours or by how many views saw them."""
+"""Plots of a run: its cameras with its Gaussians or initial points, in their own colours or coloured by coverage."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PlotSettings:
     size: tuple[int, int] = (1600, 1000)
     """Width and height [px]."""
     cameras: bool = True
-    """True where cameras are shown."""
+    """True to show cameras."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work.
@@ -95,7 +95,7 @@ def _start(stored: StoredRun) -> tuple[np.ndarray, np.ndarray, None]:
 
 
 def _eye(rig: Rig) -> np.ndarray:
-    """Return the direction [3] from the scene to the eye: aslant from above, behind cameras that look to one side."""
+    """Return the direction [3] from the scene to the viewer: from above at an angle, behind cameras that look to one side."""
     azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
     return rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))
 
@@ -106,13 +106,13 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     Args:
         folder: The run folder.
         out: File to write, .png; None for plot.png in the run folder.
-        settings: Contents and looks.
+        settings: Settings of the plot.
         device_name: auto, cpu or cuda.
 
     Raises:
         DataError: The folder is not a run, or the scene has no points to show.
         ResourceError: This machine cannot render, or the file cannot be written.
-        UsageError: The file is no .png.
+        UsageError: The file is not a .png file.
     """
     out = folder / PLOT if out is None else out
     if out.suffix.lower() != ".png":

@@ -1,4 +1,4 @@
-"""Requests for a fit, and the scene and the device that they name."""
+"""Requests for a fit, with their scene and device."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class SceneRequest:
     """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
     def with_scale(self, device: str) -> SceneRequest:
-        """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
+        """Return this request with default image sizes resolved for ``device``, cpu or cuda, to store it with a run."""
         side = CPU_MAX_SIDE if device == "cpu" and self.max_side is None and self.downscale is None else self.max_side
         downscale, max_side = image_scale(self.downscale, side)
         return replace(self, downscale=downscale, max_side=max_side)
@@ -105,14 +105,14 @@ def check_overrides(overrides: Mapping[str, object]) -> None:
     """Check that keywords of a fit are not options of `load_scene`.
 
     Raises:
-        UsageError: One is.
+        UsageError: A keyword is an option of `load_scene`.
     """
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
         raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to warpgs.load_scene and fit its result")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
-    """Return the device for auto, cpu, cuda or cuda:N, or a device itself, and a phrase that names it.
+    """Return the device for auto, cpu, cuda or cuda:N, or a given device itself, and a phrase for the user.
 
     Raises:
         ResourceError: CUDA was requested and is missing.
@@ -149,7 +149,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 
     Raises:
         DataError: A view that is named is missing.
-        UsageError: The split is not understood.
+        UsageError: The split is invalid.
     """
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]

@@ -44,7 +44,7 @@ def shown_steps(phases: Phases) -> set[int]:
 
 
 def _open_pixels(consistent: bool, quantile: float) -> str:
-    """Describe the pixels that a gate leaves open."""
+    """Describe the pixels that pass a gate."""
     parts = ["with a depth that other views confirm"] * consistent
     parts += [f"with S_geometry above its {quantile:g} quantile"] * (quantile > 0)
     return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
@@ -55,14 +55,14 @@ def view_sheet(
 ) -> np.ndarray:
     """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, gate, sampled pixels, scores.
 
-    Scores are shown where one of them has a weight, the disparity where the view has a prior.
+    Scores are shown if one of them has a weight above 0, the disparity if the view has a prior.
 
     Args:
         name: Name of the view.
         step: Steps done.
         view: The view.
-        disparity: Its relative inverse depth, shape [H, W]; None without a prior.
-        sampled: Maps of the event and the pixels it took.
+        disparity: Relative inverse depth of the view, shape [H, W]; None without a prior.
+        sampled: Maps and sampled pixels of the event.
         config: Switches and settings of the fit.
     """
     image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
@@ -110,9 +110,9 @@ def _on_host(sampled: SampledView) -> SampledView:
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
     """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
 
-    A separate thread writes them. The end of the block waits for them. So does the yielded function; call it before a
-    checkpoint, since a fit that continues from there does not write earlier images. If an image cannot be written, the fit
-    continues, with one message in ``fit.messages``.
+    A separate thread writes the images. The end of the block waits for them, and so does the yielded function. Call it before a
+    checkpoint, since a fit that continues from a checkpoint does not write earlier images. If an image cannot be written, the
+    fit continues, with one message in ``fit.messages``.
 
     Args:
         fit: The fit, before its first step.
@@ -166,8 +166,8 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
     """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
 
     Returns:
-        ``events``: their number, the Gaussians added and evicted, the samplings (views over all events) and those for which the
-        gate was widened; ``layers``: Gaussians in the coarse and the fine one.
+        ``events``: number of events, of Gaussians added and evicted, of samplings (views over all events), and of samplings
+        with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
     """
     asked = fit.config.method.asked_quantile
     layered = isinstance(fit.strategy, ImportanceSampling)

@@ -1,4 +1,4 @@
-"""Fits of photographs without cameras: their poses are found first, and kept as a scene in the run folder."""
+"""Fits of photographs without cameras: poses are found first, and stored with the photographs as a scene in the run folder."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
     Args:
         request: The request; its path may be a folder of images or a video.
-        out: Run folder, whose folder `scene` keeps the poses; a run that is continued, or begun again, finds them there.
+        out: Run folder, whose subfolder `scene` stores the poses; a run that is continued or restarted reads them from there.
         progress: Called with lines for the user.
 
     Returns:
         The request for the scene with poses, and notes for the user.
 
     Raises:
-        DataError: The photographs do not fit together, or are too few.
-        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, a continued run has other
-            photographs, or a matcher is given for a scene with cameras.
+        DataError: The photographs cannot be registered, or are too few.
+        UsageError: There is no run folder for the poses, pycolmap is not installed, a continued run has other photographs, or a
+            matcher is given for a scene with cameras.
     """
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
@@ -71,7 +71,7 @@ def lost_lines(out: Path | None) -> list[str]:
 
 
 def _notes(record: dict[str, Any]) -> list[str]:
-    """Return the report's text on found poses: how they were found, and which photographs have none."""
+    """Return the report's notes on found poses: the method, and photographs without a pose."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
     where = [f"{POSED_SCENE}/{TEXT} in the run folder lists photographs to add"] if record["advice"] else []
     return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]

@@ -35,12 +35,12 @@ class Line:
 
 @dataclass(frozen=True)
 class Panel:
-    """One metric; the lines stand in the same order in every panel."""
+    """One metric; the lines have the same order in every panel."""
 
     label: str
     """Name of the metric, with its unit."""
     upwards: bool
-    """True where more is better."""
+    """True if larger values are better."""
     digits: int
     """Digits after the point of the printed figures."""
     lines: tuple[Line, ...]
@@ -56,7 +56,7 @@ def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start",
 
 
 def _reach(panel: Panel) -> float:
-    """Return half the width of a panel's axis, which is centred on 0 so that sizes of both signs compare."""
+    """Return half the width of a panel's axis, which is centred on 0 so that both signs have the same scale."""
     values = [abs(v) for line in panel.lines for v in line.pairs]
     values += [abs(v) for line in panel.lines if line.difference for v in (line.difference.low, line.difference.high)]
     largest = max((v for v in values if math.isfinite(v)), default=0.0)

@@ -76,7 +76,7 @@ class StudyRequest:
 
 
 def scene_name(request: SceneRequest) -> str:
-    """Return the name of a scene in tables and folders: that of its folder."""
+    """Return the name of a scene in tables and folders, which is the name of its folder."""
     return Path(request.path).resolve().name
 
 
@@ -108,19 +108,19 @@ def run_folder(request: StudyRequest, scene: str, variant: str, seed: int) -> Pa
 
 
 def _value(outcome: Outcome, key: str) -> float:
-    """Return a mean score of a run; NaN where it was not measured."""
+    """Return a mean score of a run; NaN if it was not measured."""
     value = (outcome.metrics or {}).get("test", {}).get(key)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
 def _by_seed(runs: Runs, scenes: list[str], variant: str, key: str, seeds: int) -> dict[int, float]:
-    """Return the mean over scenes by seed; seeds that lack a scene are left out."""
+    """Return the mean over scenes by seed; seeds without a result for every scene are left out."""
     means = {s: math.fsum(_value(runs[p, variant, s], key) for p in scenes) / len(scenes) for s in range(seeds)}
     return {s: v for s, v in means.items() if math.isfinite(v)}
 
 
 def _metrics(runs: Runs) -> tuple[Metric, ...]:
-    """Return PSNR, SSIM, and the LPIPS variant that papers print where one was measured."""
+    """Return PSNR, SSIM and, if LPIPS was measured, the variant that papers print."""
     keys = {k for o in runs.values() for k in (o.metrics or {}).get("test", {})}
     order = ("lpips_vgg_legacy", "lpips_alex_legacy")
     found = next((k for k in order if k in keys), "lpips")
@@ -208,7 +208,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
 
 
 def _protocols(runs: Runs) -> list[str]:
-    """Return how each scene was scored, and the definition of each score, as Markdown lines."""
+    """Return the protocol of each scene, and the definition of each score, as Markdown lines."""
     lines, seen = [], set()
     variants: dict[str, str] = {}
     for (scene, _, _), outcome in runs.items():

@@ -1,4 +1,4 @@
-"""Tables of a study as Markdown, CSV and LaTeX, laid out as papers print them."""
+"""Tables of a study as Markdown, CSV and LaTeX, in the layout of papers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Metric:
     label: str
     """Name in tables."""
     upwards: bool
-    """True where more is better."""
+    """True if larger values are better."""
     digits: int
     """Digits after the point."""
 
@@ -70,7 +70,7 @@ class Table:
             raise ValueError("every row needs one check mark per switch")
 
     def best(self, metric: Metric) -> float:
-        """Return the best mean of a column as printed; NaN where nothing was measured."""
+        """Return the best mean of a column as printed; NaN if nothing was measured."""
         means = [round(r.samples[metric.key].mean, metric.digits) for r in self.rows if metric.key in r.samples]
         means = [m for m in means if math.isfinite(m)]
         return (max if metric.upwards else min)(means, default=math.nan)
@@ -89,7 +89,7 @@ def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
 
 
 def interval(d: Difference | None, digits: int) -> str:
-    """Return a paired difference with its interval as text, signed; a dash for none."""
+    """Return a paired difference, signed, with its interval, as text; a dash if there is none."""
     if d is None or not math.isfinite(d.mean):
         return NONE
     ends = f" [{d.low:+.{digits}f}, {d.high:+.{digits}f}]" if math.isfinite(d.low) else ""
@@ -97,7 +97,7 @@ def interval(d: Difference | None, digits: int) -> str:
 
 
 def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
-    """Return the lines of a Markdown table; the first ``left`` columns are words, the rest figures."""
+    """Return the lines of a Markdown table; the first ``left`` columns are text, the others numbers."""
     rows = [[c.replace("|", "\\|") for c in r] for r in [head, *body]]
     widths = [max(len(r[i]) for r in rows) for i in range(len(head))]
     lines = [
