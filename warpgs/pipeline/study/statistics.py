@@ -11,8 +11,7 @@ CONFIDENCE = 0.95
 
 
 def family_confidence(count: int, confidence: float = CONFIDENCE) -> float:
-    """Return the confidence of each of ``count`` intervals, so that all hold at once with probability ``confidence``
-    (Bonferroni 1936)."""
+    """Return the confidence of each of ``count`` intervals for a joint ``confidence`` of all (Bonferroni 1936)."""
     return 1 - (1 - confidence) / max(1, count)
 
 

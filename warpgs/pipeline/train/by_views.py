@@ -55,20 +55,20 @@ LOST_DB = 0.18
 
 
 def steps_by_views(views: int, opaque: bool = True) -> int:
-    """Return the most steps of a fit of so many views: 4500 up to 4 opaque ones, 5511 for 9, 30,000 from 87 on."""
+    """Return the largest number of steps for a number of views: 4500 up to 4 opaque views, 5511 for 9, 30,000 from 87 on."""
     if opaque and views <= FEW:
         return OPAQUE_STEPS
     return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
 def cpu_seconds(views: int) -> float:
-    """Return the time that the steps of a fit on a CPU are limited to by default [s]."""
+    """Return the default time limit for the steps of a fit on a CPU [s]."""
     least, each, most = CPU_SECONDS
     return min(least + each * views, most)
 
 
 def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
-    """Return how many pixels so many steps render; views have ``pixels``, and a quarter of them in steps at half size."""
+    """Return the number of pixels that ``steps`` render; views have ``pixels``, or a quarter of them at half size."""
     return steps * pixels * (1 - 0.75 * half_resolution)
 
 
@@ -92,7 +92,7 @@ def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
 
 
 def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
-    """Return the settings with every one chosen that is left open (None), and sentences on the choices.
+    """Return the settings with all automatic ones (None) chosen, and sentences on the choices.
 
     Args:
         config: Settings.
@@ -155,7 +155,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
 
 
 def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
-    """Return words for each setting of ``made`` that ``config`` leaves open; ``wanted`` are the steps without a limit."""
+    """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` are the steps without a limit."""
     optimizer, half = made.optimizer, made.half_resolution
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {

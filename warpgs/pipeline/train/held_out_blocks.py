@@ -1,6 +1,6 @@
-"""Held-out blocks of pixels, and the gain on them with its noise, by which a fit ends (docs/decisions/020).
+"""Held-out blocks of pixels, and the gain on them with its noise, which end a fit early (docs/decisions/020).
 
-To leave views or pixels out to choose a size is VGNC's idea (arXiv 2504.14548), here without its generative model.
+VGNC (arXiv 2504.14548) chooses the size of a model by held-out views from a generative model; here pixels are held out instead.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Blocks:
 
 
 def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
-    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; masks keep more than half of each.
+    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; more than half of each is unmasked.
 
     In small images the fraction is larger, see `MAX_FRACTION`.
     """
@@ -98,8 +98,8 @@ def block_errors(
 
     Args:
         gaussians: The model.
-        views: Views with their own masks, not those of `hide`.
-        blocks: Blocks of each.
+        views: Views without the masks of `hide`.
+        blocks: Blocks of each view.
         options: Settings of the rasterizer.
     """
     errors = []
@@ -129,9 +129,9 @@ class Gain:
     error may be larger."""
 
     def upper_bound_below(self, least: float, noises: float) -> bool:
-        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is NaN.
+        """Return whether the mean plus ``noises`` standard errors is below ``least`` [dB]; True for a gain that is NaN.
 
-        With few blocks the noise is large, so that a fit of unknown gain continues.
+        With few blocks the noise is large, so a fit whose gain is uncertain continues.
         """
         return not self.mean + noises * self.noise >= least
 
@@ -139,7 +139,7 @@ class Gain:
 def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
     """Compute the gain from the errors of blocks before and after a change, shape [B] each.
 
-    Paired over blocks: ten times the decimal logarithm of the ratio of the errors, the floor added to both.
+    The gain of a block is ten times the decimal logarithm of the ratio of its errors, with the floor added to both.
     """
     each = 10 * torch.log10((before + FLOOR) / (after + FLOOR))
     count = len(each)

@@ -1,9 +1,9 @@
-"""Memory that a fit needs, added up from what its parts declare, and the means to keep to a limit.
+"""Memory that a fit needs, as the sum of the needs that its parts declare, and the means to keep to a limit.
 
-A step holds parameters with their Adam moments throughout, plus the memory of its largest phase. Each part declares its
-bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The
-CUDA driver, Python and the compiled kernels need more on top. Not counted, since they are small: parameters of single views,
-and the buffers of learning rates and losses (`StepBuffers`).
+A step always holds parameters with their Adam moments, plus the memory of its heaviest moment. Each part declares its bytes
+beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The CUDA
+driver, Python and the compiled kernels need additional memory. Small parts are not counted: parameters of single views, and the
+buffers of learning rates and losses (`StepBuffers`).
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ class Layout:
     """Number of sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
 
     def held(self, count: int) -> int:
-        """Return the bytes that last from step to step: parameters, two Adam moments, columns, sums over slots, and views."""
+        """Return the bytes that persist between steps: parameters, two Adam moments, columns, sums over slots, and views."""
         sums = self.sums * (self.table.row_bytes + SUMMED * FLOAT)
         return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
-        """Return the bytes on top of `held` at each moment of a step that may be its heaviest.
+        """Return the bytes in addition to `held` at each moment of a step that may be its heaviest.
 
         ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
         """
@@ -68,7 +68,7 @@ class Layout:
         return needs
 
     def event(self, before: int, after: int) -> int:
-        """Return the bytes on top of ``held(after)`` while Gaussians are added."""
+        """Return the bytes in addition to ``held(after)`` while Gaussians are added."""
         return self.table.growth_bytes(before, after)
 
     def step(self, count: int, instances: int, chunked: bool = False) -> int:
@@ -95,7 +95,7 @@ class Layout:
 
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
-    """Return the largest number that fits, where all below it do; ``low`` if none does."""
+    """Return the largest number that fits, by bisection: all smaller numbers fit, too; ``low`` if none fits."""
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)
@@ -166,7 +166,7 @@ def layout_of(
 
     Args:
         table: The Gaussians with their columns.
-        views: Training views, those at half their size included.
+        views: Training views, including those of half size.
         terms: Loss terms.
         strategy: Density strategy.
         modules: View modules.
@@ -206,10 +206,10 @@ def plan(
         capacity_factor: Capacity of a CUDA graph for instances, as a multiple of the present number.
 
     Returns:
-        The plan, and the layout of the steps to be taken: without graphs where those would not keep to the limit.
+        The plan, and the layout of the steps: without graphs if graphs would exceed the limit.
 
     Raises:
-        UsageError: The limit is below the need of the smallest step.
+        UsageError: The limit is below the memory of the smallest step.
     """
     cap, refused = max(most, count), False
     single = replace(layout, graphs=0)

@@ -26,10 +26,10 @@ MAX_DECAY = 0.1
 
 
 def check_lrs(of: str, **rates: float | None) -> None:
-    """Check learning rates and factors of them by name, of which None is left to choose; ``of`` names their settings.
+    """Check learning rates, and factors of them, by name; None is allowed; ``of`` names the group of settings.
 
     Raises:
-        UsageError: One is not positive, or above `MAX_LR`.
+        UsageError: A value is not positive, or above `MAX_LR`.
     """
     for name, value in rates.items():
         if value is not None and not 0 < value <= MAX_LR:
@@ -38,7 +38,7 @@ def check_lrs(of: str, **rates: float | None) -> None:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
+    """Learning rates, by default those of the reference implementation of Kerbl et al. 2023, except for the scales."""
 
     means_lr: float | None = 1.6e-4
     """Learning rate of the means at the start, in units of the scene's extent. None: 1.6e-4, or more if a CPU's time limits the
@@ -72,7 +72,7 @@ class OptimizerConfig:
 
         Args:
             progress: Fraction of the fit, in [0, 1].
-            extent: Size of the scene [u], which the rate of the means is multiplied by.
+            extent: Size of the scene [u], a factor of the rate of the means.
             stable_start: Fraction of the fit, in [0, 1), after which the rate of the scales falls.
         """
         assert self.scales_lr is not None and self.opacities_lr is not None  # `settings_by_views` has chosen
@@ -88,7 +88,7 @@ class OptimizerConfig:
 
     @property
     def head_lrs(self) -> dict[str, float]:
-        """Learning rate of the first 3 numbers of a row, where it differs from the others'."""
+        """Learning rate of the first 3 numbers of a row, for parameters in which it differs from that of the others."""
         assert self.sh_lr is not None  # `settings_by_views` has chosen
         return {"sh": self.sh_lr}
 
@@ -97,7 +97,7 @@ class OptimizerConfig:
 class PhaseConfig:
     """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in the second.
 
-    A fit shorter than twice phases 1 and 3 together has all of them, and the interval, shortened in proportion.
+    In a fit shorter than twice phases 1 and 3 together, these phases and the interval are shortened in proportion.
     """
 
     coarse: int = 0
@@ -142,7 +142,7 @@ class Phases:
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
     def stable_from(self, step: int, planned_start: int) -> Phases:
-        """Return the phases if the third begins after ``step`` instead of ``planned_start``, and is shortened in proportion."""
+        """Return the phases if the third begins after ``step`` instead of its planned start; it is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 

@@ -29,13 +29,13 @@ class OverLimitError(ResourceError):
 
 
 class StepGraphs:
-    """Captured steps, one for each plan and kind of view; captured at first use."""
+    """Captured steps, one for each plan and kind of view, captured at first use."""
 
     def __init__(
         self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions,
         work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
     ):  # fmt: skip
-        """Capture nothing yet.
+        """Begin without captured steps.
 
         Args:
             learned: Tables and strategy that steps change.
@@ -68,7 +68,7 @@ class StepGraphs:
             max_instances: Largest capacity for instances; None for no limit.
 
         Raises:
-            OverLimitError: The capacity of one would be above ``max_instances``.
+            OverLimitError: The capacity of a graph would be above ``max_instances``.
             ResourceError: The instances would not fit into memory.
         """
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
@@ -89,7 +89,7 @@ class StepGraphs:
         return [self._graphs[kind, plan] for kind in kinds]
 
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
-        """Return the graph of a function that changes nothing where the stop flag is set."""
+        """Return the graph of a function that changes nothing if the stop flag is set."""
         buffers = self.buffers
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
@@ -111,7 +111,7 @@ def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, optio
     """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
 
     Raises:
-        ResourceError: They would not fit into memory.
+        ResourceError: The instances would not fit into memory.
     """
     counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in views.cameras()]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024

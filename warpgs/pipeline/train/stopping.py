@@ -86,8 +86,8 @@ STATE = schema.fields({
 class Stopping:
     """Held-out blocks of the training views, and the decision to end growth by their error.
 
-    Until growth ends, blocks of every view are held out of the loss and of sampling; from then on whole views are trained on.
-    The start uses whole images: the blocks measure growth, not the start.
+    Until growth ends, blocks of every view are held out of the loss and of sampling; afterwards all pixels are used. The start
+    uses whole images: the blocks measure growth, not the start.
     """
 
     def __init__(self, config: StoppingConfig):
@@ -118,7 +118,7 @@ class Stopping:
         Args:
             context: Parts of the fit, with its views.
             strategy: Density strategy.
-            half_resolution: Fraction of the planned steps, from the first, in which views are half their size.
+            half_resolution: Fraction of the planned steps, the first ones, in which views have half size.
         """
         assert self.config.min_gain_db is not None  # `settings_by_views` has chosen
         if self.config.min_gain_db == 0:
@@ -153,7 +153,7 @@ class Stopping:
         return [hide(v, b) for v, b in zip(self.whole, self.blocks)]
 
     def sh_every(self, every: int, highest: int) -> int:
-        """Return the steps after which the degree in use rises, at most ``every``: ``highest`` is in use when growth begins."""
+        """Return the steps between rises of the degree, at most ``every``, so that ``highest`` is in use when growth begins."""
         if not self.active or highest == 0:
             return every
         return max(1, min(every, self.marks[0] // highest))
@@ -163,12 +163,12 @@ class Stopping:
         return self.active and self.ended is None and step in self.marks
 
     def changes(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> Iterator[DensityUpdate]:
-        """Yield the changes of the set of Gaussians after a step: those of the strategy, or the last ones, when growth ends.
+        """Yield the changes of the set of Gaussians after a step: those of the strategy, and the last changes when growth ends.
 
         Args:
             step: Steps done.
             strategy: Density strategy.
-            context: Parts of the fit; where growth ends, its third phase begins.
+            context: Parts of the fit; when growth ends, its third phase begins.
             degree: Degree of the harmonics in use.
         """
         if self.due(step) and self._measured(step, strategy, context, degree):
@@ -180,7 +180,7 @@ class Stopping:
             yield from strategy.update(step)
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
-        """Measure the blocks, where the set has changed since they were measured last; return whether growth ends."""
+        """Measure the blocks if the set has changed since the last measurement; return whether growth ends."""
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
             return False
@@ -224,7 +224,7 @@ class Stopping:
         """Load what `state` returned, ``tensors`` of shape [...] by name.
 
         Raises:
-            DataError: The errors of the blocks are not of these blocks.
+            DataError: The errors do not belong to these blocks.
         """
         shape = (len(plain["measured"]), sum(map(len, self.blocks)) if self.active else 0)
         measured = tensors.get("stopping.measured", torch.zeros(0, shape[1]))
@@ -237,7 +237,7 @@ class Stopping:
         self.measured = list(zip(plain["measured"], measured))
 
     def figures(self) -> dict[str, Any]:
-        """Return for metrics.json why growth ended, and the measurements; nothing where nothing was held out."""
+        """Return the reason why growth ended and the measurements, for metrics.json; empty if nothing was held out."""
         if not self.active:
             return {}
         return {

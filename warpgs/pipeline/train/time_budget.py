@@ -29,7 +29,7 @@ MIN_STEPS = 100
 
 
 def probe_seconds(width: int, height: int, device: torch.device) -> float:
-    """Measure the time of a render, its loss and gradients on this machine for a cloud that is always the same [s].
+    """Measure the time of a render, its loss and gradients on this machine, for a fixed set of Gaussians [s].
 
     Returns the median of `REPEATS`; takes some hundred milliseconds.
     """
@@ -97,7 +97,7 @@ def check_budget(seconds: float) -> None:
     """Check a time budget [s].
 
     Raises:
-        UsageError: It is not a positive, finite number.
+        UsageError: The budget is not a positive, finite number.
     """
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

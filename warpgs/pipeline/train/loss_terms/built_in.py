@@ -1,4 +1,4 @@
-"""The loss that every fit has: its weights, and the terms that follow from them."""
+"""The loss of every fit: its weights, and its terms."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class LossConfig:
 def built_in_terms(
     config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False
 ) -> tuple[LossTerm, ...]:
-    """Return the terms that every fit has by its settings and its views.
+    """Return the built-in terms of a fit, by its settings and its views.
 
     Args:
         config: Weights.

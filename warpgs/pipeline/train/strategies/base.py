@@ -46,17 +46,17 @@ class Strategy:
 
     @classmethod
     def samples(cls, settings: Settings) -> bool:
-        """Return whether it places Gaussians at pixels, which needs consistent depth; ``settings`` are those of the fit."""
+        """Return whether the strategy places Gaussians at pixels, which needs consistent depth; ``settings`` are the fit's."""
         return False
 
     @classmethod
     def needs_priors(cls, settings: Settings) -> bool:
-        """Return whether it reads scores from the priors of the views; ``settings`` are those of the fit."""
+        """Return whether the strategy reads scores from the priors of the views; ``settings`` are those of the fit."""
         return False
 
     @classmethod
     def warmup_config(cls, own: Any) -> Any:
-        """Return the strategy's settings for a warm-up of three steps, which should run each part of a fit once."""
+        """Return the strategy's settings for a warmup of three steps, which should run each part of a fit once."""
         return own
 
     def bytes(self, sizes: StepSizes) -> Needs:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EventTimes:
-    """Events at equal distances, in steps done."""
+    """Events at equal intervals, in steps done."""
 
     after: int
     """Step after which the first event comes."""
@@ -18,7 +18,7 @@ class EventTimes:
 
     @staticmethod
     def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:
-        """Return the times for a fit of that many steps; a short one starts after a quarter of its length."""
+        """Return the times for a fit of that many steps; in a short fit events start after a quarter of its length."""
         return EventTimes(min(start, steps // 4), every, int(stop_fraction * steps))
 
     def due(self, step: int) -> bool:

@@ -1,4 +1,4 @@
-"""Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), for strategies to be composed of."""
+"""Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), as a part of strategies."""
 
 from __future__ import annotations
 
@@ -156,12 +156,12 @@ class GradientGrowth:
 
     @staticmethod
     def columns() -> dict[str, Column]:
-        """Return the sum of the gradient norms of each projected mean, and the number of renders that it was seen in."""
+        """Return the columns for the sum of gradient norms of a projected mean, and for the number of renders that saw it."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
     @property
     def times(self) -> EventTimes:
-        """Times of refinement as the phases are now: to the third, in a fit that has phases."""
+        """Times of refinement by the current phases: until the third phase, in a fit with phases."""
         phases, planned = self.context.phases, self.context.settings[PhaseConfig]
         times = self.config.times(phases.planned)
         until = phases.stable_start if planned.coarse + planned.stable > 0 else min(times.until, phases.stable_start)

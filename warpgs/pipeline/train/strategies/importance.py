@@ -1,7 +1,7 @@
 """Importance of the pixels of a training view: the paper's three scores, and their weighted sum.
 
-Paper, section "Multi-Modal Importance Assessment". What it leaves open (the scale of each score, the unit of depth, the
-weight of curvature) is decided here and in docs/decisions/008-method.md.
+Paper, section "Multi-Modal Importance Assessment". The paper does not specify the scale of each score, the unit of depth and
+the weight of curvature; see docs/decisions/008-method.md for our choices.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _slopes(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tensor | None = None) -> torch.Tensor:
     """Compute S_geometry: length of the disparity's gradient plus ``curvature`` times the norm of its second derivatives.
 
-    Both are brought to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
+    Both are scaled to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
 
     Args:
         disparity: Relative inverse depth, shape [H, W].
@@ -121,7 +121,7 @@ def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry:
 def importance(scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor], by: tuple[float, float, float]) -> torch.Tensor:
     """Compute S_importance = w . s of the render, semantic and geometric score, each [H, W] in [0, 1].
 
-    It is 1 everywhere where no weight is above 0, so that sampling without a score is uniform.
+    If all weights are 0, S_importance is 1 everywhere, so that sampling is uniform.
     """
     if sum(by) == 0:
         return torch.ones_like(scores[0])

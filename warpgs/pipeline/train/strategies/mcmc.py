@@ -67,10 +67,10 @@ class MCMCConfig:
 
 @torch.no_grad()
 def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return opacity and scale factor of each of N Gaussians that stand in one place for one Gaussian (eq. 9).
+    """Return opacity and scale factor of each of N Gaussians that replace one Gaussian in one place (eq. 9).
 
-    The new opacity is 1 - (1 - o)^(1/N), so that together they are as opaque at the centre; the scales shrink such that the
-    integral over a line through the centre stays. In float64, since the sum alternates.
+    The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians are together as opaque at the centre. The scales shrink such
+    that the integral over a line through the centre is unchanged. It is computed in float64, since the sum alternates.
 
     Args:
         opacities: o of the one Gaussian, in (0, 1), shape [M].
@@ -121,14 +121,14 @@ def make_kernel() -> wp.Kernel:
 def perturb(
     gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float
 ) -> None:  # fmt: skip
-    """Add noise of each Gaussian's own covariance to its mean, in place; the less the more opaque it is (eq. 8).
+    """Add noise with each Gaussian's own covariance to its mean, in place; more opaque Gaussians get less noise (eq. 8).
 
     The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit.
 
     Args:
         gaussians: N Gaussians, float32.
-        settings: Settings of the step (`Setting`), of which number and learning rate are read, float32, shape [7].
-        going: Nothing changes where this is False, bool, shape [1].
+        settings: Settings of the step (`Setting`), float32, shape [7]; step number and learning rate are read.
+        going: False to change nothing, bool, shape [1].
         seed: Any 32-bit integer.
         noise_lr: Factor of the learning rate.
     """
@@ -163,14 +163,14 @@ class MCMC(Strategy):
         return Growth(self.times.after, self.times.until)
 
     def regularisation(self, phase, gaussians):
-        """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
+        """Return the weighted mean opacity plus the weighted mean axis length, shape []; it makes unneeded Gaussians die."""
         c = self.config
         # in float64, since the rounding of float32's functions depends on the processor
         opacity, scale = gaussians.logit_opacities.double().sigmoid().mean(), gaussians.log_scales.double().exp().mean()
         return (c.opacity_weight * opacity + c.scale_weight * scale).to(gaussians.log_scales.dtype)
 
     def after_step(self, phase, settings, going):
-        """Perturb the means; nothing changes where ``going`` [1] is False. ``settings`` has shape [7]."""
+        """Perturb the means; nothing changes if ``going`` [1] is False. ``settings`` has shape [7]."""
         t = self.context
         perturb(t.table.gaussians, settings, going, seed=t.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
 

@@ -1,4 +1,4 @@
-"""Sampling of the pixels that get a fine Gaussian, and its first values (paper, section "Geometric-Aware Sampling")."""
+"""Sampling of pixels for fine Gaussians, and initial values of these (paper, section "Geometric-Aware Sampling")."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, 
         geometry: S_geometry, shape [H, W].
         valid: Pixels that may be sampled at all, bool, shape [H, W].
         quantile: tau_geometry as a quantile, in [0, 1).
-        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times as many pass, or all valid ones.
+        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times as many or all valid pixels pass.
 
     Returns:
-        The gate, bool, shape [H, W], and the quantile that was used; where the score is constant all valid pixels pass.
+        The gate, bool, shape [H, W], and the quantile that was used; if the score is constant, all valid pixels pass.
     """
     values = geometry[valid]
     while quantile > 0 and len(values) > 0:

@@ -1,4 +1,4 @@
-"""Base class of view modules, which learn parameters of each training view: of its camera, or of the colours that it shows."""
+"""Base class of view modules, which learn parameters of each training view: of its camera, or of its colours."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class ViewModule:
         return rgb
 
     def regularisation(self, values: Tensors) -> torch.Tensor | None:
-        """Return a term of the loss for the step's view, shape []; None for none. ``values`` are of that view, [...]."""
+        """Return a loss term for the step's view, shape []; None for no term. ``values`` [...] are those of the view."""
         return None
 
     def bytes(self, sizes: StepSizes) -> Needs:
@@ -144,10 +144,10 @@ register = VIEW_MODULES.register
 
 
 def check_modules(modules: Sequence[ViewModule]) -> None:
-    """Check that a run folder could name the class of each view module.
+    """Check that a run folder can name the class of each view module.
 
     Raises:
-        UsageError: One is not a view module, its class is not registered under its own name, or two are of one class.
+        UsageError: An object is not a view module, its class is not registered, or two have the same class.
     """
     for i, module in enumerate(modules):
         kind = type(module)

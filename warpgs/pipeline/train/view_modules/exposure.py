@@ -34,7 +34,7 @@ GRAY = 0.5
 def exposure_of(rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
     """Return the exposure [..., 12] of views with parameters ``own`` [..., 12], among those of all views ``rows`` [V, 12].
 
-    No gradient flows into the mean: only the rows of ``own`` are learned from.
+    No gradient flows through the mean: only the rows of ``own`` get one.
     """
     # in float64, so that the float32 result is the same for any number of threads
     return own - rows.detach().mean(0, dtype=torch.float64).to(own.dtype)
@@ -94,7 +94,7 @@ class Exposure(ViewModule):
         """Check that no view has an alpha channel: an exposure would change the background with the object.
 
         Raises:
-            UsageError: One does.
+            UsageError: A view has an alpha channel.
         """
         for v in views:
             if v.alpha is not None:
@@ -120,7 +120,7 @@ class Exposure(ViewModule):
         return exposed(rgb, values[EXPOSURE])
 
     def regularisation(self, values: Tensors) -> torch.Tensor:
-        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it holds an exposure to the identity."""
+        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it draws an exposure towards the identity."""
         square = values[EXPOSURE].double().square().sum()
         return (self.weight * square).to(values[EXPOSURE].dtype)
 
@@ -129,7 +129,7 @@ class Exposure(ViewModule):
         return {LOSS: FLOAT * CHANNELS * sizes.pixels}
 
     def figures(self, fitted: FittedViews) -> dict[str, Any]:
-        """Return what exposures were learned.
+        """Return the learned exposures and their effect.
 
         Returns:
             ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of a middle gray

@@ -1,6 +1,6 @@
 """Refinement of training poses: an increment of each camera, learned with the Gaussians.
 
-A training view i > 0 is rendered from T_i viewmat_i, where T_i turns by a rotation w_i about the camera's centre and moves by
+A training view i > 0 is rendered from T_i viewmat_i, where T_i rotates by w_i about the camera's centre and moves by
 t_i in the camera's axes. The first camera stays fixed, so that the scene as a whole cannot rotate or drift. Its scale remains
 free, but does not change any image. The rotation is Cayley's map of w / 2, of angle 2 atan(|w| / 2): for small w that of
 exp(w), without a case for w = 0, and with the same bits on every processor.
@@ -75,7 +75,7 @@ def camera_numbers(cameras: Sequence[Camera]) -> list[int]:
 
 
 def focal_factors(params: Tensors, numbers: torch.Tensor) -> torch.Tensor:
-    """Return the factor s of the focal length of views of these numbers [B], shape [B]; differentiable."""
+    """Return the factor s of the focal length of views with these indices [B], shape [B]; differentiable."""
     camera = params[CAMERA_NUMBER][:, 0]
     same = (camera.index_select(0, numbers)[:, None] == camera).to(camera.dtype)
     z = (same * params[FOCAL][:, 0]).sum(1) / same.sum(1)
@@ -91,8 +91,8 @@ def zoomed(K: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.ndarray, float, np.ndarray]:
     """Return rotation [3, 3], scale and translation [3] from the world of given cameras to that of refined ones.
 
-    The rotation is the mean of the cameras' own; scale and translation are least squares over their centres. Where all centres
-    are one, the scale is 1.
+    The rotation is the mean of the cameras' rotations. Scale and translation are least squares over the camera centres. If all
+    centres coincide, the scale is 1.
     """
     turned = sum(matmul(r.viewmat[:3, :3].T, g.viewmat[:3, :3]) for g, r in zip(given, refined))
     R = nearest_rotation(np.asarray(turned) / len(given))
@@ -106,7 +106,7 @@ def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.n
 def similar_cameras(
     cameras: Mapping[str, Camera], given: Sequence[Camera], refined: Sequence[Camera], names: Sequence[str]
 ) -> dict[str, Camera]:
-    """Return the named cameras after the similarity that takes given cameras to refined ones best, by name.
+    """Return the named cameras after the similarity that best maps given cameras to refined ones, by name.
 
     Args:
         cameras: Cameras by name, in the world of the given ones.
@@ -129,8 +129,8 @@ def refined_cameras(
 ) -> dict[str, Camera]:
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `RULE`.
 
-    Where focal lengths are learned, a held-out view has that of the training views of its camera, or the mean factor of all
-    training views if no training view has its intrinsics.
+    If focal lengths are learned, a held-out view has the focal length of the training views of its camera. If no training view
+    has its intrinsics, the mean factor over all training views is used.
 
     Args:
         given: Cameras as given, in scene units, by name.
