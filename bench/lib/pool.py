@@ -62,7 +62,7 @@ def stored_rows(path: Path | None, **facts) -> list[dict]:
     stored = result_file.read(path)
     for name, now in ({"commit": result_file.commit_of()} | facts).items():
         if stored.get(name) != now:
-            raise UsageError(f"{path} was measured with {name} {stored.get(name)}, but now {name} is {now}; choose another --out")
+            raise UsageError(f"{path} was measured with {name} {stored.get(name)}, not {now}; choose another --out")
     return [row for row in stored["rows"] if "error" not in row]
 
 

@@ -12,7 +12,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]], left: Sequen
     Args:
         head: Names of the columns.
         rows: Cells.
-        left: Number of left-aligned columns, the others are right-aligned; None for no alignment.
+        left: Names of left-aligned columns; the others are right-aligned. None for no alignment.
     """
     rule = ["---" if left is None or name in left else "---:" for name in head]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, rule, *rows)) + "\n"
