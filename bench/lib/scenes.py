@@ -86,7 +86,7 @@ def left_out(names: tuple[str, ...], count: int) -> list[tuple[str, ...]]:
     """
     n = len(names)
     if n < 3 or (n > FEW and not 1 <= count <= n - 2):
-        raise UsageError(f"{count} of {n} training views cannot be left out: two must remain; give fewer, or another row")
+        raise UsageError(f"{count} of {n} training views cannot be left out: at least two must stay; use fewer")
     if n <= FEW:
         return [(name,) for name in names]
     return [tuple(names[round(i * (n - 1) / (count + 1))] for i in range(1, count + 1))]
