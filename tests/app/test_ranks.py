@@ -75,7 +75,7 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
         out = capsys.readouterr().out
     else:
         (code, out, _), (other, silent, _) = ended(started(2, "-m", "warpgs", "fit", *flags, *shared, "--resume"))
-        assert (code, other, silent) == (0, 0, "") and "ranks: 2 processes by gloo" in out
+        assert (code, other, silent) == (0, 0, "") and "ranks: 2 processes (gloo)" in out
     assert "continued from step 4" in out
     assert main(["fit", *flags, "--out", str(tmp_path / "alone")]) == 0
     for name in ("point_cloud.ply", "checkpoint.safetensors"):
