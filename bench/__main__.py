@@ -1,4 +1,4 @@
-"""List of what can be measured, and a way to start it: `python -m bench NAME ...` is `python -m bench.NAME ...`."""
+"""List of all programs, and a way to start them: `python -m bench NAME ...` is `python -m bench.NAME ...`."""
 
 from __future__ import annotations
 

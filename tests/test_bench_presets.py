@@ -150,7 +150,7 @@ def test_a_stopped_comparison_goes_on(tmp_path, monkeypatch, capsys):
         rows = pool.measure_all(None, [Task(0), Task(1)], None, a, "w", torch.device("cpu"), lambda r: f"{r['psnr']:.1f}")
     assert calls == [[0, 1], [1]] and [r["psnr"] for r in rows] == [20.0, 20.0]
     assert "failed: E: no" in capsys.readouterr().out and pool.stored_rows(out) == rows
-    with pytest.raises(UsageError, match="steps None, now it is 8"):
+    with pytest.raises(UsageError, match="steps None, not 8"):
         pool.stored_rows(out, steps=8)
     result_file.write(out, result_file.read(out) | {"commit": "other"})
     with pytest.raises(UsageError, match="choose another --out"):

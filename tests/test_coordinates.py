@@ -82,7 +82,7 @@ def test_mistakes_are_named(tmp_path):
     with pytest.raises(UsageError, match="units='scene' requires"):
         read_ply(tmp_path / "a", units="scene")
     broken = type(g)(**{**g.tensors(), "means": g.means * float("nan")})
-    with pytest.raises(DataError, match="means holds numbers that are not finite"):
+    with pytest.raises(DataError, match="means holds non-finite values"):
         save(tmp_path / "a", broken, units="file")
     assert not (tmp_path / "a").exists()
     with pytest.raises(DataError, match="cannot be read"):

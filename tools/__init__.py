@@ -1,1 +1,1 @@
-"""Programs for those who work on warpgs; no part of the package."""
+"""Programs for developers of warpgs, not part of the package."""

@@ -1,8 +1,8 @@
-"""Run the RUN lines of the Dockerfile in a clean folder, where no Docker is: what it says is tried, the image is not.
+"""Run the RUN lines of the Dockerfile in a clean folder, without Docker: the lines are tested, but no image is built.
 
-Every path below /opt/warpgs lies in that folder instead, COPY copies, ENV and ARG are set, and nothing else of this machine's
-environment but PIP_* and proxies. Lines that only root can run are left out and named: those before USER. At the end the entry
-point is called with --version, and a demo scene is fitted.
+Every path below /opt/warpgs is in that folder instead. COPY copies, ENV and ARG are set; of this machine's environment only
+PIP_* and proxies are kept. Lines before USER, which need root, are left out and listed. At the end the entry point is called
+with --version, and a demo scene is fitted.
 
 usage: python -m tools.run_dockerfile [cpu|cuda] [--folder FOLDER] [--arg NAME=VALUE ...]
 """
@@ -21,13 +21,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 HOME = "/opt/warpgs"
-"""Folder of everything that the image's own user writes."""
+"""Folder of all files that the image's own user writes."""
 KEPT = re.compile(r"PIP_\w+|\w*_proxy|\w*_PROXY|SSL_CERT_\w+|LANG|LC_\w+")
-"""Variables of this machine that the lines may see: the way to a package index."""
+"""Environment variables of this machine that the lines may see, for access to a package index."""
 CHECK = "warpgs --version && warpgs demo $HOME/scenes/a --views 8 --width 48 --height 36 && " + (
     "warpgs farm $HOME/scenes --out $HOME/results --steps 2 --preset quick --device cpu && ls $HOME/results"
 )
-"""What a user of the image does first."""
+"""First commands of a user of the image."""
 
 
 def instructions(text: str) -> list[tuple[str, str]]:
@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run a target; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", nargs="?", default="cpu")
-    parser.add_argument("--folder", type=Path, help="an empty folder; a temporary one where not given")
+    parser.add_argument("--folder", type=Path, help="an empty folder; default: a temporary folder")
     parser.add_argument("--arg", action="append", default=[], help="as docker build --build-arg")
     a = parser.parse_args(arguments)
     steps = of_target(instructions((ROOT / "Dockerfile").read_text("utf-8")), a.target)
@@ -118,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
         except subprocess.CalledProcessError as e:
             print(f"failed with exit code {e.returncode}", file=sys.stderr)
             return 1
-    print(*(f"not run, as only root can: {' '.join(line.split())}" for line in left_out), sep="\n")
+    print(*(f"not run, because it needs root: {' '.join(line.split())}" for line in left_out), sep="\n")
     print(f"target {a.target}: all other RUN lines work in a clean folder; the image itself was not built")
     return 0
 

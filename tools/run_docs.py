@@ -1,11 +1,11 @@
 """Run the commands and the Python snippets of the README and of all pages, as a reader would type them (`make docs-run`).
 
-Each page has a temporary folder of its own, in which its blocks run one after the other. What a page uses and does not make
-itself is put there first (`INPUTS`). A program `warpgs` before all others on the path makes commands short (`LIMITS`), and ends
-the viewer once it says where it is.
+Each page has its own temporary folder, in which its blocks run one after the other. Files that a page uses but does not make
+are put there first (`INPUTS`). A program `warpgs`, first on the path, shortens commands (`LIMITS`), and ends the viewer once it
+prints its address.
 
-A block that cannot run here stands below a comment with the reason, `<!-- docs-run: REASON -->`; single lines that begin with
-what `LEFT_OUT` names are left out, too. Each is printed at the end with its reason.
+A block that cannot run is below a comment with the reason, `<!-- docs-run: REASON -->`. Single lines with a prefix in
+`LEFT_OUT` are left out, too. All left-out lines are printed at the end with their reasons.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FENCE = re.compile(
 )
 SHELLS = {"bash", "sh", "shell", "console"}
 PROGRAMS = ("warpgs ", "pip ", "ssh ", "make ", "python ", "git ")
-"""First words of a block without a language that make it one for a shell."""
+"""First words that mark a block without a language as one for a shell."""
 LEFT_OUT = (
     (r"ssh ", "another machine"),
     (r"warpgs .*--device cuda\b", "GPU"),
@@ -36,7 +36,7 @@ LEFT_OUT = (
     (r"make (demo|test|install)\b", "the workflow test runs it"),
     (r"(python3 -m venv|source .*activate|pip install '?(\.|torch)|git clone)", "installing, which --install runs"),
 )
-"""Beginnings of lines that are left out, and why."""
+"""Patterns of lines that are left out, with reasons."""
 INPUTS = ("scene", "photographs", "PHOTOGRAPHS", "run", "scenes", "keyframes.json", "examples")
 """What pages may use: the small demo scene; its images alone; a short fit; a folder of scenes; cameras of a film; examples."""
 MAKE_INPUTS = """
@@ -57,11 +57,11 @@ LIMITS = {
     "compare": {"--steps": "20", "--seeds": "1", "--downscale": "1"}, "view": {"--port": "0"},
     "ablate": {"--steps": "20", "--seeds": "1", "--downscale": "1"},
 }  # fmt: skip
-"""Largest values of flags of a command; each is given where a page gives none or more."""
+"""Largest values of flags by command; a flag is set to its value if a page gives no value or a larger one."""
 TIME = 900
-"""Seconds that a block may take."""
+"""Time limit of a block [s]."""
 VIEWER_TIME = 300
-"""Seconds within which the viewer says where it is, and within which it ends; on a busy machine it first ends an image."""
+"""Time limits for the viewer to print its address, and to end [s]; on a busy machine it first finishes an image."""
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ class Block:
     page: str
     """Path of the page from the root of the project."""
     line: int
-    """Line of the page in which its first command stands."""
+    """Line of the page with the first command."""
     code: str
-    """What runs: words for bash, or for Python."""
+    """Code to run, for bash or for Python."""
     python: bool
     """True for Python."""
     left_out: tuple[tuple[str, str], ...]
-    """Lines that do not run, or the first of a block that does not, each with its reason."""
+    """Lines that do not run, or the first line of a block that does not run, each with its reason."""
 
 
 def pages() -> list[str]:
@@ -96,7 +96,7 @@ def collect(page: str, text: str, left_out: tuple[tuple[str, str], ...] = LEFT_O
             continue
         line = text[: match.start("code")].count("\n") + 1
         if reason is not None and not reason.strip():
-            raise ValueError(f"{page}, line {line}: the marker says not why the block cannot run")
+            raise ValueError(f"{page}, line {line}: the marker gives no reason why the block cannot run")
         if reason is not None:
             blocks.append(Block(page, line, "", python, ((code.splitlines()[0], reason),)))
             continue
@@ -110,7 +110,7 @@ def collect(page: str, text: str, left_out: tuple[tuple[str, str], ...] = LEFT_O
 
 
 def shortened(words: list[str]) -> list[str]:
-    """Return the words of a `warpgs` command within `LIMITS`."""
+    """Return the arguments of a `warpgs` command within `LIMITS`."""
     if not words or {"--help", "-h", "--help-all", "--time-budget"} & set(words):
         return words
     words = [*words]
@@ -159,7 +159,7 @@ def main_of_warpgs(words: list[str]) -> int:
 
 
 def _run(words: list[str], folder: Path, programs: Path | None, code: str = "") -> str:
-    """Run a program in a folder; return what is wrong, empty where nothing is."""
+    """Run a program in a folder; return an error message, or an empty text."""
     first = [str(programs), str(Path(sys.executable).parent)] if programs else []
     path = os.pathsep.join([*first, os.environ.get("PATH", "")])
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as output:
@@ -181,7 +181,7 @@ def _run(words: list[str], folder: Path, programs: Path | None, code: str = "") 
 
 
 def run_block(block: Block, folder: Path, programs: Path | None) -> tuple[str, Path]:
-    """Run a block in a folder; return what is wrong, empty where nothing is, and the folder that a shell ends in."""
+    """Run a block in a folder; return an error message or an empty text, and the last folder of a shell."""
     if block.python:
         return _run([sys.executable, "-"], folder, programs, block.code), folder
     if not block.code:
@@ -193,7 +193,7 @@ def run_block(block: Block, folder: Path, programs: Path | None) -> tuple[str, P
 
 
 def run_blocks(blocks: list[Block], folder: Path, programs: Path | None) -> list[str]:
-    """Run the blocks of a page in order, each in the folder where the one before ended; return a line for each that failed."""
+    """Run the blocks of a page in order, each in the last folder of the block before; return a line for each failed block."""
     failed = []
     for block in blocks:
         why, folder = run_block(block, folder, programs)
@@ -203,7 +203,7 @@ def run_blocks(blocks: list[Block], folder: Path, programs: Path | None) -> list
 
 
 def write_program(folder: Path) -> None:
-    """Write the program `warpgs` that runs short."""
+    """Write the program `warpgs` that shortens commands."""
     program = folder / "warpgs"
     program.write_text(
         f"#!{sys.executable}\nimport sys\nsys.path.insert(0, {str(ROOT)!r})\nfrom tools.run_docs import main_of_warpgs\n"
@@ -213,7 +213,7 @@ def write_program(folder: Path) -> None:
 
 
 def prepare(folder: Path, code: str, made: Path) -> None:
-    """Put into the folder of a page what its blocks use and do not make."""
+    """Put the files that the blocks of a page use but do not make into its folder."""
     own = {word.strip("'\"),").rstrip("/") for word in re.findall(r"(?:warpgs demo |--out[ =]|out=)(\S+)", code)}
     for name in INPUTS:
         if name not in own and re.search(rf"(?<![\w./-]){re.escape(name)}\b", code):
@@ -222,7 +222,7 @@ def prepare(folder: Path, code: str, made: Path) -> None:
 
 
 def run_page(page: str, made: Path, programs: Path) -> tuple[int, list[str], list[str]]:
-    """Run the blocks of a page; return how many ran, a line for each that failed, and one for each line left out."""
+    """Run the blocks of a page; return their number, a line for each failed block, and one for each left-out line."""
     blocks = collect(page, (ROOT / page).read_text("utf-8"))
     folder = made.parent / page.replace("/", "-")
     folder.mkdir()
@@ -245,9 +245,9 @@ def install(folder: Path) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all pages, or those named; return 1 where a block failed."""
+    """Run all pages, or the named ones; return 1 if a block failed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("page", nargs="*", help="a page, such as README.md or docs/mesh.md; all where none is given")
+    parser.add_argument("page", nargs="*", help="a page, such as README.md or docs/mesh.md; default: all")
     parser.add_argument("--install", action="store_true", help=f"type {INSTALL} in a fresh copy, with a network")
     a = parser.parse_args(arguments)
     unknown = [page for page in a.page if page not in pages()]
@@ -265,7 +265,7 @@ def main(arguments: list[str] | None = None) -> int:
         write_program(programs)
         why = _run(["bash", "-e", "-c", MAKE_INPUTS], made, programs)
         if why:
-            print(f"what pages start from could not be made: {why}")
+            print(f"the inputs of pages could not be made: {why}")
             return 1
         for page in a.page or pages():
             ran, wrong, rest = run_page(page, made, programs)

@@ -1,9 +1,9 @@
 """Held-out errors by the number of training views that saw a pixel, under two settings and over seeds, with a picture.
 
-The classes follow the depth of each fit, so those of two fits are other pixels. Pixels that are unseen in both fits of a seed,
-the first and the second of --presets, are compared, too.
---picture draws the parts of held-out views with the largest error that no training view saw, from the fits of the first seed;
-their renders lie in --work. Rows that --out holds are kept when the command is given again.
+Classes depend on the depth of each fit, so a class has different pixels in different fits. The first and the second of
+--presets are therefore also compared over the pixels that are unseen in both fits of a seed.
+--picture writes an image of the unseen parts of held-out views with the largest error, from the fits of the first seed; the
+renders are in --work. Rows in --out are kept when the command is repeated.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ COLUMNS = {"share_of_pixels": "pixels [%]", "share_of_error": "error [%]", "psnr
 
 
 def line(row: dict) -> str:
-    """Return a result in words."""
+    """Return a result as text."""
     unseen = row["classes"].get("0", {"share_of_pixels": 0, "share_of_error": 0})
     return (
         f"{row['psnr']:.2f} dB  SSIM {row['ssim']:.3f}  {row['gaussians']:,} Gaussians; unseen: "
@@ -53,14 +53,14 @@ def table(rows: list[dict]) -> str:
 
 
 def pairs(work: Path, fits: list[Fit], presets: list[str]) -> dict[tuple[str, int], tuple[Path, Path]]:
-    """Return the files of both fits, before and after, by row and seed, where both are there."""
+    """Return the files of both fits, before and after, by row and seed, if both exist."""
     files = {(f.row, f.seed, f.preset): renders_of(work, f) for f in fits}
     found = {(f.row, f.seed): (files[f.row, f.seed, presets[0]], files[f.row, f.seed, presets[1]]) for f in fits}
     return {key: pair for key, pair in found.items() if all(file.is_file() for file in pair)}
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, print the table and draw the picture; return the exit code."""
+    """Measure, print the table and write the image; return the exit code."""
     a = parse(
         __doc__, arguments, {"data": Path}, ("out", "work"), rows=["fern:3", "horns:3"], presets=[BEFORE, "default"], seeds=3,
         jobs=1, seconds=math.inf, shrink=1, device="auto", work=Path, out=Path, picture=Path,

@@ -1,8 +1,9 @@
 """Farms of small fits: equal bytes and time by engine, and fits per hour by scenes that share a GPU and by GPUs.
 
-`engines` fits demo scenes one by one with `warpgs fit`, and then by each engine; it also kills a worker during a job, and
-starts two farms on one folder. `packing` needs CUDA: every slot of a GPU gets --fits fits of one scene, with a seed each, after
-a tiny one that starts its process; first on one GPU with several numbers of slots, then with the best one on several GPUs.
+`engines` fits demo scenes one by one with `warpgs fit`, and then with each engine; it also kills a worker during a job, and
+starts two farms on one folder. `packing` needs CUDA. Every slot of a GPU gets --fits fits of one scene, each with its own seed,
+after a tiny fit that starts the process of the slot. It runs on one GPU with several numbers of slots, then with the best
+number on several GPUs.
 """
 
 from __future__ import annotations
@@ -104,7 +105,7 @@ def kill_once(killed: list[str]) -> Callable[[list[JobStatus], Engine], None]:
 
 
 def shared(scenes: dict[str, Path], folder: Path, out: Path, steps: int) -> dict:
-    """Start two farms of one slot each on one folder; return their time, and the most often that a scene was fitted."""
+    """Start two farms of one slot each on one folder; return their time, and the largest number of fits of a scene."""
     began = time.perf_counter()
     command = farm_command(folder, out, steps, 1)
     farms = [subprocess.Popen(command, stdout=subprocess.DEVNULL) for _ in range(2)]

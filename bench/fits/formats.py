@@ -1,7 +1,7 @@
-"""Size of each file format, and its cost in PSNR on the held-out views of runs, whole and cleaned.
+"""Size of each file format, and its loss of PSNR on the held-out views of runs, whole and cleaned.
 
-A run is written in each format, read back and rendered at its held-out views. The cost of the format is the drop in PSNR
-against the model in memory. The last rows are SPZ in each version.
+A run is written in each format, read back and rendered at its held-out views. The loss is the difference in PSNR to the model
+in memory. The last rows are the versions of SPZ.
 """
 
 from __future__ import annotations

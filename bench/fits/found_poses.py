@@ -1,11 +1,12 @@
 """Fits with found poses beside fits with given ones: held-out PSNR of the same photographs, and the distance of the poses.
 
-SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; of the others
-so many train, evenly spaced. Poses are found twice: jointly, of training and held-out photographs, as the given ones were; and
-of the training photographs alone, where held-out cameras are the given ones, brought over by the similarity of the training
-cameras, with the lens that was found. Since that similarity is not exact, each held-out camera is also scored where its
-photograph fits the model best. `--refine` also fits with poses, or poses and focal length, refined; held-out cameras are then
-brought over to the refined training cameras. `--work` keeps the found scenes, for machines without pycolmap.
+SCENE is a COLMAP folder whose poses count as given, such as colmap/fern. Every eighth photograph is held out; --train of the
+others, evenly spaced, are training views. Poses are found twice. First they are found for training and held-out photographs
+jointly, like the given ones. Then they are found for the training photographs alone. In this case held-out cameras are the
+given ones after the similarity that aligns the training cameras, with the found lens. Since this similarity is not exact, each
+held-out camera is also scored at the pose where its photograph fits the model best. `--refine` also refines poses, or poses and
+focal length, in the fits; held-out cameras are then aligned with the refined training cameras. `--work` keeps the found scenes,
+for machines without pycolmap.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fits of the demo scene without and with given depth and normals: held-out scores, and errors of depth and mesh.
 
-A map is a name of `bench.lib.demo_maps.KINDS`, with `+normals` for true normals beside it. Errors are means of distances over
-the radius of the scene, as `bench.fits.mesh` measures them. Rows that --out holds are kept when the command is given again.
+A map is a name of `bench.lib.demo_maps.KINDS`, with `+normals` to add true normals. Errors are mean distances divided by the
+radius of the scene, as in `bench.fits.mesh`. Rows in --out are kept when the command is repeated.
 """
 
 from __future__ import annotations

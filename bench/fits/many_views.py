@@ -1,6 +1,6 @@
 """A fit of many photographs: the demo with 300 views, its time, steps, PSNR and peak memory.
 
-Each fit has a process of its own, so that its peak memory is its own; reading the scene counts as part of it.
+Each fit has its own process, so that peak memory is measured per fit; it includes reading the scene.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WHAT = "fits of a demo of many views: time, steps, PSNR and peak memory"
 
 
 def peak_resident() -> int:
-    """Return the most memory that this process has held [bytes] (Linux); getrusage would count its parent's, too."""
+    """Return the peak memory of this process [bytes] (Linux); getrusage would include that of the parent process."""
     return 1024 * int(re.search(r"VmHWM:\s*([0-9]+) kB", Path("/proc/self/status").read_text("ascii"))[1])
 
 

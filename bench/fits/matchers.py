@@ -1,8 +1,8 @@
 """Poses by SIFT and by the network of `--matcher`: photographs with a pose, and errors of rotations and focal length.
 
-DATA holds colmap/fern, llff/horns, fox and templeSparseRing. A set is SCENE:COUNT:CHANGE, evenly spaced photographs of a scene,
-maybe darkened, blurred or turned (dark, blur, turn). Errors are those of `bench.lib.pose_errors` against the scene's own
-cameras; "right" counts photographs whose rotation is within 5 degrees of theirs.
+DATA has the folders colmap/fern, llff/horns, fox and templeSparseRing. A set is SCENE:COUNT:CHANGE: evenly spaced photographs
+of a scene, optionally darkened, blurred or turned (dark, blur, turn). Errors are those of `bench.lib.pose_errors` against the
+scene's own cameras; "right" counts photographs with an error of rotation of at most 5 degrees.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ SETS = [
     "horns:6:turn", "temple:16:turn",
 ]  # fmt: skip
 LIGHT, NOISE = 0.01, 0.004
-"""Light that a darkened photograph gets of the original's, and standard deviation of its noise, both linear."""
+"""Brightness of a darkened photograph as a fraction of the original's, and standard deviation of its noise, both linear."""
 BLUR = 4.5 / 504
 """Standard deviation of a blurred photograph's blur, in longer sides."""
 RIGHT = 5.0
 """Largest error of the rotation [degrees] of a photograph that counts as right."""
 QUARTER = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""Turn of a camera whose image `numpy.rot90` turns once."""
+"""Rotation of a camera whose image is turned once by `numpy.rot90`."""
 
 
 def changed(image: np.ndarray, change: str, number: int) -> np.ndarray:

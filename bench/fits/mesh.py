@@ -1,8 +1,8 @@
 """Error of the mesh of a fitted demo scene against the surfaces that its images were ray cast from, and that of rendered depth.
 
-RUN is a fit of `warpgs demo` with that seed; a voxel of 0 is the default. Accuracy is the distance from the mesh to the nearest
-true surface; completeness is the distance from what the training views see, a point for each of their pixels, to the mesh.
-Distances are in scene units; the radius of the scene is half the diagonal of the box around what the training views see.
+RUN is a fit of `warpgs demo` with --seed; a voxel of 0 is the default size. Accuracy is the distance from the mesh to the
+nearest true surface. Completeness is the distance to the mesh from the true surface points at all pixels of the training views.
+Distances are in scene units; the radius of the scene is half the diagonal of the box around these points.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Objects cut out of their surroundings: held-out scores over white, rendered opacity, and the PLY over other backgrounds.
 
-Each object is that of `warpgs demo --object --seed N` with eight training views, for N from --first on; choose settings on
-other objects than those reported. Both formats hold the same views: transforms.json with RGBA images, COLMAP with cut-out
-masks. Rows that --out holds are kept when the command is given again, those that failed are tried again.
+Each object is that of `warpgs demo --object --seed N` with eight training views, for N from --first on. Choose settings on
+objects that are not reported. Both formats have the same views: transforms.json with RGBA images, COLMAP with cut-out masks.
+Rows in --out are kept when the command is repeated; failed rows are tried again.
 """
 
 from __future__ import annotations

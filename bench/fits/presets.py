@@ -1,11 +1,11 @@
 """Presets side by side, and beside gsplat's default strategy, on named rows with several seeds.
 
 A preset may carry settings: ``default:optimizer.scales_lr=0.1``, ``gsplat:steps=1000,sh_degree=0,background=mean``;
-``pruned/PRESET`` is a fit that is pruned. The views of the split are scored, or with --leave-out K training views that the
-fit did not see, by which settings may be chosen: of up to four each in turn, of more K at once. Seeds come one after the other,
-the longest fits of each first. Rows that --out holds are kept when the command is given again, failures are tried again.
-Times that were taken beside other fits stand in brackets. --fixed PRESET adds a table of bytes against quality, paired with
-that preset; --shrink N makes images smaller by a further factor, to try the command.
+``pruned/PRESET`` is a fit that is pruned afterwards. The held-out views of the split are scored. With --leave-out K, training
+views are left out and scored instead, to choose settings: each in turn if there are up to four, else K at once. Seeds run one
+after the other, the longest fits of each seed first. Rows in --out are kept when the command is repeated; failures are tried
+again. Times measured beside other fits are in brackets. --fixed PRESET adds a table of bytes against quality, paired with that
+preset; --shrink N makes images smaller by a further factor, to try the command.
 """
 
 from __future__ import annotations

@@ -2,11 +2,11 @@
 
 CASE is horns or garden. horns: PATH is a scene folder, split every:8, fitted from 112,000 random points; the set of Gaussians
 changes in the first half of the steps. garden: PATH is test_garden.npz; 2.8 million Gaussians on its points, 1920 x 1080 px, 8
-views, no growth. Started by `torchrun --nproc-per-node N -m bench.fits.ranks`. Steps are taken in series of 10, as a fit does;
-the time of a step is the median over the series in the last half. A row is put into --out, in place of one of the same case,
-batch, steps and ranks; `same_model` says whether all rows of a case have one SHA-256 of parameters, moments and statistics.
-``start_sha256`` is that of the start and of the photographs. Time in collectives is that of the first rank, between events
-around them, and includes the wait for slower ranks.
+views, no growth. Start it with `torchrun --nproc-per-node N -m bench.fits.ranks`. Steps are taken in series of 10, as in a fit;
+the time of a step is the median over the series of the last half. A row replaces the row in --out with the same case, batch,
+steps and ranks. `same_model` is true if all rows of a case have the same SHA-256 of parameters, moments and statistics;
+``start_sha256`` is that of the start and of the photographs. Time in collectives is measured on the first rank by events around
+them, and includes the wait for slower ranks.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from warpgs.runtime.ranks import Ranks, join
 from warpgs.scene import Camera, PointCloud, View
 
 SERIES = 10
-"""Steps between two times that are read."""
+"""Steps between two time measurements."""
 WHAT = "steps of several views on several GPUs: time, time in collectives, memory, and the SHA-256 of the model"
 POINTS = 112_000
-"""Random points at the start of horns, as many as a fit of it has Gaussians."""
+"""Number of random initial points for horns, about the number of Gaussians of a normal fit."""
 
 
 def horns(folder: str, batch: int, steps: int, device: torch.device, ranks: Ranks) -> Trainer:
@@ -57,7 +57,7 @@ def horns(folder: str, batch: int, steps: int, device: torch.device, ranks: Rank
 def garden(
     path: str, batch: int, steps: int, device: torch.device, ranks: Ranks, *, tiles=5, width=1920, height=1080
 ) -> Trainer:
-    """Return a trainer of Gaussians on photographed points, whose targets are renders of the same with other colours."""
+    """Return a trainer of Gaussians on photographed points; targets are renders of these with other colours."""
     gaussians, cameras = garden_inputs(path, tiles=tiles, width=width, height=height, device=device)
     other = dataclasses.replace(gaussians, sh=gaussians.sh.detach().flip(0))
     views = []
@@ -143,7 +143,7 @@ def measured(trainer: Trainer, ranks: Ranks, steps: int) -> dict:
 
 
 def keep(path: Path | None, device: torch.device, row: dict) -> list[dict]:
-    """Put a row into a result, and return all rows with what follows from several."""
+    """Put a row into a result, and return all rows with values computed from several rows."""
     rows = result_file.read(path)["rows"] if path is not None and path.is_file() else []
     key = ("case", "batch", "ranks", "steps")
     rows = [r for r in rows if [r[k] for k in key] != [row[k] for k in key]] + [row]
@@ -159,7 +159,7 @@ def keep(path: Path | None, device: torch.device, row: dict) -> list[dict]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure one case on the ranks that there are; return 1 where rows of a case are of different models."""
+    """Measure one case on all ranks; return 1 if the rows of a case have different models."""
     a = parse(
         __doc__, arguments, {"case": ("horns", "garden"), "path": str}, batch=8, steps=120, tiles=5, width=1920, height=1080,
         device="auto", out=Path,

@@ -1,12 +1,12 @@
 """Cost of slightly wrong poses, and gain of `--refine-poses`: the same fits with given, noisy and refined poses.
 
 Each training camera is turned about its centre by an angle and moved by a fraction of the cameras' extent, in random
-directions; the points of the scene stay. A model whose training cameras moved is turned and moved as a whole, too: "psnr" is of
-held-out cameras that the similarity of the true training cameras to the model's takes there, with noisy and refined poses
-alike; "psnr_as_reported" is the score that the fit itself reports, from the noisy cameras alone. With side-by-side cameras, a
-global bend of the scene is nearly unconstrained, and a similarity cannot absorb it. So "psnr_cameras_refined" is of held-out
-cameras that are then moved to where the finished model fits their photographs best, as is usual where poses are learned (Lin et
-al. 2021, BARF, arXiv 2104.06405, section 4), for all three alike. It measures the model independent of its position.
+directions; the points of the scene stay. Moved training cameras also move the model as a whole. So "psnr" uses held-out cameras
+after the similarity from the true training cameras to those of the model, for noisy and for refined poses. "psnr_as_reported"
+is the score that the fit itself reports, from the noisy cameras alone. With side-by-side cameras, a global bend of the scene is
+nearly unconstrained, and a similarity cannot absorb it. So "psnr_cameras_refined" uses held-out cameras that are then moved to
+where the finished model fits their photographs best, as is usual for learned poses (Lin et al. 2021, BARF, arXiv 2104.06405,
+section 4). This is done for all three fits. The score does not depend on the position of the model.
 """
 
 import dataclasses
@@ -58,7 +58,7 @@ def relative_errors(cameras: dict[str, Camera], truth: dict[str, Camera], names:
 
 
 def figures(fit: warpgs.FitResult, truth: Scene, train: tuple[str, ...], test: tuple[str, ...]) -> dict[str, Any]:
-    """Return the scores of a fit, and how far its training cameras are from the true ones."""
+    """Return the scores of a fit, and the errors of its training cameras."""
     true, found = {v.name: v.camera for v in truth.views}, fit.scene_cameras
     cameras = similar_cameras(true, [true[n] for n in train], [found[n] for n in train], test)
     views = [dataclasses.replace(truth.view(n), camera=cameras[n]) for n in test]

@@ -1,10 +1,9 @@
 """Methods under one rule, side by side on named rows with several seeds; the ladder from plain 3DGS to the method; an ablation.
 
-All arms of a set start from the same points, stand before the same background, have the same degree and are scored alike. Where
-an arm lists several numbers of steps, training views left out choose: of up to four each in turn, the middle one first, or only
-the first --folds of them; of more, two at once. Then all training views are fitted, seed by seed, so that every arm has one
-seed before one has two. Rows that --out holds are kept when the command is given again. --arms N takes the first N arms of the
-set.
+All arms of a set have the same initial points, background, degree and scores. If an arm lists several numbers of steps, the
+number is chosen by scores on left-out training views: each in turn if there are up to four, the middle one first, or only the
+first --folds of them; else two at once. Then all training views are fitted, seed by seed: every arm has a first seed before any
+arm has a second one. Rows in --out are kept when the command is repeated. --arms N selects the first N arms of the set.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from warpgs.errors import UsageError, WarpgsError
 from warpgs.pipeline.runs.request import choose_device
 
 LEFT_OUT = 2
-"""Training views left out at once where there are more than four; of fewer, each in turn."""
+"""Number of training views that are left out at once if there are more than four; else each is left out in turn."""
 WHAT = "scores, sizes and times of methods by row and seed, under one rule"
 
 

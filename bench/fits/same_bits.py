@@ -1,10 +1,10 @@
 """The bits that a fit gives on this processor: the SHA-256 of every stage from photographs to PLY, beside other processors.
 
-Prints a line for each stage of `bench.lib.same_bits` with the first 12 digits of its SHA-256, puts a row into the result
-``--out`` (in place of one of the same label, processor and arguments), and names the stages that differ from the first row of
-the same arguments and kind of device. ``--avx2``: every library takes the code that it has for processors without AVX-512, and
-Warp compiles for Haswell. ``--starts``: each fit stops before its first step. ``--scene``: a demo of these views and size that
-`warpgs demo` wrote on another machine.
+Prints a line for each stage of `bench.lib.same_bits` with the first 12 digits of its SHA-256. Writes a row into the result
+``--out``, replacing a row with the same label, processor and arguments. Names the stages that differ from the first row with
+the same arguments and kind of device. ``--avx2``: every library uses its code for processors without AVX-512, and Warp compiles
+for Haswell. ``--starts``: each fit stops before its first step. ``--scene``: a demo with these views and this size that `warpgs
+demo` wrote on another machine.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ AVX2 = {
     "OPENCV_CPU_DISABLE": "AVX512-SKX",
     "OPENCV_IPP": "avx2",
 }
-"""Environment variables by which libraries take their code for processors without AVX-512."""
+"""Environment variables that make libraries use their code for processors without AVX-512."""
 VARIABLES = (*AVX2, "MKL_CBWR", "GLIBC_TUNABLES")
 """All variables of that kind that a row records."""
 FEATURES = ("sse4_2", "avx", "fma", "avx2", "avx512f", "avx512_bf16", "avx512_fp16", "amx_tile")
 
 
 def _features() -> list[str]:
-    """Return the vector extensions that matter, as the kernel names them; none where it does not say."""
+    """Return the relevant vector extensions by their names in the Linux kernel; none if these are unknown."""
     try:
         flags = next(line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("flags")).split()
     except (OSError, StopIteration):
@@ -50,14 +50,14 @@ def _features() -> list[str]:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of further libraries that decide bits."""
+    """Return the versions of further libraries that affect bits."""
     names = ("numpy", "opencv-contrib-python-headless")
     found = {n: importlib.metadata.version(n) for n in names}
     return found | {"libc": " ".join(platform.libc_ver())}
 
 
 def row(device: torch.device, label: str, arguments: dict, given: Path | None) -> dict:
-    """Return one row of the table: the machine, what decides the code it runs, and the digest of each stage."""
+    """Return one row of the table: the machine, the settings that select its code, and the digest of each stage."""
     head = result_file.result(WHAT, device, [])
     kept = {name: head[name] for name in ("command", "commit", "date", "machine", "versions")}
     record = {"label": label, "arguments": arguments} | kept | {
@@ -82,7 +82,7 @@ def _set_threads(count: int) -> None:
 
 
 def _compile_for(target: str) -> None:
-    """Have Warp compile the CPU kernels that are not made yet for another processor than this one."""
+    """Let Warp compile further CPU kernels for a processor other than this one."""
     flag = f"-target-cpu {target}"
     warp.config.cpu_compiler_flags = warp.config.cpu_compiler_flags.replace("-march=native", flag)
     for options in (EXACT, ROLLED):

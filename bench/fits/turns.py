@@ -1,9 +1,8 @@
 """Two checkouts in turn on one machine: wall time, start, and held-out PSNR of the whole command `warpgs fit`.
 
-OLD and NEW are folders of the two checkouts; each has a kernel cache of its own, filled before the first round. SCENES are
-folders, or FOLDER@SPLIT where they are split in different ways. With several sets of --cores as many scenes run at the same
-time. The order of the checkouts changes from round to round. Everything from the start of the process to its end counts as
-wall time.
+OLD and NEW are folders of the two checkouts; each has its own kernel cache, filled before the first round. SCENES are folders,
+or FOLDER@SPLIT for different splits. With several sets of --cores, one scene runs on each set at the same time. The order of
+the checkouts changes from round to round. Wall time is measured from the start to the end of the process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Time of the sizes at which N Gaussians reach none of 32 cameras."""
+"""Time of computing the largest sizes at which N Gaussians reach none of 32 cameras."""
 
 import torch
 

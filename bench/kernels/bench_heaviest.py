@@ -1,4 +1,4 @@
-"""Time of the 8 heaviest of N binned Gaussians in each pixel."""
+"""Time of finding the 8 heaviest of N binned Gaussians in each pixel."""
 
 from bench.lib.pairs import binned
 from bench.lib.timing import OURS, Task

@@ -1,4 +1,4 @@
-"""Time of the median depth of N binned Gaussians."""
+"""Time of computing the median depth of N binned Gaussians."""
 
 from bench.lib.pairs import binned
 from bench.lib.timing import OURS, Task

@@ -1,4 +1,4 @@
-"""Time of the sizes of a pixel at N Gaussians, of 32 cameras."""
+"""Time of computing the pixel sizes of 32 cameras at N Gaussians."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""Time of the matching costs of an image with four others, on a CPU."""
+"""Time of computing the matching costs of an image with four others, on a CPU."""
 
 import numpy as np
 

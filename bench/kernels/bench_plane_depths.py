@@ -1,4 +1,4 @@
-"""Time of the best of the planes of each pixel, on a CPU."""
+"""Time of choosing the best plane of each pixel, on a CPU."""
 
 import numpy as np
 import torch

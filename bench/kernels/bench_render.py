@@ -11,7 +11,7 @@ AXES = ("count", "image", "degree", "cameras", "threads")
 PROGRAMS = {OURS: ("forward", "both"), **dict.fromkeys(peers.RASTERIZERS, ("forward", "both"))}
 
 LARGEST = {peers.DENSE: 1_000}
-"""Most Gaussians that a peer is given at all."""
+"""Largest number of Gaussians for a peer."""
 
 
 def tasks(point, device, wanted):

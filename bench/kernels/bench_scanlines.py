@@ -1,4 +1,4 @@
-"""Time of the path costs of an image's depth planes, beside numpy, a line of pixels at a time."""
+"""Time of computing the path costs of an image's depth planes, beside numpy, which takes a line of pixels at a time."""
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ PLANES = 64
 
 
 def path_costs(costs: np.ndarray, image: np.ndarray, small_step: float, large_step: float, *, down: bool) -> np.ndarray:
-    """Return the sum of the path costs along columns or rows, in numpy, which runs in parallel on several threads."""
+    """Return the sum of the path costs along columns or rows, in numpy, to run in parallel on several threads."""
     total = np.zeros_like(costs)
     c, t, colors = (a if down else a.swapaxes(0, 1) for a in (costs, total, image))
     bounds, small = step_limits(colors, small_step, large_step), np.int16(round(small_step * UNIT))

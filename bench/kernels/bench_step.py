@@ -1,7 +1,7 @@
 """Time of a training step: rendering, photometric loss, backward pass, Adam over all parameters.
 
-Learning rates are next to nothing, so that every repeat renders the same scene. The peer is what trainers are often made of:
-gsplat's rendering, the loss in plain torch, torch's fused Adam.
+Learning rates are nearly zero, so that every repeat renders the same scene. The peer has the usual parts of trainers: gsplat's
+rendering, the loss in plain torch, torch's fused Adam.
 """
 
 import torch
@@ -16,7 +16,7 @@ LR = 1e-12
 
 
 def cost(point, device) -> roofline.Cost:
-    """Return the cost of all stages together; the loss besides SSIM is a few bytes a pixel and left out."""
+    """Return the cost of all stages together; the rest of the loss besides SSIM, a few bytes per pixel, is left out."""
     numbers = point.count * (11 + 3 * (point.degree + 1) ** 2)
     total = roofline.adam(numbers)
     for stage in (*image_costs(point, device), *roofline.ssim(point.pixels)):

@@ -1,4 +1,4 @@
-"""Time of a captured step besides rendering and learning: it finds its view and rates, and stores its result."""
+"""Time of the parts of a captured step other than rendering and learning: reading its view and rates, storing its result."""
 
 import torch
 

@@ -1,7 +1,7 @@
-"""The price of determinism: ordered and atomic sums of gradients, time, memory and whether bits repeat.
+"""The cost of determinism: ordered and atomic sums of gradients, time, memory and whether bits repeat.
 
-Ours in both modes, and naive kernels whose atomics are plain, or made repeatable by Warp (`wp.DeterministicMode`). On a CPU all
-modes run the same code and give the same figures; the program notes this.
+Measured are our kernels in both modes, and naive kernels with plain atomics or with atomics made repeatable by Warp
+(`wp.DeterministicMode`). On a CPU all modes run the same code and give the same results; the program prints a note.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def works_of(g: Gaussians, cam: Camera) -> dict[str, Callable[[], tuple[torch.Te
 
 
 def repeats_that_differ(work: Callable[[], tuple[torch.Tensor, ...]], repeats: int) -> int:
-    """Return how many repeats differ in bits from the first."""
+    """Return the number of repeats that differ in bits from the first one."""
     first = work()
     return sum(not all(map(torch.equal, first, work())) for _ in range(repeats - 1))
 

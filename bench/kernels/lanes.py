@@ -1,12 +1,11 @@
 """CPU blending per lane, against naive kernels, on a seeded cloud; prints the contents of the cloud.
 
-A lane is one (Gaussian, pixel) pair that the inner loop evaluates: those of the strips of eight pixels that the Gaussian's
-ellipse touches, until the last pixel of the strip is finished. The forward pass looks for finished strips once for each
-batch, and so evaluates a few more. A boxed lane is a pixel of a row of the tile that the box touches, until the tile is
-finished: what was evaluated while boxes were clipped by rows alone, and what a kernel that clips less may be compared by.
-The naive kernels have no box: a thread walks its tile's list. All times are those of the whole op, its memory included.
-Interleaved, and the minimum of each, because other work on the machine only ever adds; one thread by its CPU time, two by
-the clock on the wall.
+A lane is one (Gaussian, pixel) pair that the inner loop evaluates. Lanes are in strips of eight pixels that the Gaussian's
+ellipse touches, until the last pixel of the strip is finished. The forward pass checks for finished strips once per batch, and
+so evaluates a few more. A boxed lane is a pixel of a row of the tile that the Gaussian's box touches, until the tile is
+finished. A kernel that clips boxes by rows alone evaluates boxed lanes. The naive kernels have no box: a thread reads its
+tile's list. All times are those of the whole op, including memory. Programs run interleaved, and the minimum of each is
+reported, because other work on the machine only adds time. One thread is measured by CPU time, two threads by wall time.
 """
 
 from __future__ import annotations
@@ -28,9 +27,9 @@ from warpgs.kernels.tiles import Tiles, bin_tiles
 
 WIDTH, HEIGHT = 512, 384
 SIGMAS = (2.0, 12.0)
-"""Standard deviations on the image [px], log-uniform, the two axes apart."""
+"""Range of the standard deviations on the image [px], log-uniform, sampled separately for both axes."""
 OPACITIES = (0.02, 0.5)
-"""Log-uniform."""
+"""Range of the opacities, log-uniform."""
 
 
 def cloud(count: int) -> tuple[torch.Tensor, Tiles]:
@@ -81,7 +80,7 @@ def lanes(projected: torch.Tensor, tiles: Tiles, pixel_ends: torch.Tensor) -> tu
 
 
 def fastest(works: dict[str, Callable[[], object]], repeats: int, clock: Callable[[], int]) -> dict[str, float]:
-    """Return the smallest time of each [ns]; they run in turn."""
+    """Return the shortest time of each function [ns]; the functions run in turn."""
     best = dict.fromkeys(works, float("inf"))
     for _ in range(repeats):
         for name, work in works.items():
@@ -92,7 +91,7 @@ def fastest(works: dict[str, Callable[[], object]], repeats: int, clock: Callabl
 
 
 def main() -> None:
-    """Print the inputs, then nanoseconds per lane, the naive kernels' and the ratio, and what a second thread gives."""
+    """Print the inputs, then nanoseconds per lane, the times of naive kernels, ratios, and the speed-up by a second thread."""
     a = parse(__doc__, repeats=15, gaussians=20_000)
     size, rule, background = {"width": WIDTH, "height": HEIGHT}, RULES["exact"], torch.zeros(1, 3)
     projected, tiles = cloud(a.gaussians)

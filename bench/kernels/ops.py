@@ -1,8 +1,8 @@
 """Time of all ops, of the whole image and of a training step over sizes, beside peers and a roofline of the machine.
 
-Points are measured from the lightest to the heaviest, all ops at each, so that what a time budget [s] cuts off is the far end
-of every series; it is skipped and listed. ``--again`` measures only what --out lacks, or what other programs disturbed.
-``--tiny``: sizes that only show that it runs. `python -m bench.document` turns the results into docs/performance.md.
+Points are measured from the lightest to the heaviest, all ops at each. So a time budget [s] cuts off the end of every series;
+the skipped points are listed. ``--again`` measures only rows that --out lacks, or that other programs disturbed. ``--tiny``:
+small sizes, for tests. `python -m bench.document` turns the results into docs/performance.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A training step on a CPU from two checkouts in turn, on a seeded cloud: wall time and processor time of a step.
 
-OLD and NEW are folders of two checkouts. A process of each waits while the other steps, with a kernel cache of its own.
-Processor time is that of all threads, and disturbed less by other programs. ``--targets haswell`` compiles for processors
+OLD and NEW are folders of two checkouts. Each has a process with its own kernel cache, which waits while the other one steps.
+Processor time is the sum over all threads; other programs disturb it less. ``--targets haswell`` compiles for processors
 without AVX-512.
 """
 
@@ -47,7 +47,7 @@ for line in sys.stdin:
         times.append((1000 * (time.perf_counter() - wall), 1000 * (time.process_time() - cpu)))
     print(json.dumps(times), flush=True)
 """
-"""Program of a process, in the words of both checkouts."""
+"""Program of a process, valid in both checkouts."""
 
 
 def _process(checkout: Path, cache: Path, count: int, threads: int, target: str) -> subprocess.Popen:

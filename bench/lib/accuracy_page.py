@@ -11,7 +11,7 @@ from bench.lib import rasterizers_page, result_file, same_bits
 from bench.lib.tables import markdown
 
 RENAMED = {"gsplat": "gsplat-1.5"}
-"""Rules that had another name when results were stored."""
+"""Current names of rules that had other names when results were stored."""
 
 
 def _e(value: float) -> str:
@@ -30,7 +30,7 @@ def _worst(row: dict) -> dict[str, float]:
 
 
 def _most(rows: list[dict]) -> str:
-    """Return the largest figures over all scenes, of those lines that no column shows too."""
+    """Return the largest values over all scenes, including those without a column in the table."""
     gradients = [e for row in rows for e in row["gradients"].values()]
     images = {k: max(_worst(row)[k] for row in rows) for k in ("E mean", "E max", "E depth")}
     of = {k: _e(max(e[k] for e in gradients)) for k in ("rel L2", "1 - cosine", "bias")}
@@ -67,7 +67,7 @@ def budget_text(results: dict[str, dict]) -> str:
 
 
 def needles_text(results: dict[str, dict]) -> str:
-    """Return a table of the first machine: largest errors by length, and how many times better the factor form is."""
+    """Return a table of the first machine: largest errors by length, and ratios of errors to those of the factor form."""
     parts = []
     for stem, result in list(results.items())[:1]:
         rows = []

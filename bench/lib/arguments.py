@@ -1,4 +1,4 @@
-"""Command lines of the programs: places and flags from their defaults, with the same words for the same flag everywhere."""
+"""Command lines of the programs: positional arguments, and flags by their defaults, with the same help for the same flag."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ WORDS = {
     "downscale": "factor by which both sides of images shrink",
     "first_seed": "so that several processes can share the work",
     "folds": "most fits that leave training views out, for each number of steps; fewer are faster and less certain",
-    "jobs": "fits at a time; times mean something with 1 alone",
+    "jobs": "fits at a time; times are meaningful only with 1",
     "only": "a configuration's name, or its beginning",
-    "out": "JSON file to write; finished rows are kept where the program says so",
+    "out": "JSON file to write; many programs keep its finished rows",
     "presets": "presets, also with settings: default:steps=500,optimizer.scales_lr=0.1",
-    "programs": "names of the programs to run; all where not given",
+    "programs": "names of the programs to run; default: all",
     "rows": "named rows, or FOLDER@SPLIT@DOWNSCALE",
-    "seconds": "after this long no further fit is begun",
+    "seconds": "time after which no further fit begins [s]",
     "seeds": "number of seeds, or the seeds themselves where the default is a list",
     "set": "comparison: rivals, ladder or ablation (bench/lib/arms.py)",
     "shrink": "factor by which both sides of images shrink further, to try the program",
     "split": "as in `warpgs fit --split`",
     "threads": "CPU threads; 0 for as many as there are",
-    "work": "folder that keeps scenes and fits; a temporary one where not given",
+    "work": "folder for scenes and fits; default: a temporary folder",
 }
 """Help of flags that several programs have."""
 
 
 class _Help(argparse.RawDescriptionHelpFormatter, argparse.ArgumentDefaultsHelpFormatter):
-    """The docstring as it stands, and the default behind each flag."""
+    """Show the docstring unchanged, and the default of each flag."""
 
 
 def parse(
     doc: str, given: list[str] | None = None, places: dict | None = None, need: tuple[str, ...] = (), **flags
 ) -> argparse.Namespace:
-    """Return what a command line gives.
+    """Parse a command line.
 
     Args:
         doc: Docstring of the program.
-        given: Words of the command line; None for those of this process.
-        places: Positional words by name, with their type; a list of one type for one or more words, a tuple for one of these
-            words. A name that ends in ``?`` may be left out.
-        need: Flags that must be given.
-        **flags: Default of each flag by name. A type takes one word and is None where not given; False makes a switch; a
-            list takes several words, a list of one type is empty where not given.
+        given: Arguments of the command line; None for those of this process.
+        places: Types of positional arguments by name; a list of one type for one or more arguments, a tuple for a choice. An
+            argument whose name ends in ``?`` is optional.
+        need: Required flags.
+        **flags: Default of each flag by name. A type means one argument, by default None; False means a switch; a list means
+            several arguments; a list of one type is empty by default.
     """
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     program = f"python -m {spec.name}" if spec else None
@@ -72,4 +72,4 @@ def parse(
 
 
 SCENE = {"scene": Path}
-"""The place of most programs: one scene folder."""
+"""Positional argument of most programs: one scene folder."""

@@ -14,7 +14,7 @@ ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,ini
 """Start, background and degree of `default`, without its extrapolated points; the degree follows from the number of views."""
 NO_EXTRAPOLATION = "init.extrapolate=false"
 STEPS = (500, 1000, 2000)
-"""Numbers of steps that training views left out choose from."""
+"""Numbers of steps, of which one is chosen by scores on left-out training views."""
 SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
 NO_GROWTH = "density.gradient=1e9"
 
@@ -80,17 +80,17 @@ ARMS = {"rivals": RIVALS, "ladder": LADDER, "ablation": ABLATION}
 
 
 def steps_in(preset: str) -> int:
-    """Return the steps that a preset names; those of `default` for few views where it names none."""
+    """Return the steps that a preset sets, else those of `default` for few views."""
     return int(match[1]) if (match := re.search(r"[:,]steps=(\d+)", preset)) else OPAQUE_STEPS
 
 
 def chosen_steps(rows: list[dict], row: str, arm: Arm) -> int:
-    """Return the steps of best PSNR on the training views left out of a row, the mean over views.
+    """Return the number of steps with the best mean PSNR over the left-out training views of a row.
 
-    A tuning that was cut short chooses among the numbers that most views were left out for.
+    If the tuning was cut short, only the numbers that were tried on the most views are compared.
 
     Raises:
-        UsageError: None was measured.
+        UsageError: No number of steps was measured.
     """
     found = defaultdict(list)
     for r in rows:

@@ -1,4 +1,4 @@
-"""Images and gradients with ordered and with atomic sums, and how far atomic ones spread."""
+"""Images and gradients with ordered and with atomic sums, and the spread of atomic sums."""
 
 from __future__ import annotations
 
@@ -31,8 +31,8 @@ def atomic_spread(g: Gaussians, cam: Camera, repeats: int) -> dict[str, dict]:
     """Return the distance of the gradients of repeated atomic sums from the ordered ones, by parameter.
 
     ``rel_l2``: largest relative L2 distance of a repeat from the ordered sum. ``max_ulp``: largest distance of an entry that
-    is at least a thousandth of its tensor's largest, in units in the last place. ``repeats_that_differ``: how many repeats
-    are not the bits of the first.
+    is at least a thousandth of its tensor's largest, in units in the last place. ``repeats_that_differ``: number of repeats
+    whose bits differ from the first.
     """
     wanted = gradients_of(g, cam, deterministic=True)[3:]
     names = list(g.tensors())

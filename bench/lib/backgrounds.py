@@ -17,7 +17,7 @@ PATTERN = ((0.9, 0.75, 0.2), (0.15, 0.3, 0.6))
 
 
 def backgrounds(height: int, width: int) -> dict[str, np.ndarray]:
-    """Return the images to put an object before by name, colours in [0, 1], float32, shape [H, W, 3] each."""
+    """Return background images by name, colours in [0, 1], float32, shape [H, W, 3] each."""
     odd = (np.indices((height, width)) // SQUARE).sum(0) % 2 == 1
     pattern = np.where(odd[..., None], *(np.array(c, np.float32) for c in PATTERN))
     plain = {name: np.full((height, width, 3), value, np.float32) for name, value in (("black", 0), ("white", 1))}
@@ -25,7 +25,7 @@ def backgrounds(height: int, width: int) -> dict[str, np.ndarray]:
 
 
 def over(view: View, behind: np.ndarray, ours: tuple[float, float, float]) -> np.ndarray:
-    """Return a view's image [H, W, 3] before another background [H, W, 3] or [3] than its own."""
+    """Return a view's image [H, W, 3] over a background [H, W, 3] or [3] other than its own."""
     shown: np.ndarray = view.image + (1 - view.alpha[..., None]) * (behind - np.float32(ours))
     return np.clip(shown, 0, 1)
 

@@ -1,11 +1,11 @@
-"""Small scenes for which cut-offs and rounding are hard: random ones, and ones made against each cut-off."""
+"""Small scenes that are difficult for cut-offs and rounding: random scenes, and adversarial scenes for each cut-off."""
 
 import torch
 
 from warpgs.scene import Camera, Gaussians
 
 KINDS = ("random", "haze", "needles", "far", "huge", "opaque", "close", "at cuts", "bright", "displaced")
-"""Kinds of scenes; number n is of kind n modulo their count."""
+"""Kinds of scenes; scene n has kind n modulo their count."""
 WIDTH, HEIGHT = 24, 20
 
 

@@ -1,7 +1,7 @@
 """Bytes of the buffers of a render with gradients on CUDA, as the kernels declare them, and the moments at which they exist.
 
-One camera, three channels, gradients in the five tensors. Upstream gradients and the Gaussians themselves are inputs, and do
-not count, nor does alpha, which nobody keeps. A sort takes memory from Warp's pool before these are at their peak.
+The sizes are for one camera, three channels, and gradients of the five tensors. Upstream gradients and Gaussians are inputs and
+are not counted; alpha is not counted because it is not kept. A sort takes memory from Warp's pool before these buffers peak.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from warpgs.kernels.tiles import grid
 from warpgs.render.graphed import CAPACITY_FACTOR, SPARE
 
 REAL = 4
-"""Bytes of a number."""
+"""Size of a number [bytes]."""
 PAIRS = 4 * REAL
 """Bytes of an instance in the lists: tile and slot, each in a sort buffer of twice the size."""
 TILE = 16
@@ -50,7 +50,7 @@ MOMENTS = (BLEND, PROJECT)
 
 
 def buffers(n: Counts, deterministic: bool = True) -> dict[str, tuple[int, tuple[str, ...]]]:
-    """Return bytes, and the moments at which they are held, of each buffer by name; atomic calls are not recorded."""
+    """Return the size of each buffer [bytes], and the moments at which it exists, by name; atomic calls are not recorded."""
     state = STATE * TILE * TILE * REAL // chunk_of(n.tiles, deterministic)
     slot = STRIDE * REAL if deterministic else 0
     spare = (CAPACITY_FACTOR - 1) * n.instances + SPARE, (CAPACITY_FACTOR - 1) * n.visible + SPARE
@@ -70,6 +70,6 @@ def buffers(n: Counts, deterministic: bool = True) -> dict[str, tuple[int, tuple
 
 
 def at_most(n: Counts, deterministic: bool = True) -> int:
-    """Return the bytes that are held at the larger of the moments."""
+    """Return the bytes at the moment with the most memory."""
     held = buffers(n, deterministic).values()
     return max(sum(size for size, moments in held if moment in moments) for moment in MOMENTS)

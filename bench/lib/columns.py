@@ -1,4 +1,4 @@
-"""Statistics of the columns of Gaussians as files hold them, and how far two of them differ."""
+"""Statistics of the columns of Gaussians in files, and differences of two such statistics."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ STATISTICS = ("min", "max", "mean", "stdDev")
 
 
 def statistics(gaussians: Gaussians, axes: bool = False) -> dict[str, list[float]]:
-    """Return least, largest, mean and standard deviation of each column, as splat-transform names and reports them.
+    """Return least, largest, mean and standard deviation of each column, with the names of splat-transform.
 
-    It computes them from the columns of PLY, and reports scales, opacities and colours after activation.
+    splat-transform computes them from the columns of PLY, and reports scales, opacities and colours after activation.
 
     Args:
         gaussians: N Gaussians.
@@ -39,7 +39,7 @@ def statistics(gaussians: Gaussians, axes: bool = False) -> dict[str, list[float
 
 
 def difference(ours: dict[str, list[float]], theirs: dict[str, list[float]]) -> dict:
-    """Return the largest difference of two statistics in parts of the range of its column, and where it is."""
+    """Return the largest difference of two statistics as a fraction of the column's range, and its place."""
     worst = {"largest_of_range": 0.0, "column": "", "columns": len(ours), "same_columns": set(ours) <= set(theirs)}
     for name in (n for n in ours if n in theirs):
         low, high = ours[name][:2]

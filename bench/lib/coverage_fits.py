@@ -1,4 +1,4 @@
-"""Errors of a fit's held-out views by coverage, and a picture of what no training view saw under two settings."""
+"""Errors of a fit's held-out views by coverage, and an image of unseen areas under two settings."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from warpgs.report.crops import crops
 from warpgs.report.sheet import Cell, Strip, sheet
 
 PARTS = 3
-"""A crop has this fraction of each side of an image."""
+"""Side of a crop as a fraction of the image's side."""
 HEADINGS = ["before", "after", "photograph", "striped: seen by no training view"]
-"""Headings of the columns of the picture."""
+"""Headings of the columns of the image."""
 QUALITY = 75
 """Quality of the JPEG file, from 0 to 100."""
 
@@ -55,12 +55,12 @@ def measure(folder: Path, fit: Fit) -> dict:
 
 
 def worst_parts(before: dict, after: dict, count: int) -> list[tuple[int, int, int, int, int]]:
-    """Return the parts of held-out views with the largest squared error, of both fits, where no training view saw a thing.
+    """Return the unseen parts of held-out views with the largest squared error of both fits.
 
     Args:
         before: Arrays of a fit as `measure` writes them: 8-bit ``photo`` and ``render`` [V, H, W, 3], and ``unseen`` [V, H, W].
         after: The same of another fit of the same views; a pixel counts where it is unseen in both.
-        count: Number of parts, each of another view.
+        count: Number of parts, each from a different view.
 
     Returns:
         View, x, y, width and height [px] of each, largest error first.
@@ -76,7 +76,7 @@ def worst_parts(before: dict, after: dict, count: int) -> list[tuple[int, int, i
 
 
 def unseen_in_both(before: Path, after: Path) -> dict:
-    """Return what two fits of the same views score where neither fit's depth shows a point that a training view saw.
+    """Return scores of two fits over the pixels that are unseen in both.
 
     Args:
         before: File that `measure` wrote.
@@ -119,7 +119,7 @@ def picture(rows: dict[str, tuple[Path, Path]], count: int = 2) -> bytes:
 
 
 def _psnr(image: np.ndarray, photo: np.ndarray, pixels: np.ndarray) -> str:
-    """Return the PSNR over some pixels in words."""
+    """Return the PSNR over some pixels as text."""
     if not pixels.any():
         return "none"
     return f"{psnr_of(float(np.square(image - photo)[pixels].mean())):.1f} dB"

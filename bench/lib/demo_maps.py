@@ -1,4 +1,4 @@
-"""Maps of the demo scene as from sensors, laser scanners and networks, made from its true depth and normals."""
+"""Simulated maps of sensors, laser scanners and networks for the demo scene, from its true depth and normals."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from warpgs.scene import Camera
 from warpgs.synthetic import raycast
 
 KINDS = {"none": "", "exact": "metric", "noise": "metric", "sparse": "metric", "relative": "disparity", "bent": "disparity"}
-"""Kind of the depth maps by name: none; the true depth, with 1 % noise, at 2 % of the pixels with 1 % noise; inverse depth of a
-random scale and shift for each view with 1 % noise, and the same bent by a smooth error of 5 %, as networks err."""
+"""Kind of the depth maps by name: none; true depth; true depth with 1 % noise; the same at 2 % of the pixels; inverse depth
+with 1 % noise and a random scale and shift for each view; and the same with a smooth error of 5 %, as of networks."""
 NOISE, SPARSE, BENT = 0.01, 0.02, 0.05
 WAVES = 3
 """Periods of the smooth error across the image."""

@@ -1,4 +1,4 @@
-"""Scenes that do not change, for weighing speed against accuracy: what training makes, and what strains arithmetic."""
+"""Fixed scenes for comparing speed and accuracy: scenes like those of training, and scenes that are hard for arithmetic."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Frozen:
 
     name: str
     what: str
-    """It in words."""
+    """Description of the scene."""
     gaussians: Gaussians
     """Float32, on the device."""
     camera: Camera
@@ -109,7 +109,7 @@ FAR = 1000.0
 def scenes(
     device: torch.device, width: int, height: int, count: int, run: Path | None, seed: int
 ) -> list[Callable[[], Frozen]]:
-    """Return a maker for each scene; ``run`` is a folder that a fit filled, whose first view then is the first scene."""
+    """Return a function for each scene; ``run`` is a run folder whose first view is added as the first scene."""
     camera = inputs.camera(width, height, torch.device("cpu"))
     camera = Camera(camera.viewmat[0].double().numpy(), camera.K[0].double().numpy(), width, height)
 

@@ -1,4 +1,4 @@
-"""GPU time of a work by the driver's tracer, and the memory that it takes at most."""
+"""GPU time of a function by the driver's tracer, and its peak memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import warp as wp
 from warpgs import clear_graph_cache
 
 TRACES = 3
-"""Short traces instead of a long one: they give a spread, and drop no events."""
+"""Number of traces: several short traces give a spread and, unlike one long trace, lose no events."""
 WARM_UP = 5
 
 
@@ -48,8 +48,8 @@ def _set_aside() -> int:
 def peak_memory(work: Callable[[], object]) -> float:
     """Return the memory above what was loaded before [MiB]: torch's high-water mark, and that of Warp's pool where it grew.
 
-    Where a loop of ``work`` is captured, all memory counts that is set aside for graphs, which that mark does not show: in
-    whole segments, so rather too much.
+    If ``work`` is captured as a graph, all memory reserved for graphs is added, which torch's mark does not include. It is
+    counted in whole segments, which is an upper bound.
     """
     clear_graph_cache()
     gc.collect()

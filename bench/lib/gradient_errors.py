@@ -5,17 +5,17 @@ from __future__ import annotations
 import torch
 
 SEEN = 1e-6
-"""A Gaussian counts from this fraction of the largest gradient of its tensor on: what is smaller moves nothing."""
+"""A Gaussian counts if its gradient is at least this fraction of the largest in its tensor: smaller ones have no effect."""
 TENSORS = ("means", "quats", "log_scales", "logit_opacities", "sh")
 
 
 def errors_of(found: torch.Tensor, wanted: torch.Tensor) -> dict:
     """Return the errors of a gradient [N, ...] against that of float64.
 
-    ``median``, ``p99`` and ``largest`` are of the length of a Gaussian's error over that of its gradient; ``rel_l2``,
-    ``one_minus_cosine`` and ``bias`` are of the whole tensor. ``bias`` is the mean error in the direction of the gradient,
-    entry by entry, over the mean magnitude: above 0 gradients are too long. ``lost`` counts Gaussians whose gradient is 0 or
-    not finite.
+    ``median``, ``p99`` and ``largest`` are statistics over Gaussians of the length of the error divided by that of the
+    gradient. ``rel_l2``, ``one_minus_cosine`` and ``bias`` are those of the whole tensor. ``bias`` is the mean error in the
+    direction of the gradient, entry by entry, over the mean magnitude: above 0 gradients are too long. ``lost`` is the number
+    of Gaussians whose gradient is 0 or not finite.
     """
     a, b = (t.detach().double().reshape(len(wanted), -1) for t in (found, wanted))
     length = b.norm(dim=1)

@@ -1,9 +1,9 @@
 """A plain training loop around gsplat's rasterizer and its two strategies, with the settings of its own example trainer.
 
-gsplat is called, never copied. The settings are those of ``examples/simple_trainer.py`` of nerfstudio-project/gsplat, of
-``mcmc`` at 90d7b4b3 (2026-08-20) and of ``default``, whose thresholds are `DefaultStrategy`'s own: `Settings` holds them, and
-`train` takes its steps in its order. Its SSIM is fused-ssim's with padding "valid": the map without the 5 pixels at each edge.
-Ours, which is fused, too, has the same values.
+gsplat is called, never copied. `Settings` has the settings of ``examples/simple_trainer.py`` of nerfstudio-project/gsplat:
+``mcmc`` at 90d7b4b3 (2026-08-20), and ``default``, with the thresholds of `DefaultStrategy`. `train` has the same operations in
+the same order as that script. The script uses fused-ssim with padding "valid", that is, the map without the 5 pixels at each
+edge. Our SSIM, which is also fused, has the same values.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
 
 BLACK = (0.0, 0.0, 0.0)
 EDGE = 5
-"""Pixels at each edge of an image that "valid" SSIM leaves out: half of its window."""
+"""Width of the image border that "valid" SSIM leaves out [px]: half of its window."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Settings:
     """mcmc or default."""
     init_opacity: float = 0.5
     init_scale: float = 0.1
-    """Width of a first Gaussian over the root mean square distance to its three neighbours."""
+    """Ratio of the initial width of a Gaussian to the root mean square distance to its three neighbours."""
     opacity_reg: float = 0.01
     scale_reg: float = 0.01
     ssim_lambda: float = 0.2
@@ -46,7 +46,7 @@ class Settings:
     sh_every: int = 1000
     """Steps after which the degree in use rises by one."""
     means_lr: float = 1.6e-4
-    """Times the size of the scene; it falls to a hundredth at the last step."""
+    """Learning rate of the means in units of the scene's size; it falls to a hundredth at the last step."""
     scales_lr: float = 5e-3
     opacities_lr: float = 5e-2
     quats_lr: float = 1e-3
@@ -59,7 +59,7 @@ class Settings:
     """Length of the schedule that `refine_stop` belongs to."""
     refine_stop: int = 25_000
     background: tuple[float, float, float] = BLACK
-    """Colour behind the scene, which its trainer leaves black."""
+    """Colour behind the scene; gsplat's trainer uses black."""
 
     @property
     def last_refinement(self) -> int:
@@ -70,8 +70,8 @@ class Settings:
 def default_settings(steps: int) -> Settings:
     """Return the settings for gsplat's default strategy, whose refinement ends at half of the steps, as at 15,000 of 30,000.
 
-    gsplat 1.6.0 resets opacities every 3000 steps up to there. 1.5.3 never does: it writes
-    ``step % reset_every == 0 & step > 0``, which Python reads as false.
+    Until the end of refinement, gsplat 1.6.0 resets opacities every 3000 steps. Version 1.5.3 never does, because its condition
+    ``step % reset_every == 0 & step > 0`` is always false in Python.
     """
     return Settings(
         steps, cap=0, strategy="default", init_opacity=0.1, init_scale=1.0, opacity_reg=0.0, scale_reg=0.0, refine_stop=15_000
@@ -79,9 +79,9 @@ def default_settings(steps: int) -> Settings:
 
 
 def own_scale(cameras: list[Camera], normalization: Normalization) -> float:
-    """Return our unit in gsplat's world, whose parser makes the median distance of the cameras from their focus 1.
+    """Return the length of our unit in gsplat's world: its parser scales the median distance of cameras to their focus to 1.
 
-    The focus is the median over cameras of the points of the optical axes that are nearest to the origin of the files.
+    The focus is the median, over cameras, of the point on the optical axis nearest to the origin of the files.
     """
     centers = np.array([c.center for c in cameras]) / normalization.scale + normalization.offset
     axes = np.array([c.viewmat[2, :3] for c in cameras])
@@ -99,7 +99,7 @@ def scene_scale(cameras: list[Camera], scale: float) -> float:
 def start(points: torch.Tensor, colors: torch.Tensor, s: Settings) -> torch.nn.ParameterDict:
     """Return the first parameters: a Gaussian for each point [N, 3] with its colour [N, 3] in [0, 1].
 
-    Coincident points get a width of 1e-9 of the unit, where gsplat's logarithm would be infinite.
+    Coincident points get a width of 1e-9 units, because otherwise the logarithm would be infinite.
     """
     count = len(points)
     widths = mean_square_distances(points).sqrt().clamp_min(1e-9) * s.init_scale
@@ -186,9 +186,9 @@ def train(
 
     Args:
         views: Training views, in our units.
-        first: Their means and colours of degree 0 are the start; all else is gsplat's.
+        first: Gaussians whose means and colours of degree 0 are the start; other initial values are gsplat's.
         s: Settings.
-        seed: Of torch, and of the order of views.
+        seed: Seed of torch, and of the order of views.
         scale: Length of our unit in gsplat's world.
         size: Size of the scene in gsplat's world.
         draw: Rasterizer, with arguments and results of `render`.
@@ -228,15 +228,15 @@ def fit(
         views: Training views.
         first: Gaussians whose means and colours are the start.
         s: Settings.
-        seed: Of torch, and of the order of views.
-        own_units: Scale the world as gsplat's parser does; else our units stay.
+        seed: Seed of torch, and of the order of views.
+        own_units: Scale the world as gsplat's parser does; else use our units.
         draw: Rasterizer, with arguments and results of `render`.
 
     Raises:
-        UsageError: The scene has another background, over which its transparent pixels lie.
+        UsageError: The scene's images are composited over a background other than that of the settings.
     """
     if any(scene.background) and scene.background != s.background:
-        raise UsageError(f"{scene.path}: its background is {scene.background}, and the settings say {s.background}")
+        raise UsageError(f"{scene.path}: its background is {scene.background}, but the settings have {s.background}")
     cameras, began = [view.camera for view in scene.views], time.perf_counter()
     unit = own_scale(cameras, scene.normalization) if own_units else 1.0
     size = scene_scale(cameras, unit)

@@ -1,8 +1,8 @@
-"""Scores of pixels by which fine Gaussians could be placed, and the gains that they are compared with.
+"""Scores of pixels for placing fine Gaussians, and gains to compare the scores with.
 
-A candidate is a fine Gaussian behind every second pixel of a training view, as an event would place it. Its gain over some
-views is what its opacity changes in their squared error: to first order from one backward pass over all candidates at once,
-almost transparent, and to second order with the curvature of Hutchinson's estimator.
+Candidates are fine Gaussians behind every second pixel of a training view, as an event would place them. The gain of a
+candidate over some views is the change of their squared error by its opacity. The first order comes from one backward pass over
+all candidates at once, which are almost transparent. The second order uses the curvature of Hutchinson's estimator.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from warpgs.render.rasterize import RasterizeOptions, rasterize
 from warpgs.scene import Camera, Gaussians
 
 STRIDE = 2
-"""Distance of candidates [px]."""
+"""Distance between candidates [px]."""
 FAINT = 5e-4
 """Opacity of candidates: all together hide one hundredth of what is behind them."""
 LINEAR = Rule("linear", alpha_cut=1e-5)
 """Cut-offs with which candidates are rendered."""
 SIGNS = 4
-"""Images of random signs by which a curvature is estimated."""
+"""Number of images of random signs for estimating a curvature."""
 HIDDEN = 6, 0.3
-"""Renders with opacity dropout whose spread is a score, and the probability that they hide a Gaussian."""
+"""Number of renders with opacity dropout whose spread is a score, and their dropout probability."""
 NEARLY = 0.05
-"""Relative difference of depth up to which a point is seen in another view."""
+"""Largest relative difference of depth at which another view sees a point."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,11 +79,11 @@ def opacity_slopes(
     gaussians: Gaussians, extra: dict[str, torch.Tensor] | None, views: Sequence[TrainingView], background: torch.Tensor,
     generator: torch.Generator,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    """Return what opacities do to the sum of squared errors of each view: -slope and half the curvature, each [V, N].
+    """Return the effect of opacities on the sum of squared errors of each view: -slope and half the curvature, each [V, N].
 
     Args:
         gaussians: The model.
-        extra: Rows of candidates: figures are theirs. None for figures of the model itself.
+        extra: Rows of candidates, whose effects are returned; None for the effects of the model's own Gaussians.
         views: Views whose pixels count by their masks.
         background: Colour behind the scene, shape [3].
         generator: Generator of random signs, on the CPU.
@@ -123,7 +123,7 @@ def best_opacity_gain(down: torch.Tensor, bend: torch.Tensor) -> torch.Tensor:
 def residual_elsewhere(
     gaussians: Gaussians, points: torch.Tensor, views: Sequence[TrainingView], options: RasterizeOptions
 ) -> torch.Tensor:
-    """Return the mean blurred squared error where points [K, 3] land in the views that see them, 0 where none does, [K]."""
+    """Return the mean blurred squared error at points [K, 3] over the views that see them, [K]; 0 if no view does."""
     total, count = points.new_zeros(len(points)), points.new_zeros(len(points))
     for view in views:
         render = rasterize(gaussians, view.camera, options)
@@ -159,7 +159,7 @@ def warped_gains(
 
 
 def signed_residual(residual: torch.Tensor, footprint: float) -> torch.Tensor:
-    """Return the length of a colour difference [H, W, 3] that was blurred with its sign by a footprint [px], shape [H, W]."""
+    """Return the length of a signed colour difference [H, W, 3] after a blur by a footprint [px], shape [H, W]."""
     return torch.stack([blur(channel.contiguous(), footprint) for channel in residual.unbind(-1)], -1).norm(dim=-1)
 
 
@@ -238,7 +238,7 @@ def held_out_scores(
     gaussians: Gaussians, found: Sequence[Candidates], held: Sequence[TrainingView], options: RasterizeOptions,
     background: torch.Tensor, generator: torch.Generator,
 ) -> list[dict[str, torch.Tensor]]:  # fmt: skip
-    """Return the oracles: for the candidates of each view their gain in views that were left out, and the error there."""
+    """Return the oracles: for the candidates of each view, the gain in left-out views, and the error there."""
     extra = {n: torch.cat([c.rows[n] for c in found]) for n in found[0].rows}
     down, bend = (t.sum(0) for t in opacity_slopes(gaussians, extra, held, background, generator))
     error = residual_elsewhere(gaussians, extra["means"], held, options)
@@ -264,7 +264,7 @@ def spearman(score: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 def lift(score: torch.Tensor, truth: torch.Tensor, fraction: float) -> float:
-    """Return the mean truth of the highest fraction by a score [K] over the mean of all; ties are not broken in their order."""
+    """Return the ratio of the mean truth of the candidates with the highest scores [K] to that of all; ties are shuffled."""
     order = torch.argsort(score + 1e-9 * score.abs().max() * torch.rand(len(score)).to(score), descending=True)
     top = order[: max(1, round(fraction * len(score)))]
     mean = float(truth.mean())

@@ -1,7 +1,8 @@
-"""Blending as one would first write it in Warp: a thread per pixel, scalar code, float atomics. A peer to compare with.
+"""Naive blending in Warp, as a baseline: a thread per pixel, scalar code, float atomics.
 
-The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so launch it there from one thread only.
-On CUDA Warp can make them repeatable (`wp.DeterministicMode`): it stores each of them as a record, and sorts and adds those.
+The rule is `exact`, in float32. On a CPU Warp's atomics are plain additions, so kernels must be launched on one thread only. On
+CUDA Warp can make atomics repeatable (`wp.DeterministicMode`): it stores each addition as a record, then sorts and adds the
+records.
 """
 
 import functools
@@ -102,7 +103,7 @@ def count_kernel():
 
 
 ATOMICS = 9
-"""Atomic additions of the backward kernel for each Gaussian blended into a pixel."""
+"""Number of atomic additions of the backward kernel for each Gaussian blended into a pixel."""
 
 
 @functools.cache
@@ -110,8 +111,8 @@ def backward_kernel(mode: wp.DeterministicMode = wp.DeterministicMode.NOT_GUARAN
     """Return the kernel of the gradients, which are added by float atomics.
 
     Args:
-        mode: What Warp guarantees of their order.
-        layers: Most Gaussians that are blended into a pixel, for which a guarantee takes memory.
+        mode: Warp's guarantee for the order of additions.
+        layers: Most Gaussians that are blended into a pixel; with a guarantee, memory depends on this number.
     """
     options = {"deterministic": mode, "deterministic_max_records": ATOMICS * layers}
 

@@ -1,14 +1,16 @@
-"""Errors of needles in the form of a triangular factor, in that of an inverse covariance ("conic") and in textbook form.
+"""Errors of needles with a triangular factor, with an inverse covariance ("conic") and with textbook formulas.
 
-Needles of one length lie in the middle of an image at many angles, tilted out of the image plane, their other axes at the
-pixel filter. The reference is the float64 reference of the same float32 parameters. Three programs in float32:
+Needles of one length are in the middle of an image at many angles, tilted out of the image plane; their other axes are as wide
+as the pixel filter. The reference is computed in float64 from the same float32 parameters. Three programs in float32 are
+compared:
 
 * factor: the kernels.
-* conic: the kernels' own factor multiplied out to an inverse covariance, so that nothing but the form differs.
-* plain: the whole projection as textbooks have it, with determinant a c - b^2 (tests/reference/low_precision.py, P32).
+* conic: the kernels' own factor multiplied out to an inverse covariance, so that only the form differs.
+* plain: the whole projection by textbook formulas, with determinant a c - b^2 (tests/reference/low_precision.py, P32).
 
-Errors: of the weight exp(-power / 2) at places along the needle up to two standard deviations; of alpha in an image; and of
-the gradient of the projected mean, relative, for a random gradient of that image (there is no conic kernel to ask).
+Errors are those of the weight exp(-power / 2) at places along the needle up to two standard deviations; of alpha in an image;
+and the relative error of the gradient of the projected mean, for a random gradient of that image (not for conic, which has no
+kernel).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fits and their stored figures: ours, by the public call or without files, and gsplat's."""
+"""Fits and their stored figures: ours, through the public function or without files, and gsplat's."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ from warpgs.scene import Scene, View
 
 PEER, PEER_POINTS = "gsplat", "gsplat-points"
 PEERS = (PEER, PEER_POINTS)
-"""gsplat's default strategy from the points of our default's start, and from the points of the reconstruction."""
+"""gsplat's default strategy with the initial points of our default, and with the points of the reconstruction."""
 PRUNED = "pruned/"
 """Prefix of a preset: the model is pruned by `KEEP_PSNR` after its fit."""
 KEEP_PSNR = 0.1
 """Loss of training PSNR that pruning may cost [dB]."""
 PEER_STEPS = 7000
-"""Steps of gsplat where its settings name none."""
+"""Default number of steps of gsplat."""
 
 
 def is_peer(preset: str) -> bool:
@@ -73,10 +73,10 @@ class Fit:
 
 
 def config_of(preset: str, seed: int = 0) -> FitConfig:
-    """Return the settings of one of our presets with a seed; ``default`` is that of a user who names none.
+    """Return the settings of one of our presets with a seed; ``default`` is the preset of a user who gives none.
 
-    ``PRESET:a.b=value,c=value`` changes what it names; values are JSON, a bare word is a word. A strategy may be
-    ``FILE.py:CLASS``; settings of its own come after it, by the names of their flags, as in ``lottery.growth=0.2``.
+    ``PRESET:a.b=value,c=value`` changes the named settings; values are JSON, or text without quotes. A strategy may be
+    ``FILE.py:CLASS``; its own settings come after it, by the names of their flags, as in ``lottery.growth=0.2``.
 
     Raises:
         UsageError: The preset or a setting is unknown, or a value is out of range.
@@ -129,7 +129,7 @@ def _change(values: dict, preset: str, changes: str) -> None:
 
 
 def compile_all(presets: tuple[str, ...], device: str) -> None:
-    """Compile what fits of these presets use, gsplat's own kernels too; those that differ in their steps alone use the same."""
+    """Compile the kernels of fits of these presets, including gsplat's; presets that differ only in steps share kernels."""
     for preset in dict.fromkeys(re.sub(r"(?<=[:,])steps=\d+,?", "", p) for p in presets):
         if is_peer(preset):
             gsplat_trainer.compile_kernels(torch.device(device))
@@ -190,7 +190,7 @@ def pruned_figures(fit: Fit, config: FitConfig) -> dict:
 
 
 def peer_figures(fit: Fit, scene: Scene) -> dict:
-    """Train gsplat with its default strategy on the same views, in the units of its own parser, and score it as ours."""
+    """Train gsplat with its default strategy on the same views, in the units of its own parser, and score it like our fits."""
     split, began = split_views(scene, fit.split), time.perf_counter()
     train, test = ([scene.view(name) for name in names] for names in (split.train, split.test))
     first = start_of(fit, scene, train)
@@ -203,7 +203,7 @@ def peer_figures(fit: Fit, scene: Scene) -> dict:
 
 
 def start_of(fit: Fit, scene: Scene, train: list[View]) -> warpgs.Gaussians:
-    """Return the first Gaussians of our default, not extrapolated, with this seed, or those on the reconstruction's points."""
+    """Return initial Gaussians: those of our default with this seed, not extrapolated, or on the reconstruction's points."""
     first = "3dgs:init.source=points" if fit.preset.startswith(PEER_POINTS) else "default:init.extrapolate=false"
     config = config_of(first, fit.seed)
     return make_trainer(train, scene.points, config, torch.device(fit.device), scene.background).gaussians

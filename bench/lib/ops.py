@@ -39,12 +39,12 @@ class Bench:
         self.echo(f"{_title(head)}  skipped: {reason}")
 
     def _stop(self, op: str, program: str, direction: str, sizes: dict, reason: str) -> None:
-        """Note a task that was tried in vain, so that it is not tried at larger sizes."""
+        """Record a failed task, so that it is not tried at larger sizes."""
         self.stopped.append((op, program, direction, sizes))
         self._skip({"op": op, "program": program, "direction": direction, **sizes}, reason)
 
     def _chosen(self, op: str, module, point: Point, sizes: dict) -> set[tuple[str, str]]:
-        """Return the tasks of an op at a point that are worth a try; the others are noted."""
+        """Return the tasks of an op at a point that may succeed; the others are recorded as skipped."""
         chosen, late = set(), self.deadline is not None and time.monotonic() >= self.deadline
         for program, directions in module.PROGRAMS.items():
             largest = getattr(module, "LARGEST", {}).get(program, point.count)
@@ -148,11 +148,11 @@ def run(
 
     Args:
         device: Where to measure.
-        tiny: Sizes and repeats that only show that it runs.
+        tiny: True for few repeats at small sizes, for tests.
         ops: Names out of `OPS`.
-        budget: Time for all of it [s]; what is left then is skipped. None for no limit.
-        note: Words about the machine that belong in the results.
-        earlier: Results of the same code on the same machine; only what they lack or what was disturbed is measured.
+        budget: Time limit [s], after which remaining points are skipped. None for no limit.
+        note: Note on the machine for the results.
+        earlier: Results of the same code on the same machine; only missing or disturbed rows are measured.
         echo: Takes a line per task.
     """
     if device.type == "cuda" and device.index is None:

@@ -1,4 +1,4 @@
-"""Pages with generated parts: the text between two comments that name the part; all else is written by hand."""
+"""Pages with generated parts, each between two comments with the name of the part; the rest is written by hand."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def filled(page: str, parts: dict[str, str]) -> str:
     marks = re.compile(r"(<!-- ([\w ]+): written by bench\.document -->\n).*?(<!-- end of \2 -->)", re.DOTALL)
     names = [match[2] for match in marks.finditer(page)]
     if sorted(names) != sorted(parts):
-        raise ValueError(f"the page has marks of {', '.join(names)}, the parts are {', '.join(parts)}; make them equal")
+        raise ValueError(f"the page has markers for {', '.join(names)}, but the parts are {', '.join(parts)}; make them equal")
     return marks.sub(lambda match: f"{match[1]}\n{parts[match[2]]}\n{match[3]}", page)
 
 

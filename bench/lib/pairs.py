@@ -1,4 +1,4 @@
-"""Number of (Gaussian, pixel) pairs of an image: the work that no way of blending can avoid."""
+"""Number of (Gaussian, pixel) pairs of an image: the least work of any blending."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def instances_and_pairs(point: Point, device: torch.device) -> tuple[int, int]:
 
 
 def image_costs(point: Point, device: torch.device) -> tuple[roofline.Cost, roofline.Cost]:
-    """Return what projection, tiles and blending need together, forward and backward."""
+    """Return the cost of projection, tiles and blending together, forward and backward."""
     instances, pairs = instances_and_pairs(point, device)
     tiles_in_all = point.cameras * -(-point.width // 16) * -(-point.height // 16)
     projection = roofline.project(point.count, point.cameras, point.degree)

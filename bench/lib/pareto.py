@@ -1,4 +1,4 @@
-"""Cost against error as SVG: fronts drawn, what another point beats in both hollow, presets named."""
+"""Cost against error as SVG, with Pareto fronts; dominated points are hollow, presets have names."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from bench.lib.plot import PALETTE, PLOT_WIDTH, SMALL, grid, spread, svg, text
 PLOT_HEIGHT = 250
 LEFT, RIGHT, TOP, BOTTOM = 66, 150, 76, 66
 FAR = 5.0
-"""Costs this many times the least are named below the plot instead of shown, if they are few: they would squeeze the rest. So
-are, on a linear axis, values that fall behind the worst of front and presets by more than `BEHIND` times what those span."""
+"""Points that cost this many times the least are listed below the plot instead of shown, if they are few, because they would
+compress the rest. On a linear axis, so are values worse than those of front and presets by over `BEHIND` times their range."""
 BEHIND = 2.0
 FEW = 2
 HEAD, LEGEND = 40, 22
@@ -25,11 +25,11 @@ class Point:
 
     name: str
     knob: str
-    """Name of the setting that was changed, by which it is coloured."""
+    """Name of the changed setting, which determines the colour."""
     cost: float
-    """Positive; less is better."""
+    """Cost, above 0; less is better."""
     value: float
-    """Positive and less is better, unless the panel says otherwise."""
+    """Value; above 0 on a logarithmic axis; less is better unless the panel sets ``upwards``."""
     bar: float = 0.0
     """Half the interval of the value."""
     preset: bool = False
@@ -41,12 +41,12 @@ class Panel:
 
     title: str
     what: str
-    """One line on the content."""
+    """Title line of the panel."""
     x_label: str
     y_label: str
     points: tuple[Point, ...]
     upwards: bool = False
-    """True where more is better."""
+    """True if more is better."""
     log_y: bool = True
 
 

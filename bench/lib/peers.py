@@ -1,4 +1,4 @@
-"""Other programs that do the same work, each behind the same call: plain torch, the naive Warp kernel, gsplat."""
+"""Other programs for the same work, with the same interface: plain torch, the naive Warp kernel, gsplat."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NAIVE = "naive"
 GSPLAT = "gsplat"
 GSPLAT_STEP = "gsplat + torch"
 PIXELS_AT_ONCE = 4096
-"""Pixels that the dense rasterizer composites in one go, so that memory stays bounded."""
+"""Number of pixels that the dense rasterizer composites at a time, to limit memory."""
 
 
 @functools.cache

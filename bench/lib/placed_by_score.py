@@ -1,4 +1,4 @@
-"""Fits whose events sample by one score each: the strategy of the study on importance, and the figures of a fit."""
+"""Fits whose events sample by a single score: the strategy of the study on importance, and the figures of a fit."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ OWN = "own"
 LOG = "+log"
 """Suffix of a score: all scores are compared with the gains."""
 LATER = 300
-"""Steps after an event at which its Gaussians are judged, at least."""
+"""Least number of steps after an event at which its Gaussians are evaluated."""
 TOP = 0.02
-"""Fraction of the candidates, those of the highest score, whose mean gain is reported."""
+"""Fraction of the candidates with the highest scores whose mean gain is reported."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +57,11 @@ class StudiedConfig:
 
 
 class Studied(ImportanceSampling):
-    """Importance sampling by one score, which may read the views that are left out."""
+    """Importance sampling by one score, which may read the left-out views."""
 
     Config = StudiedConfig
     held: ClassVar[list] = []
-    """Views that are left out, of the fit in this process."""
+    """Left-out views of the fit in this process."""
     told: ClassVar[list[dict[str, Any]]] = []
     """Logged figures."""
 
@@ -78,11 +78,11 @@ class Studied(ImportanceSampling):
 
     @classmethod
     def needs_priors(cls, settings):
-        """Return True: its scores read priors whatever the weights are."""
+        """Return True: the scores read priors for any weights."""
         return True
 
     def columns(self):
-        """Return the columns of the method, and the number of each Gaussian in the event that is followed."""
+        """Return the columns of the method, and the index of each Gaussian in the evaluated event."""
         return {**super().columns(), "birth": Column(-1, torch.int32, inherited=False)}
 
     def _scores(
@@ -141,7 +141,7 @@ class Studied(ImportanceSampling):
         return step in (events[0], events[len(events) // 2], events[-1])
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Change the set as the method does; number the Gaussians of the event that is followed, and judge them later."""
+        """Change the set like the method; number the Gaussians of one event, and evaluate them later."""
         if self.pending is not None and step >= self.placed + LATER and self.samples_after(step):
             self._judge(step)
         yield from super().update(step)

@@ -25,7 +25,7 @@ class Line:
     points: tuple[tuple[float, float], ...]
     """Positive (x, y), x ascending."""
     color: int = 0
-    """Place in the palette."""
+    """Index in the palette."""
     dashed: bool = False
     """Dashed for other programs."""
 
@@ -47,7 +47,7 @@ def decades(values: Sequence[float]) -> tuple[int, int]:
 
 
 def spread(wanted: Sequence[float], gap: float, low: float, high: float) -> list[float]:
-    """Move positions apart until neighbours are ``gap`` from each other, as little as one sweep each way needs."""
+    """Move positions apart, as little as possible, until neighbours have a distance of ``gap``."""
     order = sorted(range(len(wanted)), key=lambda i: wanted[i])
     placed = [wanted[i] for i in order]
     # groups of labels that touch, each centred on the mean of what its members want
@@ -84,7 +84,7 @@ def text(x: float, y: float, words: str, *, size: int = 12, anchor: str = "start
 
 
 def grid(left: float, top: float, bottom: float, xs: Sequence[tuple[float, str]], ys: Sequence[tuple[float, str]]) -> list[str]:
-    """Return the lines of a grid with their labels, and the axis at the bottom; lines are places [px] and words."""
+    """Return the lines of a grid with their labels, and the axis at the bottom; a line is a position [px] and a text."""
     out = []
     for y, words in ys:
         out.append(f'<path d="M{left:.1f} {y:.1f}h{PLOT_WIDTH}" stroke="#e6e6e6"/>')

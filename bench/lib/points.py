@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 
 NAMES = {"count": "N", "degree": "degree", "cameras": "cameras", "threads": "threads"}
-"""Fields of a point by their names in the results; the image goes there as width and height."""
+"""Fields of a point by their names in the results, which have width and height of the image."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Point:
         return self.width * self.height
 
     def sizes(self, axes: tuple[str, ...]) -> dict[str, int]:
-        """Return the fields that matter to an op, by their names in the results."""
+        """Return the fields that an op depends on, by their names in the results."""
         named = {}
         for axis in axes:
             if axis == "image":
@@ -52,7 +52,7 @@ DIAGONAL = (
     (100, 128, 128), (1_000, 256, 256), (10_000, 256, 256), (100_000, 504, 378), (1_000_000, 1920, 1080),
     (10_000_000, 3840, 2160),
 )  # fmt: skip
-"""Numbers of Gaussians with image sizes. The first is for peers that support no more."""
+"""Numbers of Gaussians with image sizes. The first is for peers that support only few Gaussians."""
 
 
 def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Point]:
@@ -81,7 +81,7 @@ def points(axes: tuple[str, ...], device: torch.device, tiny: bool) -> list[Poin
 
 
 def load(p: Point) -> float:
-    """Return the weight of a point beside the base point, roughly: Gaussians with their colours, and pixels, count alike."""
+    """Estimate the work of a point relative to the base point: Gaussians with their colours, and pixels, have equal weight."""
     return p.cameras * (p.count / BASE.count * (0.5 + (p.degree + 1) ** 2 / 32) + p.pixels / BASE.pixels)
 
 
@@ -117,7 +117,7 @@ class Series:
     points: tuple[tuple[float, float], ...]
     """(size, median time [ms]), sizes ascending."""
     others: dict
-    """The sizes that stay the same."""
+    """Sizes that are equal for all points of the series."""
 
 
 def tasks(rows: list[dict]) -> list[tuple[str, str, str]]:

@@ -22,14 +22,14 @@ Line = Callable[[dict], str]
 def finished(
     work: Work, tasks: Sequence, jobs: int, seconds: float, first: Callable[[], object] | None = None
 ) -> Iterator[tuple[object, dict]]:
-    """Yield each task with what ``work`` returned for it, as they finish; ``{"error": ...}`` where it raised or died.
+    """Yield each task with its result of ``work``, as they finish; ``{"error": ...}`` if ``work`` raised or the process died.
 
     Args:
         work: Function of a module, called in a worker process.
-        tasks: Its arguments, the longest first.
+        tasks: Arguments of ``work``, the longest tasks first.
         jobs: Tasks at a time.
-        seconds: After this long no further task is begun [s].
-        first: Function of a module, called in one worker before any task begins: compiles kernels once for all.
+        seconds: Time after which no further task begins [s].
+        first: Function of a module, called in one worker before any task begins, to compile kernels once for all.
     """
     began, waiting = time.monotonic(), deque(tasks)
     while waiting and time.monotonic() - began < seconds:
@@ -52,17 +52,17 @@ def finished(
 
 
 def stored_rows(path: Path | None, **facts) -> list[dict]:
-    """Return the finished rows of a file, none where there is no file; those that failed are left out.
+    """Return the finished rows of a file, without failed rows; none if there is no file.
 
     Raises:
-        UsageError: They were measured at another commit, or with other facts than these.
+        UsageError: The rows were measured at another commit, or with facts other than these.
     """
     if path is None or not path.is_file():
         return []
     stored = result_file.read(path)
     for name, now in ({"commit": result_file.commit_of()} | facts).items():
         if stored.get(name) != now:
-            raise UsageError(f"{path} was measured with {name} {stored.get(name)}, now it is {now}; choose another --out")
+            raise UsageError(f"{path} was measured with {name} {stored.get(name)}, not {now}; choose another --out")
     return [row for row in stored["rows"] if "error" not in row]
 
 
@@ -71,12 +71,12 @@ def measure_all(work: Work, tasks: Sequence, first, a, what: str, device: torch.
 
     Args:
         work: As in `finished`.
-        tasks: Tasks, each with a ``key`` that tells its row from others.
+        tasks: Tasks, each with a ``key`` that identifies its row.
         first: As in `finished`.
         a: Arguments of the program: ``out``, ``jobs`` and ``seconds``.
         what: What a row measures.
         device: Where it is measured.
-        line: Returns a row in words.
+        line: Returns a row as text.
     """
     rows, done = stored_rows(a.out), 0
     todo = [t for t in tasks if not any(t.key.items() <= row.items() for row in rows)]
@@ -88,5 +88,5 @@ def measure_all(work: Work, tasks: Sequence, first, a, what: str, device: torch.
         result_file.keep(a.out, what, device, rows)
     if done < len(todo):
         left = len(todo) - done
-        print(f"{left} fits were not begun: --seconds {a.seconds:g} had passed; give the command again for the rest")
+        print(f"{left} fits did not begin, because --seconds {a.seconds:g} had passed; repeat the command for the rest")
     return rows

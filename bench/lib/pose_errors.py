@@ -9,13 +9,13 @@ from warpgs.scene import Camera, View
 
 
 def brought_over(of: dict[str, View], to: dict[str, View], train: list[str], names: list[str]) -> dict[str, Camera]:
-    """Return the named cameras of one scene after the similarity of its training cameras to those of another."""
+    """Return the named cameras of one scene after the similarity that aligns its training cameras with those of another."""
     cameras, goal = {n: v.camera for n, v in of.items()}, [to[n].camera for n in train]
     return similar_cameras(cameras, [cameras[n] for n in train], goal, names)
 
 
 def angles(of: dict[str, View], to: dict[str, View]) -> list[float]:
-    """Return the angle between the rotations of each camera and of that in another scene, after the similarity [degrees]."""
+    """Return the angle between each camera's rotation and that in another scene, after the similarity [degrees]."""
     names = sorted(of.keys() & to.keys())
     cameras = brought_over(of, to, names, names)
     cosines = [(np.trace(to[n].camera.viewmat[:3, :3] @ cameras[n].viewmat[:3, :3].T) - 1) / 2 for n in names]
@@ -23,7 +23,7 @@ def angles(of: dict[str, View], to: dict[str, View]) -> list[float]:
 
 
 def errors(of: dict[str, View], to: dict[str, View]) -> dict[str, float]:
-    """Return how far cameras are from those of another scene after the similarity: degrees, and parts of the mean distance."""
+    """Return the errors of cameras against another scene after the similarity: degrees, and fractions of the mean distance."""
     names, off = sorted(of.keys() & to.keys()), angles(of, to)
     cameras = brought_over(of, to, names, names)
     centers = np.array([to[n].camera.center for n in names])

@@ -1,4 +1,4 @@
-"""Tables of fits by row, preset and seed: means, the worst seed, and the base beside the best of the others."""
+"""Tables of fits by row, preset and seed: means, the worst seed, and the base beside the best other preset."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.statistics import Difference, paired_difference
 
 LIMIT = 0.1
-"""Loss against the best rival that is allowed [dB]."""
+"""Largest allowed loss against the best rival [dB]."""
 LIMITS = {"psnr": -0.05, "ssim": -0.002}
-"""Mean paired loss of a smaller model against the fixed fit that is allowed over all scenes [dB, SSIM]."""
+"""Largest allowed mean paired loss of a smaller model against the fixed fit, over all scenes [dB, SSIM]."""
 
 
 def by_seed(rows: list[dict]) -> dict[tuple[str, str], dict[int, dict]]:
-    """Return the results of each (row, preset) by seed, those of views left out one at a time averaged; failures left out."""
+    """Return the results of each (row, preset) by seed, without failures; results for left-out views are averaged."""
     groups: dict[tuple, list[dict]] = defaultdict(list)
     for row in rows:
         if "error" not in row:
@@ -34,8 +34,8 @@ def by_seed(rows: list[dict]) -> dict[tuple[str, str], dict[int, dict]]:
 def rival(scores: dict[str, dict[int, float]], base: str) -> tuple[Difference, list[str]]:
     """Return the paired difference of the base to the best of the others, and the names of the best.
 
-    For each seed that all have, the rival is the preset of the best mean over the other seeds, which avoids winner's bias.
-    Seeds that some presets lack are not used, because the best preset could be missing there.
+    For each seed with results for all presets, the rival is the preset with the best mean over the other seeds, which avoids
+    winner's bias. Seeds without results for some presets are not used, because the best preset could be missing.
 
     Args:
         scores: PSNR by preset and seed [dB].
@@ -104,7 +104,7 @@ def rivals_table(rows: list[dict], base: str) -> str:
 
 
 def sizes_table(rows: list[dict], fixed: str) -> str:
-    """Return bytes and scores by row and preset beside one preset, and over all rows a line for each of the others."""
+    """Return bytes and scores by row and preset, compared with one preset, and a line over all rows for each other preset."""
     found, lines = by_seed(rows), []
     means: dict[str, list[dict[str, float]]] = {}
     for (name, preset), own in found.items():
@@ -138,7 +138,7 @@ def _verdict(preset: str, scenes: list[dict[str, float]]) -> str:
 
 
 def tables(rows: list[dict], base: str, fixed: str | None = None) -> str:
-    """Return the tables, that of sizes where a preset is named for it, and a line for each fit that failed."""
+    """Return the tables, including that of sizes if a fixed preset is given, and a line for each failed fit."""
     failed = [f"- failed: {r['row']}, `{r['preset']}`, seed {r['seed']}: {r['error']}" for r in rows if "error" in r]
     sizes = [] if fixed is None else [sizes_table(rows, fixed)]
     return "\n\n".join(filter(None, [means_table(rows), rivals_table(rows, base), *sizes, "\n".join(failed)]))

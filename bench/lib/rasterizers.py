@@ -1,7 +1,7 @@
-"""Rasterizers of CUDA, ours, gsplat, Faster-GS and gswarp, each behind the same call: a scene in, an image and gradients out.
+"""CUDA rasterizers (ours, gsplat, Faster-GS and gswarp) with one interface: a scene in, an image and gradients out.
 
-A program gets its tensors in the layout that it asks for before anything is timed. Activations that it leaves to its user are
-part of its work, as in its own trainer.
+Tensors are converted to the layout of each program before anything is timed. Activations that a program leaves to its user are
+timed with it, as in its own trainer.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ OURS = "warpgs"
 UNRECORDED = "warpgs, never recorded"
 ATOMIC = "warpgs atomic"
 FAST_MATH = "warpgs fast math"
-"""Our kernels under CUDA's fast math, which no option of ours turns on."""
+"""Our kernels with CUDA's fast math, which no option of warpgs enables."""
 GSPLAT = "gsplat dense"
 GSPLAT_PACKED = "gsplat packed"
 FASTER_GS = "Faster-GS"
@@ -66,7 +66,7 @@ class Drawing:
 
 
 def compile_with_fast_math() -> None:
-    """Have kernels that are made from now on compiled with CUDA's fast math, in single precision."""
+    """Compile all further kernels with CUDA's fast math, in single precision."""
     module = type(wp.get_module("bench.lib.rasterizers"))
     made = module.__init__
 
@@ -120,7 +120,7 @@ def _center(camera: Camera) -> torch.Tensor:
 
 
 def faster_gs(g: Gaussians, camera: Camera) -> Drawing:
-    """Return the drawing of Faster-GS; where no gradients are on, by its code for images alone."""
+    """Return the drawing of Faster-GS; without gradients, it uses its code for images alone."""
     from FasterGSCudaBackend.torch_bindings.rasterization import RasterizerSettings, diff_rasterize
     from FasterGSCudaBackend.torch_bindings.rasterization import rasterize as draw_alone
 
@@ -144,7 +144,7 @@ def faster_gs(g: Gaussians, camera: Camera) -> Drawing:
 
 
 def gswarp(g: Gaussians, camera: Camera) -> Drawing:
-    """Return the drawing of gswarp, without the depth that it can draw beside."""
+    """Return the drawing of gswarp, without its optional depth."""
     from gswarp import GaussianRasterizationSettings, GaussianRasterizer, set_compute_depth
 
     set_compute_depth(False)

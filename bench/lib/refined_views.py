@@ -1,4 +1,4 @@
-"""Held-out views whose cameras are moved to where a finished model shows their images best."""
+"""Held-out views whose cameras are moved to where their images fit a finished model best."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ REFINE_STEPS = 100
 
 
 def refined(gaussians: warpgs.Gaussians, view: View, options: warpgs.RasterizeOptions) -> View:
-    """Return a view whose camera was moved to where a model shows its image best; the model stays as it is."""
+    """Return a view whose camera was moved to where its image fits a model best; the model is not changed."""
     device = gaussians.means.device
     start, target = (torch.as_tensor(a, dtype=torch.float32, device=device) for a in (view.camera.viewmat, view.image))
     twist = torch.zeros(6, device=device, requires_grad=True)

@@ -1,4 +1,4 @@
-"""The one format of all results: what was measured, with which command and code, on what, and a row for each measurement."""
+"""The format of all results: description, command, commit, machine, and a row for each measurement."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from warpgs.runtime.processor import processor_name
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "bench/results"
-"""The latest result of each measurement, named ``KIND_MACHINE.json``; the commit stands inside."""
+"""Folder with the latest result of each measurement, named ``KIND_MACHINE.json``; the file contains the commit."""
 KEYS = ("what", "command", "commit", "date", "machine", "versions", "rows")
-"""Keys that every result holds, in this order; ``commit`` and ``date`` are None where nobody kept them."""
+"""Keys of every result, in this order; ``commit`` and ``date`` are None if they were not recorded."""
 
 
 def commit_of(checkout: Path = ROOT) -> str | None:
-    """Return the commit of a checkout, marked where files differ from it; None outside a repository."""
+    """Return the commit of a checkout, with a mark if files have been changed; None outside a repository."""
     command = ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"]
     try:
         done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, timeout=10, check=True)
@@ -79,22 +79,22 @@ def result(what: str, device: torch.device, rows: list[dict], **facts) -> dict:
     """Return a result of this program on this machine.
 
     Args:
-        what: One sentence that says what a row measures.
+        what: One sentence on what a row measures.
         device: Where it was measured.
         rows: Plain values, a dictionary for each measurement.
-        **facts: What else a reader or a later run needs.
+        **facts: Further facts for readers or later runs.
     """
     head = {"what": what, "command": command_line(), "commit": commit_of(), "date": datetime.now(UTC).strftime("%Y-%m-%d")}
     return head | {"machine": _machine(device), "versions": _versions(device)} | facts | {"rows": rows}
 
 
 def keep(path: Path | None, what: str, device: torch.device, rows: list[dict], **facts) -> None:
-    """Write a result of this program on this machine; nothing where no path is given."""
+    """Write a result of this program on this machine; nothing if no path is given."""
     write(path, result(what, device, rows, **facts))
 
 
 def write(path: Path | None, values: dict) -> None:
-    """Write a result; nothing where no path is given.
+    """Write a result; nothing if no path is given.
 
     Raises:
         ValueError: The result lacks a key of the format.
@@ -121,7 +121,7 @@ def read(path: Path) -> dict:
 
 
 def machine_name(values: dict) -> str:
-    """Return the machine of a result in the words of the pages: ``2 cores``, ``H200``."""
+    """Return the machine of a result as the pages name it: ``2 cores``, ``H200``."""
     return "2 cores" if values["machine"]["device"] == "cpu" else values["machine"]["name"].removeprefix("NVIDIA ")
 
 

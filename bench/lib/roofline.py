@@ -1,12 +1,13 @@
 """Least bytes and operations of a stage, and the largest rates of the machine.
 
-How bytes are counted: every input read once and every output written once, in float32, as if caches were perfect; what a
-stage stores for its backward pass counts, scratch memory does not. Two exceptions, because no known method does without:
-a record is read once per (Gaussian, tile) instance, and a radix sort reads and writes all pairs once per 8 bits of key.
+Bytes: every input is read once and every output is written once, in float32, as if caches were perfect. Values that a stage
+stores for its backward pass count, scratch memory does not. There are two exceptions, which no known method avoids: a record is
+read once per (Gaussian, tile) instance, and a radix sort reads and writes all pairs once per 8 bits of key.
 
-How operations are counted: float multiplications, additions, comparisons and selections by hand from the kernels'
-formulas, each 1, a square root or division 1, an exponential 10 (a polynomial of degree 6 and its scaling). Counts per
-Gaussian are good to about a fifth. Blending counts the pairs that are drawn; pairs looked at and dropped are overhead.
+Operations: float multiplications, additions, comparisons, selections, square roots and divisions count 1 each, an exponential
+    10
+(a polynomial of degree 6 and its scaling). They are counted by hand from the kernels' formulas, per Gaussian to about a fifth.
+Blending counts the pairs that are blended; pairs that are evaluated and dropped are overhead.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ class Cost:
     """Least work of a stage."""
 
     bytes: float
-    """Moved between memory and processor."""
+    """Bytes moved between memory and processor."""
     operations: float
     """Float operations; a fused multiply-add is two."""
 
@@ -172,7 +173,7 @@ def multiply_add(begin: int, factor: float, steps: int, result: wp.array(dtype=f
 
 
 def _fastest(work: Callable[[], object], device: torch.device, repeats: int) -> float:
-    """Return the shortest time of several runs [s]: a ceiling is what the machine can do, not its average."""
+    """Return the shortest time of several runs [s], since a ceiling is the best performance of the machine."""
     times = []
     for _ in range(repeats + 1):
         if device.type == "cuda":
@@ -210,7 +211,7 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
 
 
 def against_roof(cost: Cost, seconds: float, roof: dict) -> dict:
-    """Return the least time that the two ceilings allow [ms], the one that binds, and the fraction of it that was reached."""
+    """Return the least time by the two ceilings [ms], the binding ceiling, and the reached fraction of it."""
     memory, compute = cost.bytes / roof["bytes_per_s"], cost.operations / roof["operations_per_s"]
     least = max(memory, compute)
     return {

@@ -1,8 +1,8 @@
 """SHA-256 of every stage from photographs to the PLY of a fit: first of single library functions, then of three fits.
 
 The demo scene is fitted by three presets: ``3dgs`` from the points of the scene, ``quick`` from swept depths, with saliency and
-sampling events, and ``mcmc`` with relocation and noise. Single functions (``torch.exp``, ``cv2.SIFT``, ...) work on fixed
-numbers, so one that differs did not inherit it.
+sampling events, and ``mcmc`` with relocation and noise. Single functions (``torch.exp``, ``cv2.SIFT``, ...) get fixed inputs,
+so a difference comes from the function itself.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ RESULTS = result_file.FOLDER / "same_bits.json"
 PRESET_NAMES = ("3dgs", "quick", "mcmc")
 DIGITS = 12
 LIBRARIES = ("torch.", "numpy.", "cv2.")
-"""Beginnings of the names of stages of single functions."""
+"""Prefixes of the names of stages of single functions."""
 
 Stage = tuple[str, str]
 
@@ -59,7 +59,7 @@ def digest(*parts: np.ndarray | torch.Tensor | bytes | None) -> str:
 
 
 def _numbers(count: int) -> np.ndarray:
-    """Return float64 numbers in [0, 1) that look random and are products of whole numbers alone."""
+    """Return pseudorandom float64 numbers in [0, 1), computed by integer products alone."""
     return (np.arange(count, dtype=np.int64) * 40503 % 65536) / 65536
 
 
@@ -177,7 +177,7 @@ def fit_stages(
 def stages(
     device: torch.device, *, views: int, width: int, height: int, steps: int, only_start: bool, given: Path | None = None
 ) -> Iterator[Stage]:
-    """Yield names and digests in the order in which one stage feeds the next.
+    """Yield names and digests of stages in their order of computation.
 
     Args:
         device: Device of the fits.
@@ -186,7 +186,7 @@ def stages(
         height: Height of its images [px].
         steps: Steps of each fit.
         only_start: True to stop each fit before its first step.
-        given: Folder of such a demo that was written elsewhere; None to write one.
+        given: Folder of such a demo from another machine; None to write one.
     """
     yield from function_stages()
     with tempfile.TemporaryDirectory() as name:
@@ -208,7 +208,7 @@ def stages(
 
 
 def placed(rows: list[dict], made: dict) -> list[dict]:
-    """Return the rows with the one just made, in the place of the row of the same label, processor and arguments."""
+    """Return the rows with the new one, which replaces a row with the same label, processor and arguments."""
 
     def key(r: dict) -> tuple:
         return r["label"], r["machine"]["device"], r["machine"]["name"], r["arguments"]
@@ -219,7 +219,7 @@ def placed(rows: list[dict], made: dict) -> list[dict]:
 
 
 def differing(one: dict, other: dict) -> list[str]:
-    """Return the names of the stages of one row whose digests are others in another, in order."""
+    """Return the names of the stages whose digests differ between two rows, in order."""
     return [n for n, value in one["stages"].items() if other["stages"].get(n) != value]
 
 

@@ -16,15 +16,15 @@ from warpgs.synthetic.demo import split_spec, write_demo
 DEMO = "demo"
 DEMO_VIEWS = 24
 FEW = 4
-"""Most training views of which each is left out in turn; of more, some are left out at once."""
+"""Largest number of training views for which each is left out in turn; of more views, some are left out at once."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A scene as it is fitted and scored."""
+    """A scene with its split and size."""
 
     scene: str
-    """Folder, relative to that of the data; ``demo`` is made."""
+    """Folder, relative to the data folder; ``demo`` is generated."""
     split: str
     """Split, as in `warpgs fit --split`."""
     downscale: int = 1
@@ -52,7 +52,7 @@ def row_of(name: str) -> Row:
     """Return a named row, or that of ``FOLDER@SPLIT`` or ``FOLDER@SPLIT@DOWNSCALE``.
 
     Raises:
-        UsageError: The name is neither.
+        UsageError: The name is neither a row nor such a text.
     """
     if name in ROWS:
         return ROWS[name]
@@ -63,7 +63,7 @@ def row_of(name: str) -> Row:
 
 
 def made(data: Path, row: Row, work: Path) -> str:
-    """Return the folder of a row's scene; the demo is written below ``work`` when it is not there yet."""
+    """Return the folder of a row's scene; the demo is written below ``work`` if it is missing."""
     if row.scene != DEMO:
         return str(data / row.scene)
     folder = work / DEMO
@@ -86,16 +86,16 @@ def left_out(names: tuple[str, ...], count: int) -> list[tuple[str, ...]]:
     """
     n = len(names)
     if n < 3 or (n > FEW and not 1 <= count <= n - 2):
-        raise UsageError(f"{count} of {n} training views cannot be left out: at least two must stay; use fewer, or another row")
+        raise UsageError(f"{count} of {n} training views cannot be left out: at least two must stay; use fewer")
     if n <= FEW:
         return [(name,) for name in names]
     return [tuple(names[round(i * (n - 1) / (count + 1))] for i in range(1, count + 1))]
 
 
 def folds(scene: Scene, split: str, count: int) -> list[tuple[str, str]]:
-    """Return the splits that score training views left out, each with the names left out; held-out views are never read.
+    """Return splits that score left-out training views, each with the names of these; held-out views are never read.
 
-    With ``count`` 0 it is the split itself, and no name.
+    With ``count`` 0, return the split itself, without names.
     """
     if not count:
         return [(split, "")]

@@ -1,4 +1,4 @@
-"""PSNR of Gaussians of files at the held-out views of a run, beside that of the run's own model."""
+"""PSNR of Gaussians from files at the held-out views of a run, compared with that of the run's own model."""
 
 from __future__ import annotations
 
@@ -25,5 +25,5 @@ class Scorer:
         return float(metrics["test"]["psnr"])
 
     def loss(self, gaussians: Gaussians) -> float:
-        """Return by how much the PSNR of Gaussians in file units is lower than that of the run's own model [dB]."""
+        """Return the loss of PSNR of Gaussians in file units, compared with the run's own model [dB]."""
         return self.own - self._psnr(convert_gaussians(gaussians, self.run.normalization, "file", "scene"))

@@ -25,15 +25,15 @@ LIMITS = (1e-2, 1e-3, 1e-4)
 MEASURES = ("mean", "max")
 CPU = torch.device("cpu")
 HAZE = (1.1, 1.9, 2.1, 3.9, 4.1)
-"""Alphas of the layers of haze in 255ths: just above the cut of `exact`, and on either side of those of the faster rules."""
+"""Alphas of the layers of haze in 255ths: just above the cut of `exact`, and on both sides of the cuts of the faster rules."""
 BACKGROUND = torch.tensor([0.2, 0.5, 0.8])
 REFUSED = "none"
-"""Word for a limit that no rule keeps."""
+"""Text for a limit that no rule keeps."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A scene with the views that a limit is to be kept in."""
+    """A scene with the views in which a limit must hold."""
 
     kind: str
     gaussians: Gaussians
@@ -105,7 +105,7 @@ def measure(scene: Measured, repeats: int) -> list[dict]:
 
 
 def summary(rows: list[dict]) -> list[dict]:
-    """Return a row for each kind of scene, measure and limit: how often each rule, time, and true error over the scenes."""
+    """Return a row for each kind of scene, measure and limit: frequency of each rule, time, and true error over the scenes."""
     found = []
     for kind, name, limit in dict.fromkeys((r["kind"], r["measure"], r["limit"]) for r in rows):
         own = [r for r in rows if (r["kind"], r["measure"], r["limit"]) == (kind, name, limit)]

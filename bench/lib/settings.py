@@ -15,11 +15,11 @@ from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
 UNCUT = dataclasses.replace(EXACT, name="uncut", alpha_cut=0.0, transmittance_stop=0.0)
-"""Nothing left out: in float64 the reference of the model."""
+"""No cut-offs: in float64 the reference of the model."""
 CUTS = (0.0, 0.25, 2.0, 4.0, 8.0)
-"""Values of the alpha cut beside 1 [1/255]."""
+"""Values of the alpha cut, in addition to 1 [1/255]."""
 STOPS = (1e-5, 1e-3, 1e-2, 1e-1)
-"""Values of the transmittance stop beside 1e-4."""
+"""Values of the transmittance stop, in addition to 1e-4."""
 PAIRS = ((0.25, 1e-3), (2.0, 1e-2), (4.0, 1e-2), (8.0, 1e-3))
 """Cut and stop together."""
 

@@ -23,7 +23,7 @@ from warpgs.scene import Camera
 PEER = "gsplat"
 ADAPTER = Path(__file__).parents[2] / "examples" / "09_gsplat_strategy.py"
 CAP = 1_000_000
-"""Most Gaussians of MCMC, which a short training does not reach."""
+"""Largest number of Gaussians of MCMC; a short training does not reach it."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Distances between meshes and surfaces that rays are cast at, and the depth and points of those surfaces."""
+"""Distances between meshes and ray cast surfaces, and the depth and points of these surfaces."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from warpgs.scene import Camera, Mesh
 from warpgs.synthetic import raycast
 
 NEAR = (0.005, 0.01, 0.02)
-"""Distances, over the radius of the scene, within which fractions are counted."""
+"""Distances, as fractions of the scene's radius, within which points are counted."""
 
 
 def distance_to(shape: raycast.Shape, x: np.ndarray) -> np.ndarray:
@@ -32,7 +32,7 @@ def distance_to(shape: raycast.Shape, x: np.ndarray) -> np.ndarray:
 
 
 def true_depth(shapes: list[raycast.Shape], camera: Camera) -> np.ndarray:
-    """Return the z-depth [u] of the surfaces at the pixel centres, infinite where there is none, shape [H, W]."""
+    """Return the z-depth [u] of the surfaces at the pixel centres, infinite without a surface, shape [H, W]."""
     column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     d = raycast.pixel_rays(camera.K, camera.viewmat, np.stack([column, row], -1).reshape(-1, 2))
     t, _ = raycast.cast(shapes, camera.center, d)

@@ -1,4 +1,4 @@
-"""Numbers in words and Markdown tables."""
+"""Numbers as text, and Markdown tables."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]], left: Sequen
     Args:
         head: Names of the columns.
         rows: Cells.
-        left: Columns that stand to the left, the others to the right; None for no side.
+        left: Names of left-aligned columns; the others are right-aligned. None for no alignment.
     """
     rule = ["---" if left is None or name in left else "---:" for name in head]
     return "\n".join("| " + " | ".join(map(str, line)) + " |" for line in (head, rule, *rows)) + "\n"
@@ -26,11 +26,11 @@ def figure(value: float) -> str:
 
 
 def mean_sd(values: Sequence[float], digits: int = 2, sign: str = "") -> str:
-    """Return the mean, and the standard deviation where there are several values."""
+    """Return the mean, and the standard deviation if there are several values."""
     deviation = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{statistics.mean(values):{sign}.{digits}f}{deviation}"
 
 
 def named(row: dict, digits: int = 4) -> str:
-    """Return the entries of a row in words."""
+    """Return the entries of a row as text."""
     return "  ".join(f"{k} {v:.{digits}g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())

@@ -1,7 +1,7 @@
-"""Timing: warm-up, then repeats that go round all programs, median and quartiles, one row per task.
+"""Timing: warm-up, then repeats of all programs in turn; median and quartiles, one row per task.
 
-Programs that are compared run in turn, one repeat each, so that whatever else the machine does meets all of them alike;
-only programs far slower than the others run after them.
+Compared programs run in turn, one repeat each, so that other load on the machine affects all of them alike. Only programs far
+slower than the others run after them.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from warpgs.runtime import interop
 REPEATS = 30
 WARM_UP = 3
 WARM_UP_SECONDS = 0.1
-"""Short work is repeated for this long before it counts, so that clocks and caches settle."""
+"""Duration of the warm-up of short work [s], so that clocks and caches settle."""
 
 OURS = "warpgs"
 APART = 30
-"""A program this many times slower than another runs after it instead: pairing adds nothing to such a ratio, and what a long
-run leaves of caches and freed memory was seen to make its short neighbour several times slower."""
+"""A program this many times slower than another one runs after it instead of in turn. Pairing does not improve such a ratio,
+and a long run was seen to make a short one after it several times slower, through caches and freed memory."""
 DISTURBED = 0.2
-"""Cores kept busy by other programs from which on a measurement counts as disturbed."""
+"""Number of cores used by other programs above which a measurement counts as disturbed."""
 IN_WARP = (OURS, "naive")
 """Programs whose scratch memory comes from Warp's pool."""
 
@@ -75,7 +75,7 @@ def _timed(work: Callable[[], object], device: torch.device) -> tuple[float, flo
 
 
 def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, whole: bool) -> float:
-    """Run work `WARM_UP` times, if whole at least for `WARM_UP_SECONDS`, and return the shortest time of a call [ms].
+    """Run work `WARM_UP` times, and at least for `WARM_UP_SECONDS`, and return the shortest time of a call [ms].
 
     Stops after the second call if both took longer than the limit.
     """
@@ -88,7 +88,7 @@ def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, 
 
 
 def others_seconds() -> float | None:
-    """Return the CPU time that everything but this process has used since the machine started [s]; None if unknown."""
+    """Return the CPU time of all other processes since the machine started [s]; None if unknown."""
     try:
         times = psutil.cpu_times()
     except (OSError, RuntimeError):
@@ -105,8 +105,8 @@ def measure_in_turn(
 ) -> list[dict]:
     """Return median, quartiles and minimum of each work's wall time [ms], and on CUDA the median of its GPU time [ms].
 
-    A work that turns out in the warm-up to take longer than ``limit_ms`` is left there: its row has ``warm_up_ms`` only.
-    ``others_cores`` says how many cores other programs kept busy meanwhile.
+    A work that takes longer than ``limit_ms`` in the warm-up is not timed: its row has ``warm_up_ms`` only. ``others_cores`` is
+    the number of cores that other programs used at the same time.
     """
     begin, before = time.perf_counter(), others_seconds()
     shortest = [_warm_up(work, device, limit_ms, repeats >= REPEATS) for work in works]
@@ -146,13 +146,13 @@ def measure(work: Callable[[], object], device: torch.device, repeats: int = REP
 
 
 def peak_bytes(task: Task, device: torch.device) -> int:
-    """Return the device memory that one run takes above the loaded inputs, on CUDA [bytes].
+    """Return the device memory of one run in addition to the loaded inputs, on CUDA [bytes].
 
-    The sum of two figures. Torch's allocator keeps an exact high-water mark, which is reset before the run; the peers
-    allocate nowhere else. Warp's pool serves the sorts, keeps their scratch memory for the next call and has no mark that
-    can be reset, so what it holds after the run counts in full for programs that use it: an upper bound, since a larger
-    earlier call may have grown it. A thread sampling the free memory would see whole blocks that the allocators keep for
-    later, 2 to 20 MiB each, and would miss short peaks; this sees neither the context nor compiled kernels.
+    It is the sum of two values. Torch's allocator keeps an exact high-water mark, which is reset before the run; peers allocate
+    only there. Warp's pool serves the sorts, and keeps their scratch memory for the next call. The pool's mark cannot be reset,
+    so its whole size after the run counts for programs that use it. This is an upper bound, since a larger earlier call may
+    have enlarged the pool. Context and compiled kernels are not included. Sampling the free memory in a thread instead would
+    show blocks that the allocators keep, 2 to 20 MiB each, and would miss short peaks.
     """
     gc.collect()
     _drain(device)

@@ -20,9 +20,9 @@ from warpgs.scene import Camera, Gaussians
 VISIBLE = 0.5 / 255
 """Half a step of an 8-bit channel."""
 REFERENCE_INSTANCES = 8_000_000
-"""Instances of the reference at a time: without a cut every Gaussian is in every tile."""
+"""Largest number of instances of the reference at a time: without a cut every Gaussian is in every tile."""
 LIMIT_MS = 2000.0
-"""A setting that takes longer is left without times: an error is all that it can win by."""
+"""Time above which a setting is not timed, since only its error is of interest."""
 
 
 def _leaves(gaussians: Gaussians, dtype: torch.dtype) -> Gaussians:
@@ -43,7 +43,7 @@ def reference(scene: Frozen) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
 
 
 def image_errors(found: torch.Tensor, wanted: torch.Tensor) -> dict[str, float]:
-    """Return errors of colours [H, W, 3] in [0, 1]: largest, mean, p99.9, PSNR [dB], fraction of pixels visibly off."""
+    """Return errors of colours [H, W, 3] in [0, 1]: largest, mean, p99.9, PSNR [dB], fraction of visibly wrong pixels."""
     error = (found.double() - wanted.double()).abs()
     square = float((error**2).mean())
     return {
@@ -71,7 +71,7 @@ def gradient_errors(found: dict[str, torch.Tensor], wanted: dict[str, torch.Tens
 
 
 def _works(s: Setting, leaves: Gaussians, camera: Camera, upstream: torch.Tensor) -> list[Callable[[], object]]:
-    """Return the work of an image, and that of an image with its gradients.
+    """Return the functions that compute an image, and an image with its gradients.
 
     On CUDA both are graphs, as in fits, because the host is slower.
     """
@@ -161,7 +161,7 @@ def times_in_turn(works: list[Callable[[], object]], device: torch.device, repea
 
 
 def sorting_share(scene: Frozen, repeats: int) -> dict:
-    """Return the time of sorting visible Gaussians by depth [ms], an upper limit of what reusing the order could save."""
+    """Return the time of sorting visible Gaussians by depth [ms], an upper limit of the gain from reusing the order."""
     g = scene.gaussians
     view, K = (
         torch.as_tensor(t, dtype=torch.float32, device=g.means.device)[None] for t in (scene.camera.viewmat, scene.camera.K)

@@ -1,4 +1,4 @@
-"""The trainer for benches: no other module of the benches sets up or steps a fit."""
+"""The trainer for benches; no other module of bench sets up a fit or takes its steps."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def make_trainer(
 
 
 def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
-    """Replace the Gaussians of a trainer, which then begin without moments."""
+    """Replace the Gaussians of a trainer; moments start at zero."""
     new = {n: t.detach().to(trainer.device) for n, t in gaussians.tensors().items()}
     nobody = torch.empty(0, dtype=torch.int64, device=trainer.device)
     parents = torch.full((len(gaussians),), -1, dtype=torch.int64, device=trainer.device)
@@ -51,7 +51,7 @@ def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
 
 
 def state_tensors(trainer: Trainer) -> list[torch.Tensor]:
-    """Return parameters, moments and columns of the Gaussians, in an order that stays."""
+    """Return parameters, moments and columns of the Gaussians, in a fixed order."""
     return [t for _, t in sorted(trainer.table.state().items())]
 
 
@@ -96,12 +96,12 @@ def full_bytes(count: int, degree: int = 3) -> int:
 
 
 def with_cap(config: FitConfig, most: int) -> FitConfig:
-    """Return the settings with at most so many Gaussians."""
+    """Return the settings with a largest number of Gaussians."""
     return dataclasses.replace(config, max_gaussians=most)
 
 
 def without_density(config: FitConfig) -> FitConfig:
-    """Return the settings with the set of Gaussians left as it starts."""
+    """Return the settings with a set of Gaussians that does not change."""
     return dataclasses.replace(config, density=dataclasses.replace(config.density, start=10**9))
 
 

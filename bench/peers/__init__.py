@@ -1,1 +1,1 @@
-"""Ours beside other programs: gsplat, splat-transform."""
+"""warpgs compared with other programs: gsplat, splat-transform."""

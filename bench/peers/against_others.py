@@ -1,9 +1,9 @@
 """Images, gradients and training steps beside gsplat, Faster-GS and gswarp, on the same inputs in the same run.
 
 Directions: `image` without gradients, `forward` as it precedes a backward pass, `both`. GPU time is the sum of the kernels'
-durations; wall time runs from an idle device to an idle device, in turn, repeat by repeat. Memory is the peak of `both` above
-the inputs. --programs names those to run, a few instead of all; --traces the traces that a GPU time is the median of.
-Needs a CUDA device; peers that cannot be imported are left out, with the reason. --kernels lists our kernels by GPU time.
+durations; wall time runs from an idle device to an idle device, in turn, repeat by repeat. Memory is the peak of `both` minus
+the inputs. --programs selects programs; --traces is the number of traces, of which GPU time is the median. A CUDA device is
+required; peers that cannot be imported are left out, with the reason. --kernels lists our kernels by GPU time.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ RULE = "gsplat-1.6"
 VARIANTS = {OURS: {}, UNRECORDED: {"record": False}, ATOMIC: {"deterministic": False}}
 CHANNELS = (3, 32)
 TRACED = 15
-"""Calls that are traced for their GPU time."""
+"""Number of calls in a trace of GPU time."""
 CUDA = torch.device("cuda")
 
 
@@ -53,7 +53,7 @@ def works_of(drawing: Drawing, upstream: torch.Tensor) -> dict[str, Callable[[],
 
 
 def drawings(g: Gaussians, camera: Camera, channels: int, present: dict, variants: dict) -> dict[str, Drawing]:
-    """Return the scene as each program takes it: with coefficients for 3 channels, with plain colours for more."""
+    """Return the scene in the layout of each program: with coefficients for 3 channels, with plain colours for more."""
     if channels == 3:
         made = {who: rasterizers.ours(g, camera, rule=RULE, **how) for who, how in variants.items()}
         return made | {who: prepare(g, camera) for who, prepare in present.items()}
@@ -101,7 +101,7 @@ def compare(
 
 
 def counts_of(g: Gaussians, camera: Camera) -> dict[str, int]:
-    """Return how many Gaussians are visible, and how many (Gaussian, tile) instances they make."""
+    """Return the numbers of visible Gaussians and of their (Gaussian, tile) instances."""
     size = {"width": camera.width, "height": camera.height}
     with torch.no_grad():
         tensors = g.tensors().values()
@@ -110,7 +110,7 @@ def counts_of(g: Gaussians, camera: Camera) -> dict[str, int]:
 
 
 def peer_step(g: Gaussians, camera: Camera, target: torch.Tensor):
-    """Return a training step in the manner of gsplat's trainer: coefficients in two tensors, its fused Adam, torch SSIM."""
+    """Return a training step like that of gsplat's trainer: coefficients in two tensors, fused Adam, SSIM in torch."""
     from gsplat import rasterization
     from gsplat.optimizers import SelectiveAdam
 

@@ -1,10 +1,10 @@
 """Gradients in float32, ours and those of other rasterizers, against float64, by parameter, on scenes that do not change.
 
-The judge is our float64 pass under the cut-offs of the program that is judged, so that an error is arithmetic and no choice
-of model; before that it is compared with the derivative that torch takes of a plain program in float64. Each peer stands
-beside our kernels under its own cut-offs. The gradient is that of a sum of the image with random weights of both signs.
---fast-math measures our kernels alone, compiled with CUDA's fast math.
-A Gaussian whose alpha rounds to the other side of a cut-off in some pixel is among the largest errors, of every program.
+The reference is our float64 pass with the cut-offs of the measured program, so that errors come from arithmetic and not from
+the model. This pass is first compared with torch's derivative of a plain program in float64. Each peer is compared with our
+kernels under the peer's cut-offs. The gradient is that of a sum of the image with random weights of both signs. --fast-math
+measures our kernels alone, compiled with CUDA's fast math. A Gaussian whose alpha is rounded across a cut-off in some pixel has
+one of the largest errors, in every program.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FROZEN = ("trained", "needles", "far")
 """Scenes of `bench.lib.frozen`."""
 DENSE = "torch dense"
 SMALL = 300
-"""Gaussians of the scene on which the judge itself is compared."""
+"""Number of Gaussians of the scene on which the reference is compared with torch."""
 
 
 def batch(camera: Camera, like: torch.Tensor) -> Camera:
@@ -38,7 +38,7 @@ def batch(camera: Camera, like: torch.Tensor) -> Camera:
 
 
 def scenes(garden: Path | None, device: torch.device, width: int, height: int, count: int):
-    """Yield name, words, Gaussians and camera of each scene, float32 on the device."""
+    """Yield name, description, Gaussians and camera of each scene, float32 on the device."""
     if garden is not None:
         g, cameras = garden_inputs(garden, sh_degree=3, width=width, height=height, device=device)
         yield "garden", f"photographed points, {len(g):,} Gaussians", g, first_camera(cameras)
@@ -87,7 +87,7 @@ def programs(g: Gaussians, camera: Camera, present: dict, device: torch.device, 
 
 
 def of_the_judge(device: torch.device) -> dict[str, float]:
-    """Return the largest relative L2 distance, over parameters, of the judge from torch's derivative of a plain program."""
+    """Return the largest relative L2 distance, over parameters, of the reference from torch's derivative of a plain program."""
     scene = frozen.generated(SMALL, 1)
     g = Gaussians(**{n: t.to(device, torch.float32) for n, t in scene.tensors().items()})
     camera = batch(frozen.inputs.camera(96, 72, torch.device("cpu")), g.means)

@@ -1,9 +1,9 @@
 """Preset `mcmc` beside preset `3dgs` and gsplat's own MCMC: held-out PSNR from the same images, cameras, split and points.
 
-For each seed preset `3dgs` is fitted first; the number of Gaussians that it ends with is the cap of the others. gsplat is
-trained with the settings of its example trainer (bench/lib/gsplat_trainer.py), once in our normalisation and once with the
-world scaled as its own parser does: its noise and its regularizer of scales depend on the unit. All start from the points of
-the first fit, and all images are scored by the same code. Rows that --out holds are not measured again.
+For each seed preset `3dgs` is fitted first; its final number of Gaussians is the cap of the other programs. gsplat is trained
+with the settings of its example trainer (bench/lib/gsplat_trainer.py), once in our normalisation and once with the world scaled
+as by its own parser, because its noise and its regularizer of scales depend on the unit. All programs have the initial points
+of the first fit, and the same code scores all images. Rows in --out are not measured again.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Study:
 
 
 def measure(study: Study, program: str, seed: int, cap: int) -> dict:
-    """Train and score one program with one seed; the cap is not for the fit that sets it."""
+    """Train and score one program with one seed; preset 3dgs, which sets the cap, has no cap itself."""
     if program in (BASE, OURS):
         config = study.config("3dgs", seed) if program == BASE else with_cap(study.config("mcmc", seed), cap)
         return bare_fit(study.scene, study.train, study.test, config, study.device)

@@ -22,12 +22,12 @@ from warpgs.scene import Camera
 LIMITS = {"image_mean": 1e-5, "image_fraction_below_1e-4": 0.9999, "rel_l2": 1e-3, "cosine": 0.9999, "norm_ratio": 1e-3}
 RULE = "gsplat-1.6"
 UNITS_WIDE = 8.0
-"""Width of what the orthographic camera sees [u]."""
+"""Width of the view of the orthographic camera [u]."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """One way to render, in our words and in gsplat's."""
+    """One way to render, with our arguments and gsplat's."""
 
     name: str
     degree: int = 3
@@ -37,7 +37,7 @@ class Case:
     ours: dict = field(default_factory=dict)
     gsplat: dict = field(default_factory=dict)
     differs: str = ""
-    """Definition in which the two differ; such a case need not keep the limits."""
+    """Definition in which both programs differ; such a case need not keep the limits."""
 
 
 CASES = (
@@ -56,7 +56,7 @@ CASES = (
 
 
 def seen_by(camera: Camera, model: str) -> Camera:
-    """Return a batch of cameras of a model in place of pinholes: its scale is in px/u where it is orthographic."""
+    """Return a batch of cameras of a model other than pinhole; the scale of an orthographic camera is in px/u."""
     if model == "orthographic":
         K = camera.K.clone()
         K[:, 0, 0] = K[:, 1, 1] = camera.width / UNITS_WIDE
@@ -94,7 +94,7 @@ def compare(path: Path, case: Case, width: int, height: int, device: torch.devic
 
 
 def passes(row: dict) -> bool:
-    """Return whether every figure of a row keeps its limit."""
+    """Return whether every value of a row keeps its limit."""
     gradients = row["gradients"].values()
     return (
         row["image_mean"] < LIMITS["image_mean"]

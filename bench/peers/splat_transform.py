@@ -1,12 +1,12 @@
-"""Files exchanged with npm's splat-transform: what it reads of ours, and what is read here of its own.
+"""Files exchanged with npm's splat-transform: our files read by splat-transform, and its files read by warpgs.
 
-CLI is that of @playcanvas/splat-transform, version 3. It needs Node 22, which npm has, too: after `npm install node@22
+CLI is the command of @playcanvas/splat-transform, version 3. It needs Node 22, which is on npm, too: after `npm install node@22
 @playcanvas/splat-transform@3` in any folder, the command is "node_modules/.bin/node
 node_modules/@playcanvas/splat-transform/bin/cli.mjs".
 
-Of each file of ours, its statistics of every column (least, largest, mean, standard deviation, to 6 digits) are compared with
-those of what is read here, in parts of the column's range. Each file that it writes of our PLY is read here, compared with that
-PLY in the same way, and rendered at the held-out views.
+For each of our files, splat-transform's statistics of every column (least, largest, mean, standard deviation, to 6 digits) are
+compared with those of the Gaussians that warpgs reads, as fractions of the column's range. Each file that splat-transform
+writes from our PLY is read by warpgs, compared with that PLY in the same way, and rendered at the held-out views.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from warpgs.scene import Gaussians
 
 WHAT = "differences between what splat-transform and this program read of the same files, and loss of PSNR of its own files"
 READ = tuple(s for s in suffixes() if s not in (".glb", ".gltf"))
-"""Formats of ours that it reads; of glTF it writes only."""
+"""Our formats that splat-transform reads; it writes glTF, but does not read it."""
 WRITTEN = (
     (".compressed.ply", ()), (".spz", ("--spz-version", "3")), (".spz", ("--spz-version", "4")), (".sog", ("-g", "cpu")),
     (".glb", ()),
 )  # fmt: skip
-"""Formats that it writes, with the words for that."""
+"""Formats that splat-transform writes, with the arguments for each."""
 
 
 def turned(gaussians: Gaussians) -> Gaussians:
@@ -58,7 +58,7 @@ class Tool:
         return done.stdout or done.stderr
 
     def statistics(self, file: Path) -> tuple[int, dict[str, list[float]]]:
-        """Return the number of Gaussians and the statistics of each column that it reads of a file."""
+        """Return splat-transform's number of Gaussians and statistics of each column of a file."""
         found = json.loads(self._run(str(file), "--stats", "json", "null"))
         table = found["stats"][0]
         data = [table["data"][which] for which in STATISTICS]
@@ -70,7 +70,7 @@ class Tool:
 
 
 def rows_of(folder: Path, tool: Tool) -> list[dict]:
-    """Return a row for each file of ours that it reads, and one for each file that it writes."""
+    """Return a row for each of our files that splat-transform reads, and one for each file that it writes."""
     scorer, rows = Scorer(folder), []
     with tempfile.TemporaryDirectory() as name:
         files = {suffix: Path(name) / f"model{suffix}" for suffix in READ}

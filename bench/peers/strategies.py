@@ -1,8 +1,8 @@
 """The two strategies of gsplat on its rasterizer and on ours: held-out PSNR of the same training loop, over seeds.
 
-Ours stands behind the adapter of `examples/09_gsplat_strategy.py`. Start, order of views and random numbers are those of the
-seed, so what differs is the rasterizer. gsplat's own sums are not repeatable: its spread over seeds is the yardstick. Needs
-gsplat, built from its repository. Rows that --out holds are not measured again.
+Our rasterizer is called through the adapter of `examples/09_gsplat_strategy.py`. Start, order of views and random numbers
+depend on the seed only, so runs differ only in the rasterizer. gsplat's own sums are not repeatable; compare differences with
+the spread over seeds. gsplat, built from its repository, is required. Rows in --out are not measured again.
 """
 
 from __future__ import annotations

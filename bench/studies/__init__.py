@@ -1,1 +1,1 @@
-"""Studies of one question each, which a document or a decision quotes."""
+"""Studies of single questions, quoted by pages or decisions."""

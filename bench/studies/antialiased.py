@@ -1,7 +1,7 @@
-"""Scores of held-out views at half, full and double size, by the filters that a fit has.
+"""Scores of held-out views at half, full and double size, by the filters of a fit.
 
-Fits are of photos at --downscale D. Views are scored at 2 D, D and D / 2, each against photos of that size: the stored ones, or
-means over their pixels. For double size D must be even: at --downscale 1 there is no photo of it.
+Photos are fitted at --downscale D. Views are scored at downscale 2 D, D and D / 2, each against photos of that size: the stored
+ones, or means over their pixels. Double size requires an even D, because photos larger than the stored ones do not exist.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Task:
 
 
 def changed(preset: str, filters: str) -> str:
-    """Return a preset, which may carry settings, with those of filters."""
+    """Return a preset, which may have settings, with the settings of filters added."""
     return f"{preset}{',' if ':' in preset else ':'}{FILTERS[filters]}"
 
 

@@ -1,7 +1,7 @@
-"""Bytes against PSNR of runs that are pruned at growing losses of training PSNR, with a chart.
+"""Bytes against PSNR of runs that are pruned at increasing losses of training PSNR, with a chart.
 
-RUN is a folder of `warpgs fit`, such as each scene's first seed of a study of `warpgs compare`. --out gets curve.json and
-curve.svg. Fits of fixed size, without harmonics and pruned beside each other over seeds: `bench.fits.presets --fixed`.
+RUN is a run folder, such as each scene's first seed of a study of `warpgs compare`. curve.json and curve.svg are written to
+--out. `bench.fits.presets --fixed` compares fits of fixed size, without harmonics, and pruned, over seeds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FIGURES = {"gaussians": "count", "mean_degree": "mean_degree", "bytes": "bytes",
 
 
 def curve_rows(run: Path, device: str) -> list[dict]:
-    """Return rows of the run itself, and of the run pruned at every loss of `KEEP`."""
+    """Return rows of the run itself, and of the run pruned at each loss of `KEEP`."""
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for keep in KEEP:

@@ -1,10 +1,10 @@
 """Order of near and far in a run: rendered depth of held-out views against a reconstruction's points.
 
-SCENE is a COLMAP folder of the same photographs, usually the one that was fitted. For each held-out view of the run the points
-that the reconstruction saw in it are looked up in the rendering, and Spearman's rank correlation of the two depths is printed:
-1 where all pairs of points are in the right order, 0 where the order is chance. Ranks know no unit, so the run may have been
-made from another format, in other units and at another size; views are matched by name. The points were not seen by the fit
-unless it started from them (``--init.source points``).
+SCENE is a COLMAP folder of the same photographs, usually the one that was fitted. For each held-out view of the run, depths of
+the reconstruction's points in that view are compared with rendered depths at these points. Spearman's rank correlation is
+printed: 1 if all pairs of points are in the right order, 0 for a random order. Ranks have no unit, so the run may have another
+    format, unit
+and size; views are matched by name. The fit does not use the points unless it starts from them (``--init.source points``).
 """
 
 from __future__ import annotations
@@ -31,19 +31,20 @@ def run_order(run: Path, scene: Path, device: torch.device) -> Iterator[dict]:
     """Yield the order of each held-out view of a run.
 
     Raises:
-        DataError: The folder is no run, it holds no view out, the scene has no points with tracks, or lacks a view.
+        DataError: The folder is not a run, the run has no held-out view, or the scene has no points with tracks, or lacks a
+            view.
     """
     stored = open_run(run, device)
     if not stored.record["test"]:
-        raise DataError(f"{run}: holds no view out, so there is none to look at; fit with --split")
+        raise DataError(f"{run}: no view is held out; fit with --split")
     source = load_scene(str(scene), downscale=stored.record["scene"]["downscale"])
     if source.points is None or source.points.tracks is None:
-        raise DataError(f"{scene}: has no points that name the views which saw them; give a COLMAP folder")
+        raise DataError(f"{scene}: has no points with tracks; give a COLMAP folder")
     gaussians, cameras = stored.gaussians(), stored.cameras()
     options = stored.options()
     for name in stored.record["test"]:
         if name not in {v.name for v in source.views}:
-            raise DataError(f"{scene}: lacks {name}, which {run} holds out; give the reconstruction of the same photographs")
+            raise DataError(f"{scene}: held-out view {name} of {run} is missing; give a reconstruction of the same photographs")
         render = rasterize(gaussians, cameras[name], options)
         depth, alpha = render.depth.cpu().numpy(), render.alpha.cpu().numpy()
         yield {"view": name} | depth_order(depth, alpha, source.view(name).camera, source.points.seen_by({name}))

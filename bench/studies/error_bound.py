@@ -1,7 +1,7 @@
-"""The bound of a render's error against its true error, in scenes made against each cut-off.
+"""The bound of a render's error against its true error, in adversarial scenes for each cut-off.
 
-The true error is the distance from `reference_image`, in float64 and without the kernels. A violation is a pixel with more
-error than its bound. Tightness is bound over error, of the pixels with an error above 1e-6.
+The true error is the distance from `reference_image`, in float64 and without the kernels. A violation is a pixel whose error
+exceeds its bound. Tightness is bound divided by error, for pixels with an error above 1e-6.
 """
 
 from pathlib import Path

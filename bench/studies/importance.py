@@ -1,9 +1,9 @@
-"""Effect of the placement of fine Gaussians: fits whose events sample by one score each, at several budgets.
+"""Effect of the placement of fine Gaussians: fits whose events sample by a single score, at several budgets.
 
 An arm is SCORE/PRESET:SETTINGS, as in `bench.fits.presets`; a score is one of `bench.lib.importance_scores`, or ``own`` for the
-importance of the settings. Training views are left out in turn and scored; the oracles read them, no other score does. The
-held-out views of the split are scored beside. SCORE+log adds, for the first event, the middle one and the last, how each score
-goes with the gain in the views left out, and with what the Gaussians of the first are worth there later.
+importance of the settings. Training views are left out in turn and scored; only the oracles read them. The held-out views of
+the split are scored, too. SCORE+log adds the correlation of each score with the gain in left-out views, for the first, the
+middle and the last event. It also adds the correlation with the later gain of the first event's Gaussians in left-out views.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def line(row: dict) -> str:
 
 
 def table(rows: list[dict]) -> str:
-    """Return means over views left out and seeds by arm and row, and those of the log by truth and score."""
+    """Return means over left-out views and seeds by arm and row, and means of the log by truth and score."""
     groups: dict = defaultdict(list)
     names = list(dict.fromkeys(r["row"] for r in rows))
     for r in rows:

@@ -1,6 +1,6 @@
-"""Errors of needles in the form of a triangular factor, in that of an inverse covariance ("conic") and in textbook form.
+"""Errors of needles with a triangular factor, with an inverse covariance ("conic") and with textbook formulas.
 
-`bench/lib/needles.py` says what is measured.
+See `bench/lib/needles.py` for definitions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Time of a training step with Gaussians in the order in which they came, and along a Morton curve, in turns."""
+"""Time of a training step with Gaussians in their original order and along a Morton curve, in turn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warpgs.pipeline.train.config import FitConfig
 
 REPEATS = 15
 STEPS_PER_BATCH = 100
-"""Steps of a repeat on CUDA, where they are recorded; on a CPU a repeat is one step."""
+"""Number of steps of a repeat on CUDA, where steps are captured; on a CPU a repeat is one step."""
 
 
 def step_ms(trainer: Trainer) -> float:

@@ -1,7 +1,7 @@
 """Time of an image with its gradients against its error, for every setting of the rasterizer, on frozen scenes, with a chart.
 
-RUN is a fit, for the trained scene. An interrupted run goes on where it stopped: scenes that --out holds are not measured
-again. A chart as SVG stands beside it.
+RUN is a fit, for the trained scene. An interrupted measurement continues: scenes in --out are not measured again. A chart is
+written as SVG beside --out.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Time of whole fits against scores of held-out views, for every setting of a fit, with several seeds and a chart.
 
-An interrupted run goes on where it stopped: what --out holds is not measured again. A chart as SVG stands beside it.
+An interrupted measurement continues: rows in --out are not measured again. A chart is written as SVG beside --out.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ def test_render_paths(run, tmp_path, path, pictures, capsys):
     assert main(["render", str(run), *flags]) == 0
     assert len(list(tmp_path.glob("*.png"))) == pictures + 1 and (tmp_path / "film.mp4").stat().st_size > 0
     said = capsys.readouterr().out
-    assert said.count("the film is VP9, for browsers and VLC; ") == 1
+    assert said.count("the film is VP9, which browsers and VLC play; ") == 1
     assert f"sheet of {min(6, pictures)} frames in {tmp_path / 'sheet.png'}" in said
 
 
@@ -167,7 +167,7 @@ def test_plot(run, tmp_path, capsys):
     [
         (["--points", "stars"], "gaussians, start"), (["--color", "red"], "own, coverage"),
         (["--size", "9", "9"], "64 to 8192"),
-        (["--background", "red"], "white, black"), (["--points", "start", "--color", "coverage"], "coverage is measured"),
+        (["--background", "red"], "white, black"), (["--points", "start", "--color", "coverage"], "coverage needs Gaussians"),
         (["--out", "a.jpg"], "a plot is a .png"),
     ],
 )  # fmt: skip
@@ -243,7 +243,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "model.spz: is a file, not the folder of a run" in failure(capsys, 3, "eval", str(tmp_path / "model.spz"))
     again = ["fit", str(scene), "--split", split_spec(9), "--out", str(run), "--resume", "--device", "cpu", "--downscale", "2"]
     assert "differs from the run" in (said := failure(capsys, 2, *again)) and "(downscale was 1" in said
-    assert f"use only --out {run} --resume" in said
+    assert f"give only --out {run} --resume" in said
     assert "leave out --frames" in failure(capsys, 2, "render", str(run), "--path", "views", "--frames", "2")
     assert "--format requires --object" in failure(capsys, 2, "demo", out, "--format", "transforms")
     assert "--format must be transforms or colmap" in failure(capsys, 2, "demo", out, "--object", "--format", "ply")
@@ -393,7 +393,7 @@ def test_changed_data_are_noticed(scene, run, tmp_path, capsys):
     record["scene"]["path"] = str(moved)
     (copy / "config.json").write_text(json.dumps(record))
     (moved / "images" / "000.png").write_bytes((moved / "images" / "001.png").read_bytes())
-    assert "are not those" in failure(capsys, 3, "eval", str(copy), "--device", "cpu")
+    assert "have changed since the fit" in failure(capsys, 3, "eval", str(copy), "--device", "cpu")
 
 
 def test_demo_command_tells_the_next_step(tmp_path, capsys):

@@ -75,7 +75,7 @@ def test_any_number_of_processes_fits_the_same_model(tmp_path, capsys, first, th
         out = capsys.readouterr().out
     else:
         (code, out, _), (other, silent, _) = ended(started(2, "-m", "warpgs", "fit", *flags, *shared, "--resume"))
-        assert (code, other, silent) == (0, 0, "") and "ranks: 2 processes by gloo" in out
+        assert (code, other, silent) == (0, 0, "") and "ranks: 2 processes (gloo)" in out
     assert "continued from step 4" in out
     assert main(["fit", *flags, "--out", str(tmp_path / "alone")]) == 0
     for name in ("point_cloud.ply", "checkpoint.safetensors"):
@@ -202,7 +202,8 @@ class Two(ranks.Ranks):
 
 
 @pytest.mark.parametrize(
-    "changed", ["another version of warpgs", "another scene", "another split", "other settings", "another checkpoint"]
+    "changed",
+    ["a different version of warpgs", "a different scene", "a different split", "different settings", "a different checkpoint"],
 )
 def test_ranks_that_do_not_fit_the_same_are_refused(tmp_path, changed):
     """Each would take its part of other steps, and the model would be that of no fit; nothing is written."""

@@ -139,7 +139,7 @@ def test_upright_where_the_cameras_agree(stored, tmp_path, capsys):
             )
         stored.scene_cameras.update(kept)
         assert main(["mesh", "run", "--out", str(tmp_path / "a.glb"), "--resolution", "24", "--device", "cpu"]) == 0
-        assert ("may be rotated in a viewer" in capsys.readouterr().out) == upside_down
+        assert ("may be tilted in a viewer" in capsys.readouterr().out) == upside_down
 
 
 @pytest.mark.parametrize(

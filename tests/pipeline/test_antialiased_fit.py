@@ -156,7 +156,7 @@ def test_the_flag_and_the_files(tmp_path, capsys):
         assert content_of_file(tmp_path / name / "a.spz").model.options().antialiased is bool(own)
         write_cameras(tmp_path / "cameras.json", ring(2))
         opened, notes = open_file(tmp_path / name / "point_cloud.ply", tmp_path / "cameras.json", "exact", "cpu")
-        assert opened.antialiased is bool(own) and any("is antialiased" in note for note in notes) is bool(own)
+        assert opened.antialiased is bool(own) and any("declares an antialiased model" in note for note in notes) is bool(own)
     assert main(["prune", str(tmp_path / "with"), "--keep-psnr", "1", "--device", "cpu"]) == 0
     assert warpgs.open_run(tmp_path / "with-pruned", "cpu").antialiased
     assert read_with_antialiasing(tmp_path / "with-pruned" / "point_cloud.ply", None, "file")[1]

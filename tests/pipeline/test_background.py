@@ -53,8 +53,8 @@ def test_cut_out_objects_keep_the_background_of_the_scene(tmp_path):
     """Whether they know their opacity or stand on black."""
     scene = load_scene(scenes.write_blender(tmp_path))
     color, note = choose_background("auto", scene, list(scene.views))
-    assert color == (1, 1, 1) and "#ffffff, since the views show an object cut out" in note
-    assert choose_background("scene", scene, list(scene.views))[1] == "background: #ffffff, that of the scene"
+    assert color == (1, 1, 1) and "#ffffff, since the views show a cut-out object" in note
+    assert choose_background("scene", scene, list(scene.views))[1] == "background: #ffffff, from the scene's files"
     black = [dataclasses.replace(v, image=v.image * (v.alpha[..., None] > 0), alpha=None) for v in scene.views]
     assert choose_background("auto", dataclasses.replace(scene, background=(0, 0, 0)), black)[0] == (0, 0, 0)
 

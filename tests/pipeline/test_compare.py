@@ -141,8 +141,8 @@ def test_finished_runs_are_kept_and_half_finished_ones_continued(finished, tmp_p
     assert states(request) == ["kept", "kept", "continued", "kept"] and (half / "report.html").is_file()
     assert metrics_of(request, "a", 1)["test"] == before
     assert [p.parent for p, t in times.items() if p.stat().st_mtime_ns != t] == [half]
-    assert "continued from its last checkpoint" in capsys.readouterr().out
-    assert "still, a, seed 1: was half done" in (request.out / "table.md").read_text()
+    assert "continued from the last checkpoint" in capsys.readouterr().out
+    assert "still, a, seed 1: was interrupted" in (request.out / "table.md").read_text()
 
 
 def test_more_seeds_fit_only_what_is_new(finished, tmp_path):
@@ -191,7 +191,7 @@ def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, mo
 
     assert study(1)[0] == ["kept", "fitted"] and study(1)[0] == ["kept", "kept"]
     again, text = study(2)
-    assert again == ["kept", "redone"] and "had another code of your own; moved to 0.old1" in text
+    assert again == ["kept", "redone"] and "differs in user code; moved to 0.old1" in text
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
     assert tables[0][3][1].strip("*") == f"{np.mean(psnr['b b']):.2f} ± {np.std(psnr['b b'], ddof=1):.2f}"
     d = paired_difference(psnr["b b"], psnr["a"])
     assert tables[1][2][1].removesuffix(" \\*") == f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"
-    assert "they do not cover other scenes" in (request.out / "table.md").read_text()
+    assert "on these scenes, not other scenes" in (request.out / "table.md").read_text()
 
 
 def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
@@ -308,7 +308,7 @@ def test_requests_that_make_no_sense(scene, tmp_path):
         StudyRequest((scene,), {"a": A, "b": B}, 0, tmp_path)
     with pytest.raises(UsageError, match="at least two settings"):
         StudyRequest((scene,), {"a": A}, 2, tmp_path)
-    with pytest.raises(UsageError, match="have one name"):
+    with pytest.raises(UsageError, match="have the same name"):
         StudyRequest((scene, scene), {"a": A, "b": B}, 2, tmp_path)
     with pytest.raises(UsageError, match="name at least one scene"):
         StudyRequest((), {"a": A, "b": B}, 2, tmp_path)

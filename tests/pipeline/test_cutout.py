@@ -188,6 +188,6 @@ def test_starts_stand_on_the_object():
     shapes = silhouettes(views)
     everywhere = PointCloud(np.random.default_rng(0).uniform(-0.8, 0.8, (3000, 3)), np.ones((3000, 3), np.float32))
     starts = [initial_points(views, everywhere, InitConfig(source=s), np.random.default_rng(0)) for s in ("hull", "points")]
-    assert "left out, in empty areas of a view" in starts[1].how
+    assert "left out: they are in an empty area of a view" in starts[1].how
     for cloud in (*(s.cloud for s in starts), random_points(views, 200, np.random.default_rng(0))[0]):
         assert len(cloud) >= 100 and not in_empty_region(shapes, cloud.points).any()

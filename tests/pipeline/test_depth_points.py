@@ -168,7 +168,7 @@ def test_fallbacks_are_said(tmp_path):
     """A single view, flow that knows nothing, and views that see nothing in common: random points, and why."""
     views, _ = still_life()
     cloud, how, *_ = initial_points(views[:1], None, InitConfig(source="sweep", random_count=300), np.random.default_rng(0))
-    assert len(cloud) == 300 and "instead of --init.source sweep: a single view" in how
+    assert len(cloud) == 300 and "instead of --init.source sweep: depth needs at least two views" in how
     write_flo(tmp_path / "000-to-001.flo", np.full((120, 160, 2), np.nan, np.float32))
     config = InitConfig(source="flow", flow=str(tmp_path), random_count=300)
     cloud, how, *_ = initial_points(views, None, config, np.random.default_rng(0))

@@ -124,7 +124,7 @@ def test_a_start_without_extrapolated_points_says_why():
     masked = [dataclasses.replace(v, mask=corner) for v in views]
     config = InitConfig(source="sweep", merge_px=4, fill_px=8, extrapolate=True)
     random = dataclasses.replace(config, source="random", random_count=200)
-    for given, settings, reason in ((masked, config, "none extrapolated, since masks"), (views, random, "sweep or flow")):
+    for given, settings, reason in ((masked, config, "none extrapolated, because masks"), (views, random, "sweep or flow")):
         start = initial_points(given, None, settings, np.random.default_rng(0))
         assert reason in start.how and start.extrapolated == 0
         plain = dataclasses.replace(settings, extrapolate=False)

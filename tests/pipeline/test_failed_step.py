@@ -49,7 +49,7 @@ def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
     assert "loss term nan_later: nan" in "\n".join(lines) and not any("NOT FINITE" in line for line in lines)
     assert any(line.startswith("  loss term photometric: 0.") for line in lines)
     assert any(line.startswith("  rendered depth: ") for line in lines) and not any("rendered alpha" in line for line in lines)
-    assert any("its gradient by means is not finite" in line for line in lines)
+    assert any("gradient with respect to means: not finite" in line for line in lines)
     with pytest.raises(NotFiniteError) as again:
         warpgs.fit(scene, config, out=tmp_path / "run", resume=True, **run)
     assert str(again.value) == str(found.value)
@@ -83,7 +83,7 @@ def test_what_is_not_finite_is_counted(tmp_path, capsys):
     assert any(line == "  image: 18 of 3,840 NOT FINITE" for line in lines)
     assert any("photometric: nan" in line for line in lines)
     (tmp_path / "other").write_bytes(b"12345678")
-    for name, what in (("other", "not a failed step"), ("none", "cannot be read")):
+    for name, what in (("other", "not the inputs of a failed step"), ("none", "cannot be read")):
         with pytest.raises(DataError, match=what):
             read_failed_step(tmp_path / name, CPU)
     del bundle[0]["K"]

@@ -72,9 +72,9 @@ def test_keyframes_of_a_viewer_give_back_its_cameras(model, tmp_path):
         (lambda k: [{**k, "fov_y": 50}], "give radians"),
         (lambda k: [{**k, "fov_y": 0}], "fov_y"),
         (lambda k: [{**k, "seconds": "1"}], "seconds"),
-        (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 is not after that of keyframe 0, by 0.001 to 86400"),
-        (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 is not after that of keyframe 0, by 0.001 to 86400"),
-        (lambda k: [k, k], "keyframe 1 is not after that of keyframe 0"),
+        (lambda k: [k, {**k, "seconds": 5e-324}], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
+        (lambda k: [k, {**k, "seconds": 1e300}], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
+        (lambda k: [k, k], "keyframe 1 must be 0.001 to 86400 above those of keyframe 0"),
         (lambda k: [k] * 10_001, "1 to 10,000"),
         (lambda k: [{"c2w": k["c2w"], "fov_y": 1.0}], "seconds is missing"),
     ],
@@ -129,11 +129,11 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     )
     assert 0.02 < plan.coverage < 0.9
     done = render_film(model, plan, tmp_path / "a.webp", FilmSettings())
-    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing, numbers 3 to 4: the path leaves the captured area")
+    assert done.notes[-1].startswith("2 of 6 frames show nearly nothing (frames 3 to 4): the path leaves the captured area")
     assert "--path interpolate" in done.notes[-1] and done.files == [tmp_path / "a.webp"]
     dark = dataclasses.replace(model, scene_gaussians=dataclasses.replace(black, sh=torch.full_like(black.sh, -2.0)))
     done = render_film(dark, plan, tmp_path / "b.webp", FilmSettings())
-    assert "4 of 6 frames are black, numbers 0 to 2 and 5" in done.notes[-1]
+    assert "4 of 6 frames are black (frames 0 to 2 and 5)" in done.notes[-1]
     check = FrameCheck(0.5)
     for alpha in (0.04, 0.06):  # a tenth of what a training view shows is nearly nothing, however much that is
         check.look(np.ones((4, 4, 3)), np.full((4, 4), alpha))
@@ -141,7 +141,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
     check = FrameCheck(0.0)
     for i in range(40):
         check.look(np.ones((4, 4, 3)), np.full((4, 4), i % 3))
-    assert "numbers 0, 3, 6, 9, 12 and 9 more" in check.notes("", "")[0]
+    assert "(frames 0, 3, 6, 9, 12 and 9 more)" in check.notes("", "")[0]
 
 
 @pytest.mark.parametrize(
@@ -162,11 +162,11 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
         plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "", [])
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
-    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings()).notes if "no photograph saw" in n]
+    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings()).notes if "in no photograph" in n]
     assert len(notes) == (advice is not None)
     if advice:
-        frames = "1 of 2 frames show over 10% that no photograph saw, numbers 1" if path == "own" else "2 of 2 frames"
-        assert notes[0].startswith(frames) and notes[0].endswith(f"expect smears there; {advice}")
+        frames = "1 of 2 frames have over 10% of pixels in no photograph (frames 1)" if path == "own" else "2 of 2 frames"
+        assert notes[0].startswith(frames) and notes[0].endswith(f"expect artefacts there; {advice}")
 
 
 def _moved(x: float) -> np.ndarray:

@@ -98,7 +98,7 @@ def test_what_disturbs_is_counted_once():
     maxima[0] = 0
     found = {reason: where.nonzero()[:, 0].tolist() for reason, where in disturbing(made, maxima).items()}
     assert list(found.values()) == [[0], [1], [2]]
-    assert list(disturbing(made)) == ["larger than the scene", "needles beyond 30 to 1"]
+    assert list(disturbing(made)) == ["larger than the scene", "needles over 30 times as long as wide"]
 
 
 def test_degrees():
@@ -113,12 +113,12 @@ def test_convert_says_what_it_did(tmp_path):
     write_gaussians(tmp_path / "a.ply", made, units="file")
     lines = convert(tmp_path / "a.ply", tmp_path / "b.spz", Filters(sh_degree=1))
     assert any("removed Gaussians: 1 larger than the scene (--no-clean" in line for line in lines)
-    assert any("above degree 1 are left out, as asked" in line for line in lines)
+    assert any("above degree 1 are left out (--sh-degree)" in line for line in lines)
     assert any("SPZ files have y up" in line for line in lines)
     assert "99 Gaussians in" in lines[-1] and read_gaussians(tmp_path / "b.spz").sh.shape == (99, 4, 3)
     lines = convert(tmp_path / "b.spz", tmp_path / "c.ply", Filters(crop="-1,-1,3,1,1,5", rotate="0,0,1,180"))
     assert "SPZ files have y up" in lines[0]
-    assert not any("removed" in line for line in lines) and any("turned by 180.0 degrees" in line for line in lines)
+    assert not any("removed" in line for line in lines) and any("rotated by 180.0 degrees" in line for line in lines)
     assert float(read_gaussians(tmp_path / "c.ply").means[:, :2].abs().max()) <= 1
     convert(tmp_path / "a.ply", tmp_path / "d.ply")
     assert (tmp_path / "d.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
@@ -149,7 +149,7 @@ def test_boxes_of_files(tmp_path):
         box_of(str(tmp_path / "none.json"))
 
 
-@pytest.mark.parametrize("wish,match", [("level", "cameras of a run"), ("0,0,0,9", "no length"), ("1,2", "x,y,z,degrees")])
+@pytest.mark.parametrize("wish,match", [("level", "cameras of a run"), ("0,0,0,9", "length 0"), ("1,2", "x,y,z,degrees")])
 def test_rotations_that_are_none(wish, match, tmp_path):
     write_gaussians(tmp_path / "a.ply", cloud(5), units="file")
     with pytest.raises(UsageError, match=match):

@@ -95,7 +95,7 @@ def test_nothing_is_written_or_printed_unless_asked_for(folder, tmp_path, monkey
     assert capsys.readouterr().out == "" and not list(tmp_path.iterdir())
     with pytest.raises(UsageError, match="preset 'best' is not one of"):
         warpgs.fit(folder / "scene", "best", device="cpu", out=tmp_path / "x")
-    with pytest.raises(UsageError, match="give out"):
+    with pytest.raises(UsageError, match="resume requires out"):
         warpgs.fit(folder / "scene", CONFIG, resume=True)
     assert not list(tmp_path.iterdir())
 

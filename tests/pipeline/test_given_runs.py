@@ -48,7 +48,7 @@ def test_a_run_says_and_keeps_what_was_given(folder, capsys):
         "depth maps: 7 of 8 views, 100.0% of their pixels, metric (a unit is 0.001 for integers" in notes
         and "given depth: used in 5 of 6 views" in notes
     )
-    assert "rendered depth differs from it by" in notes and "start: " in notes and "by given depth and sweep" in notes
+    assert "median difference of rendered depth" in notes and "start: " in notes and "by given depth and sweep" in notes
     assert record["scene"]["depths"] == str(folder / "depths") and record["scene"]["depth_kind"] == "metric"
     rows = metrics["given"]["depth"]["views"]
     assert len(rows) == 5 and all(r["coverage"] > 0.9 and 0 < r["difference"] < 0.5 for r in rows)

@@ -141,7 +141,7 @@ def test_conversion_notes_unknown_sources(files, tmp_path):
     """Weights that are not the published ones are converted, and it is said."""
     _, _, _, backbone, heads = files
     notes = convert_lpips(backbone, heads, tmp_path / "x.safetensors")
-    assert len(notes) == 3 and "not the file that torchvision publishes" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
+    assert len(notes) == 3 and "not torchvision's published file" in notes[1] and "neither v0.0 nor v0.1" in notes[2]
 
 
 class Evil:
@@ -201,7 +201,7 @@ def test_packed_weights_are_refused_before_they_are_unpacked(files, tmp_path):
 
     for packing, words in (
         (zipfile.ZIP_DEFLATED, r"unpacks to [\d,]+ bytes, more than its size"),
-        (zipfile.ZIP_STORED, "beside its"),
+        (zipfile.ZIP_STORED, "besides its"),
     ):
         with zipfile.ZipFile(files[4]) as old, zipfile.ZipFile(tmp_path / "heads.pth", "w", packing) as new:
             for name in old.namelist():
@@ -224,7 +224,7 @@ def test_bad_weights_are_named(weights, tmp_path):
     with pytest.raises(DataError, match="warpgs convert-lpips"):
         load_lpips(bad, cpu)
     save_file({"a": torch.zeros(1)}, bad, {"format": "warpgs-lpips-1", "net": "vgg"})
-    with pytest.raises(DataError, match="lacks"):
+    with pytest.raises(DataError, match="no features"):
         load_lpips(bad, cpu)
 
 

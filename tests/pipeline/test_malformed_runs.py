@@ -46,7 +46,7 @@ def test_settings_of_a_continued_run_are_checked(run, name, value):
     record = json.loads((run / "config.json").read_text())
     record["config"][name] = value
     (run / "config.json").write_text(json.dumps(record))
-    with pytest.raises(DataError, match=r"config\.json: its settings are invalid .*; restore it, or fit the scene again"):
+    with pytest.raises(DataError, match=r"config\.json: invalid settings .*; restore the file, or fit the scene again"):
         stored_request(run)
 
 
@@ -270,7 +270,7 @@ def test_packed_coefficients_that_do_not_go_with_their_degrees(run, degrees):
     put_checkpoint(run, tensors | {"degrees": torch.tensor([0] * 50)}, state)
     assert open_run(run, "cpu").gaussians().sh.shape == (50, 1, 3)
     put_checkpoint(run, tensors | {"degrees": torch.tensor(degrees)}, state)
-    with pytest.raises(DataError, match="do not go with"):
+    with pytest.raises(DataError, match="do not match"):
         open_run(run, "cpu")
 
 

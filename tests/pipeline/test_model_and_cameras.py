@@ -76,7 +76,7 @@ def test_cameras_turn_with_their_gaussians(tmp_path):
     turn = Filters(rotate="1,2,3,70")
     convert(tmp_path / "a.ply", tmp_path / "b.ply", turn)
     lines = convert(tmp_path / "cameras.json", tmp_path / "b" / "transforms.json", turn)
-    assert "turned by 70.0 degrees" in lines[0] and "3 cameras for images of 64 x 48 px, named by number" in lines[-1]
+    assert "rotated by 70.0 degrees" in lines[0] and "3 cameras for images of 64 x 48 px in" in lines[-1]
     models = [open_file(tmp_path / f"{x}.ply", tmp_path / y, "inria", "cpu")[0] for x, y in (
         ("a", "cameras.json"), ("b", "b/transforms.json"))]  # fmt: skip
     images = [rasterize(m.gaussians(), torch_camera(list(m.cameras().values())[1])).rgb for m in models]
@@ -169,7 +169,7 @@ def test_render_of_a_file(tmp_path):
     assert any("cut-offs of inria" in line for line in lines) and any("the background is black" in line for line in lines)
     assert len(list(out.glob("*.png"))) == 3
     write_cameras(tmp_path / "transforms.json", [replace(c, K=1000 * c.K, width=20000, height=20000) for c in make_cameras()])
-    with pytest.raises(DataError, match="20000 x 20000 px has more than 100,000,000 pixels"):
+    with pytest.raises(DataError, match="20000 x 20000 px has over 100,000,000 pixels"):
         render(tmp_path / "a.spz", "views", out, settings, "cpu", file_of=(tmp_path / "transforms.json", None))
     assert main(["render", str(tmp_path / "none.ply"), "--cameras", str(tmp_path / "cameras.json")]) == DataError.exit_code
     assert main(["render", str(tmp_path), "--cameras", str(tmp_path / "cameras.json")]) == UsageError.exit_code

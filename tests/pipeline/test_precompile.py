@@ -71,8 +71,8 @@ def test_the_second_call_finds_all_in_the_cache(tmp_path, monkeypatch, capsys):
         assert main(["doctor", "--warm"]) == 0
         said.append(capsys.readouterr().out)
         nothing.module.unload()
-    assert "cpu: test_precompile.nothing, " in said[0] and "1 modules: 1 compiled, 0 were there" in said[0]
-    assert "test_precompile.nothing" not in said[1] and "1 modules: 0 compiled, 1 were there" in said[1]
+    assert "cpu: test_precompile.nothing, " in said[0] and "1 modules: 1 compiled, 0 were in the cache" in said[0]
+    assert "test_precompile.nothing" not in said[1] and "1 modules: 0 compiled, 1 were in the cache" in said[1]
 
 
 def test_kernels_of_both_kinds_of_device_are_named():

@@ -96,7 +96,7 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ("strategy = 3", "3 is not a strategy"),
         ('strategy = "json:JSONDecoder"', 'in a study: a preset in a .py file, with "strategy": JSONDecoder'),
         ('loss-terms = "json:JSONDecoder"', "Files cannot import code"),
-        ('base = "json:dumps"', "is code, which is never imported because a file names it"),
+        ('base = "json:dumps"', "is code; a preset file never loads code"),
         ('base = "best"', "base 'best' is not one of"),
         ("base = 3", "base must be text, not 3"),
         ('base = "my.toml"', "is circular"),

@@ -63,7 +63,7 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
     lines = result_lines(metrics, tmp_path / "my run")
     assert lines[0].startswith("held-out PSNR 24.50 dB, SSIM 0.800") and lines[0].endswith("(2 views)")
     assert "the nearest photograph 13.50 dB" in lines[1] and "all seen" in lines[2]
-    assert lines[3] == "1,234 Gaussians, 1.0 MiB, in 1 min 15 s, 20 s of it for kernels, once on this machine"
+    assert lines[3] == "1,234 Gaussians, 1.0 MiB, in 1 min 15 s, of which 20 s to compile kernels, once on this machine"
     assert lines[4] == f"report: {tmp_path / 'my run' / 'report.html'}"
     assert [line.split("  ")[1] for line in lines[6:]] == [
         f"warpgs {words}" for words in (

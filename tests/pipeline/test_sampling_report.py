@@ -127,7 +127,7 @@ def test_uniform_events_show_no_scores(tmp_path):
     one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * HEAD) + 2 * MARGIN + round(1.25 * TITLE_SIZE) + 18
     assert sheet.shape[0] == one_row  # render, image, gate, pixels, words
     words = sampling_report_of(fit, tmp_path).words
-    assert "uniformly at random" in words and "No score has a weight, so none was computed." in words
+    assert "uniformly at random" in words and "All scores have weight 0, so none was computed." in words
 
 
 def test_figures_add_up(run):
@@ -162,7 +162,7 @@ def test_story_follows_the_switches(run, tmp_path):
     assert "all pixels that Gaussians cover" in sampling_report_of(free, tmp_path).words
     alike = dataclasses.replace(METHOD, s_render=False, s_semantic=False, s_geometry=False)
     words = sampling_report_of(fitted(dataclasses.replace(CONFIG, method=alike), steps=8), tmp_path).words
-    assert "sampled uniformly at random" in words and "No score has a weight" in words
+    assert "sampled uniformly at random" in words and "All scores have weight 0" in words
     assert sampling_report_of(fitted(dataclasses.replace(CONFIG, method=type(METHOD)()), steps=1), tmp_path) is None
 
 
@@ -205,7 +205,7 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
         while fit.step < CONFIG.steps:
             fit.advance()
     assert fit.strategy.on_event is None and len(fit.messages) == 1
-    assert "the report lacks images of sampling events" in fit.messages[0]
+    assert "images of sampling events are missing from the report" in fit.messages[0]
     assert ("no space left" if cause == "disk" else "cannot be created") in fit.messages[0]
 
 

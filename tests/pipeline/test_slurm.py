@@ -169,7 +169,7 @@ def test_a_job_that_ends_without_an_answer_has_crashed(cluster, job, capsys):
     engine.start(job)
     cluster.end("71", "gone wild")
     (event,) = engine.wait(0)
-    assert event.state == "crashed" and "no known answer" in event.message
+    assert event.state == "crashed" and "unknown answer" in event.message
     engine.close()
 
 

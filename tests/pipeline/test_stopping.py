@@ -132,7 +132,7 @@ def test_errors_of_other_blocks_are_refused():
 @pytest.mark.parametrize(
     ("views", "stopping", "words"),
     [
-        (1, StoppingConfig(min_gain_db=0.1, fraction=0.001), "the images hold only"),
+        (1, StoppingConfig(min_gain_db=0.1, fraction=0.001), "the images have only"),
         (4, dataclasses.replace(AT_ONCE), "growth lasts to the end of the fit"),
     ],
 )

@@ -141,6 +141,6 @@ def test_a_change_that_is_not_whole_is_refused():
     before = snapshot(made)
     added = {n: t.detach()[:2] for n, t in made.params.items()}
     for bad, parents in ((added, 1), ({n: t for n, t in added.items() if n != "sh"}, 2)):
-        with pytest.raises(UsageError, match="one row for each parent"):
+        with pytest.raises(UsageError, match="one row for each entry of parents"):
             made.apply(DensityUpdate(torch.arange(4), bad, torch.full((parents,), -1)))
     assert all(torch.equal(t, before[n]) for n, t in made.state().items()) and len(made) == 4

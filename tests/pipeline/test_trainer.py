@@ -61,7 +61,7 @@ def test_random_points_stand_on_an_object_on_black():
     regions = [counted_region(v) for v in views]
     assert empty_votes(views, regions, np.array([[0.0, 0, 0], [1.2, 0, 0], [0, 1.2, 0]])).tolist() == [0, 2, 4]
     cloud, how = random_points(views, 400, np.random.default_rng(0))
-    assert "object that 4 views show on black" in how
+    assert "on the object (4 views show it on black)" in how
     assert len(cloud) == 400 and (cloud.colors == np.float32(0.8)).all()
     # without votes, one point in six stands before some view's black
     assert (empty_votes(views, regions, cloud.points) == 0).all()

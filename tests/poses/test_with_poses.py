@@ -37,7 +37,7 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
         )
     assert calls == [tmp_path / "in"] and "has no cameras: finding the poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
-    with pytest.raises(UsageError, match="holds the poses of other photographs"):
+    with pytest.raises(UsageError, match="holds poses of photographs other than"):
         with_poses(request, run, said.append)
     for resume in (False, True):  # a fit that ended before its first step begins again either way
         with run_folder(run, resume):
@@ -48,7 +48,7 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
     scene = tmp_path / "scene"
     scene.mkdir()
     rows = found[1]["photographs"]
-    missing = f"2 of 6 photographs have no pose and were not used: see {scene / 'poses.txt'} for reasons and remedies"
+    missing = f"2 of 6 photographs have no pose and were not used: {scene / 'poses.txt'} lists reasons and remedies"
     for lost, said in ((0, []), (2, [missing])):
         unposed = [p | {"registered": False, "reason": "has none"} for p in rows[:lost]]
         write_record(scene, found[1] | {"photographs": [*unposed, *rows[lost:]]})
@@ -59,7 +59,7 @@ def test_photographs_without_a_pose_are_told_of_at_the_end(tmp_path, found):
 def test_other_requests_stay_as_they_are(tmp_path, photographs, found):
     for request in (SceneRequest(str(found[0])), SceneRequest(str(photographs), reader="llff"), SceneRequest("")):
         assert with_poses(request, tmp_path, print) == (request, [])
-    with pytest.raises(UsageError, match=r"--matcher requires photographs without cameras, and .* holds none"):
+    with pytest.raises(UsageError, match=r"--matcher requires a folder of photographs without cameras; leave it out for"):
         with_poses(SceneRequest(str(found[0]), matcher="x.onnx"), tmp_path, print)
     with pytest.raises(UsageError, match="needs a run folder; give out="):
         with_poses(SceneRequest(str(photographs)), None, print)

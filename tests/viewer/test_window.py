@@ -304,7 +304,7 @@ def test_a_page_names_nobody(folder, tmp_path, capsys):
     scene = zstandard.ZstdDecompressor().decompressobj().decompress(base64.b64decode(data.partition('"')[0])[8:])
     assert b"/gaussians" in scene and not [w for w in (b".png", b"run", str(folder).encode()) if w in scene]
     said = capsys.readouterr().out
-    assert "without a network" in said and "removed" not in said and "turned by" in said
+    assert "without a network" in said and "removed" not in said and "rotated by" in said
 
 
 def test_names_that_are_not_utf8(window, monkeypatch):

@@ -1,4 +1,4 @@
-"""`python -m tools.mutation`: break the kernels in many small ways, one at a time, and see whether the tests notice."""
+"""`python -m tools.mutation`: change the kernels in many small ways, one at a time, and check that tests fail."""
 
 import argparse
 import hashlib
@@ -24,10 +24,10 @@ def arguments(args: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--files", nargs="+", default=None, help="only of these, such as tiles.py cuda/blend_forward.cu")
     parser.add_argument("--device", choices=["cpu", "cuda", "both"], default="cpu", help="whose code is mutated (default cpu)")
     parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 2), help="mutants at a time")
-    parser.add_argument("--timeout", type=float, default=120.0, help="seconds of one mutant (default 120)")
-    parser.add_argument("--test-timeout", type=float, default=45.0, help="seconds of one test of it (default 45)")
+    parser.add_argument("--timeout", type=float, default=120.0, help="time limit of one mutant in seconds (default 120)")
+    parser.add_argument("--test-timeout", type=float, default=45.0, help="time limit of one test in seconds (default 45)")
     parser.add_argument(
-        "--json", type=Path, default=Path("runs/mutants.json"), help="results, which the same command goes on from"
+        "--json", type=Path, default=Path("runs/mutants.json"), help="file of results, from which the same command continues"
     )
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "warpgs-mutant-kernels")
     parser.add_argument("--only", nargs="+", default=None, help="run just these mutants, by number")
@@ -37,7 +37,7 @@ def arguments(args: list[str] | None = None) -> argparse.Namespace:
 
 
 def chosen(options: argparse.Namespace, pool: list[Candidate], claimed: dict[str, str]) -> list[Candidate]:
-    """Return the sampled mutants; of claimed ones, where those are asked for, all."""
+    """Return the sampled mutants; or all claimed ones, if these are requested."""
     if options.claims:
         pool = [c for c in pool if c.id in claimed]
         options.sample = len(pool)
@@ -51,11 +51,11 @@ def chosen(options: argparse.Namespace, pool: list[Candidate], claimed: dict[str
 
 
 CUDA_PATIENCE = 3.0
-"""Factor of the time limits: a CUDA body compiles for up to a minute where many do, which must not count as endless."""
+"""Factor of the time limits: compiling a CUDA body takes up to a minute if many compile, which must not count as a timeout."""
 
 
 def has_cuda() -> bool:
-    """Return whether there is a device; asked in a process of its own, since a parent that has asked CUDA cannot fork."""
+    """Return whether there is a CUDA device, by a separate process: a process that has used CUDA cannot fork."""
     code = "import sys, torch; sys.exit(not torch.cuda.is_available())"
     return subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
@@ -69,7 +69,7 @@ def job_of(candidate: Candidate, cuda: bool, untested: list[str]) -> Job:
 
 
 def named(test: str, cuda: bool) -> str:
-    """Return a test file and where it runs, in words."""
+    """Return a test file and its device as text."""
     return f"{test} on {'CUDA' if cuda else 'the CPU'}"
 
 
@@ -82,7 +82,7 @@ def all_tests(sampled: list[Candidate], device: str) -> list[tuple[str, bool]]:
 def check_unmutated(tests: list[tuple[str, bool]], options: argparse.Namespace) -> list[str]:
     """Run the tests on the code as it is, which also compiles its kernels; exit if any of them fails.
 
-    Returns the files, in words, that have no test for the device.
+    Returns the files that have no test for the device, as text.
     """
     untested = []
     jobs = [Job(named(test, cuda), (test,), cuda) for test, cuda in tests]
@@ -100,7 +100,7 @@ def check_unmutated(tests: list[tuple[str, bool]], options: argparse.Namespace) 
 
 
 def tree_digest(tests: list[tuple[str, bool]]) -> str:
-    """Return a name for the state of all sources and tests, and for the tests that run where."""
+    """Return a digest of all sources and tests, and of the assignment of tests to devices."""
     digest = hashlib.sha256(repr(tests).encode())
     for path in sorted(p for room in COPIED for p in (ROOT / room).rglob("*") if p.suffix in (".py", ".cu", ".toml")):
         digest.update(path.as_posix().encode() + path.read_bytes())
@@ -108,9 +108,9 @@ def tree_digest(tests: list[tuple[str, bool]]) -> str:
 
 
 def run(mutants: list[tuple[Candidate, bool]], kept: dict, options: argparse.Namespace) -> None:
-    """Run mutants, each on CUDA or not, and write each result down as it comes.
+    """Run mutants, each on CUDA or on the CPU, and store each result.
 
-    Tests that several mutants run at a time may find a device's memory full: such a mutant is run again, by itself.
+    A mutant that runs out of device memory while others run is run again alone.
     """
     by_id = {c.id: c for c, _ in mutants}
     jobs = [job_of(c, cuda, kept["untested"]) for c, cuda in mutants]
@@ -151,7 +151,7 @@ def main() -> None:
         return
     reasons = {} if options.claims else reasons
     if (options.device == "both" or any(c.cuda for c in sampled)) and not has_cuda():
-        sys.exit("mutants of what CUDA runs need a CUDA device, and torch finds none here; use --device cpu")
+        sys.exit("mutants of CUDA code need a CUDA device, but torch finds none; use --device cpu")
     preload()
     options.json.parent.mkdir(parents=True, exist_ok=True)
     kept = json.loads(options.json.read_text()) if options.json.exists() else {"unmutated": "", "mutants": {}}

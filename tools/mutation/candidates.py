@@ -1,4 +1,4 @@
-"""All mutants, each under a key that edits elsewhere leave alone, and samples of them."""
+"""All mutants, with keys that do not depend on edits elsewhere in a file, and samples of mutants."""
 
 import hashlib
 import random
@@ -30,7 +30,7 @@ class Candidate:
 
     @property
     def key(self) -> tuple[str, str, str, str, str]:
-        """File, function, path, shape and change: its name whatever stands elsewhere in the file."""
+        """File, function, path, shape and change: a name that does not depend on the rest of the file."""
         place = self.edit.place
         return self.file, place.function, place.path, place.shape, self.change
 
@@ -66,9 +66,9 @@ def all_candidates() -> list[Candidate]:
 
 
 def sample(candidates: list[Candidate], count: int, seed: int) -> list[Candidate]:
-    """Return a random sample: of each file, and apart for each device, its proportion of the count, rounded up.
+    """Return a random sample, stratified by file and by device, in proportion to the number of mutants, rounded up.
 
-    A larger sample of the same seed holds the smaller one.
+    A larger sample with the same seed contains the smaller one.
     """
     strata: dict[tuple[str, bool], list[Candidate]] = {}
     for c in candidates:

@@ -1,4 +1,4 @@
-"""Claims that a mutant is equivalent: read, and matched with the mutants that there are."""
+"""Claims that mutants are equivalent: reading, and matching with the existing mutants."""
 
 import re
 import tomllib
@@ -37,7 +37,7 @@ def load(path: Path = CLAIMS) -> Claims:
     claims = Claims(table["files"], {})
     for reason, mutants in table["equivalent"].items():
         if len(reason) < 20:
-            raise ValueError(f"{path.name}: '{reason}' is too short for a reason; say in 20 letters why no test sees it")
+            raise ValueError(f"{path.name}: '{reason}' is too short for a reason; explain in 20 letters why no test can fail")
         for text in mutants:
             if not (found := PATTERN.fullmatch(text)) or found["name"] not in claims.files:
                 raise ValueError(f"{path.name}: write '<name in [files]>.<function> <path> <shape>: <changes>', not '{text}'")
@@ -50,9 +50,9 @@ def load(path: Path = CLAIMS) -> Claims:
 
 
 def match(claims: Claims, candidates: list[Candidate]) -> tuple[dict[str, str], list[str]]:
-    """Return the reason by number of each claimed mutant, and a message for each claim that no mutant answers to.
+    """Return the reason of each claimed mutant by its number, and a message for each claim without a mutant.
 
-    A statement that has moved within its function is found by its shape, as long as no other there has the same.
+    A statement that has moved within its function is found by its shape, if this shape is unique in the function.
     """
     exact = {c.key: c for c in candidates}
     alike: dict[tuple[str, ...], list[Candidate]] = {}

@@ -21,16 +21,16 @@ NAMES = {
 
 @dataclass(frozen=True)
 class Place:
-    """A statement found by its syntax, which no new name, comment, line break or edit of another function changes."""
+    """A statement, identified by syntax: independent of names, comments, line breaks and edits of other functions."""
 
     function: str = ""
     """Dotted name of the function around it; empty at module level."""
     path: str = ""
     """Statements from the function down to this one, each with its number among those of its kind there: ``For2.If1``."""
     shape: str = ""
-    """Fingerprint of the statement: a statement of another shape is another one, wherever it stands."""
+    """Fingerprint of the statement; statements with different shapes are different, at any place."""
     cuda: bool = False
-    """True where only a CUDA device runs it."""
+    """True if only a CUDA device runs the statement."""
 
     def below(self, kind: str, counts: Counter, shape: str = "") -> "Place":
         """Return the place of the next part of a kind below this one; ``counts`` is of one file."""
@@ -51,7 +51,7 @@ class Edit:
     end: int
     new: str
     change: str
-    """The change in words that do not depend on the place: ``+ to -``."""
+    """The change as text, independent of its place: ``+ to -``."""
     place: Place = Place()
 
     def apply(self, source: bytes) -> bytes:
@@ -65,7 +65,7 @@ def fingerprint(shape: str) -> str:
 
 
 def swaps(operator: str) -> list[str]:
-    """Return what an operator is replaced by."""
+    """Return the replacements of an operator."""
     tables = (ARITHMETIC, BOUNDARY, DIRECTION, UPDATES, LOGIC)
     return [table[operator] for table in tables if operator in table]
 

@@ -1,4 +1,4 @@
-"""Mutants of a CUDA body, by a tokenizer: house style sets binary operators between blanks and nothing else."""
+"""Mutants of a CUDA body, by a tokenizer that relies on our style: only binary operators are between blanks."""
 
 import bisect
 import re
@@ -38,7 +38,7 @@ def native_edits(source: bytes) -> list[Edit]:
 
 
 def _statements(tokens: list[re.Match]) -> tuple[list[int], list[Place]]:
-    """Return where each statement of a body begins, and its place. The head of a block is a statement of its own."""
+    """Return the start of each statement of a body, and its place. The head of a block is a separate statement."""
     starts, places, blocks, counts = [], [], [Place(cuda=True)], Counter()
     for head, end in _heads(tokens):
         words, place = [t[0].decode() for t in head], blocks[-1]

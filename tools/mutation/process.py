@@ -15,7 +15,7 @@ from tools.mutation.rules import SKIPPED
 
 COPIED = ("warpgs", "tests", "bench")
 PASSED, NO_TESTS, NOT_RUN = 0, 5, (3, 4, 70)
-"""Exit status of tests that pass, where there are none, and where pytest cannot run: its own error, no such file; ours."""
+"""Exit status of passed tests, of no tests, and of failures to run: an error in pytest, a missing file, and our own error."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,11 @@ class Outcome:
     the tests could not be run at all."""
     seconds: float
     output: str
-    """The end of what pytest printed."""
+    """The end of pytest's output."""
 
 
 def copy_tree(root: Path, to: Path) -> None:
-    """Make hard links to all that tests read; a file that is to differ must be unlinked first."""
+    """Make hard links to all files that tests read; to change a file, unlink it first."""
     ignored = shutil.ignore_patterns("__pycache__", "*.pyc")
     for name in COPIED:
         if (root / name).is_dir():
@@ -64,14 +64,14 @@ def _link(source, target) -> None:
 
 
 def preload() -> None:
-    """Import, once for all children, what is slow and holds no state of ours or of a device."""
+    """Import, once for all children, modules that are slow to import and hold no state of ours or of a device."""
     for name in ("numpy", "torch", "torch.autograd.gradcheck", "warp", "pytest", "scipy.stats", "hypothesis"):
         with contextlib.suppress(ImportError):
             __import__(name)
 
 
 class _Clock:
-    """A pytest plugin that ends the process where a single test takes too long, in whatever loop it is, and counts tests."""
+    """A pytest plugin that counts tests, and ends the process if a single test takes too long, even in an endless loop."""
 
     def __init__(self, seconds: float):
         self.seconds, self.run = seconds, 0
@@ -84,7 +84,7 @@ class _Clock:
 
 
 def _child(job: Job, tree: Path, root: Path, cache: Path, test_timeout: float) -> int:
-    """Do all that a forked child does, and return pytest's exit status."""
+    """Do the work of a forked child, and return pytest's exit status."""
     import pytest
     import torch
 
@@ -131,7 +131,7 @@ def _start(job: Job, folder: Path, root: Path, cache: Path, test_timeout: float)
 
 
 def _outcome(job: Job, status: int, timed_out: bool, seconds: float, output: str) -> Outcome:
-    """Classify an end: tests that failed, a process that crashed or one that never ended is a mutant that was noticed."""
+    """Classify the end of a job: a failed test, a crash or a timeout means that the mutant was noticed."""
     code = os.waitstatus_to_exitcode(status)
     if timed_out or code == -signal.SIGALRM:
         word = "timeout"
@@ -152,12 +152,12 @@ def run_jobs(
     """Run jobs, ``workers`` at a time, and yield each outcome as it comes.
 
     Args:
-        jobs: What to run.
+        jobs: Jobs to run.
         root: The tree to copy.
-        cache: Warp's folder of compiled kernels, shared: it is keyed by the code, and entries are moved in whole.
+        cache: Warp's folder of compiled kernels. Processes can share it: its keys depend on the code, and writes are atomic.
         workers: Processes at a time.
-        timeout: Seconds after which a job is ended.
-        test_timeout: Seconds after which it is ended if they all went into one test.
+        timeout: Time limit of a job [s].
+        test_timeout: Time limit of a single test of a job [s].
     """
     waiting, running = iter(jobs), {}
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:

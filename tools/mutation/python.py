@@ -1,4 +1,4 @@
-"""Mutants of a Python source: found in its syntax tree, made by replacing the bytes of one token."""
+"""Mutants of a Python source: found in its syntax tree, and made by replacing one token."""
 
 import ast
 import io
@@ -21,12 +21,12 @@ OPERATORS = {
 
 
 def python_edits(source: bytes, file: str) -> list[Edit]:
-    """Return all mutants of a file, in the order in which they stand in it."""
+    """Return all mutants of a file, in their order in the file."""
     return sorted(_Walker(source, file).edits, key=lambda e: (e.start, e.end, e.change))
 
 
 def shape_of(node: ast.AST) -> str:
-    """Return the syntax of a statement, names numbered as they come, without the statements in its body."""
+    """Return the syntax of a statement without the statements in its body; names are numbered in order of appearance."""
     names: dict[str, str] = {}
 
     def text(part) -> str:
@@ -65,7 +65,7 @@ class _Walker:
         return self.starts[node.end_lineno - 1] + node.end_col_offset
 
     def walk(self, node, place: Place) -> None:
-        """Collect the edits of a node and of all below it that no rule leaves out."""
+        """Collect the edits of a node and of its descendants, except those that a rule leaves out."""
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             place = place.inside(node.name)
             place = replace(place, cuda=place.cuda or place.function in rules.CUDA_FUNCTIONS.get(self.file, ()))
@@ -99,7 +99,7 @@ class _Walker:
                 side = side or rules.ends_cpu(part)
 
     def between(self, left, right, operator: str) -> tuple[int, int]:
-        """Return where an operator stands between two operands."""
+        """Return the position of an operator between two operands."""
         words = operator.encode().split()
         start = self.bare.index(words[0], self.end(left), self.begin(right))
         return start, self.bare.index(words[-1], start, self.begin(right)) + len(words[-1])

@@ -27,8 +27,9 @@ def summary(sampled: list[Candidate], status: dict[str, str], reasons: dict[str,
 
     Args:
         sampled: The sample.
-        status: By number of the mutant: killed, timeout, survived, untested, broken; mutants that were not run are missing.
-        reasons: By number, why a mutant is claimed to be equivalent.
+        status: Status by number of the mutant: killed, timeout, survived, untested, broken; mutants that were not run are
+            missing.
+        reasons: Reasons of claims by number of the mutant.
     """
     parts = []
     for c in sampled:

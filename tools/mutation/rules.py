@@ -1,4 +1,4 @@
-"""Rules: the code that is mutated, the device that runs it, and the tests that look at it."""
+"""Rules: the code that is mutated, the device that runs it, and its tests."""
 
 import ast
 import re
@@ -8,16 +8,16 @@ SPEED = {
     "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX",
     "MAX_TILES", "WARPS", "STRIP", "ABREAST", "MAX_GRAPHS", "MIN_REPLAYS", "FREE_CAPTURES", "SMALL_BYTES",
 }  # fmt: skip
-"""Sizes of portions of work, and numbers of graphs; every value that divides as its comment says gives the same numbers."""
+"""Sizes of portions of work, and numbers of graphs; results are equal for every value allowed by the constant's comment."""
 
 HINTS = {
     "cost", "enable_backward", "grid_stride", "record_tape", "sync", "requires_grad", "cuda_max_registers", "launch_bounds",
     "max_unroll",
 }  # fmt: skip
-"""Keywords, and keys of options, that tell Warp or torch how to work, not what comes out."""
+"""Keywords, and keys of options, of Warp or torch that do not affect results."""
 
 SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
-"""Widths by which bounds are safe: a hundredth more lists a tile in excess, which draws nothing. Their operators count."""
+"""Safety margins of bounds: a margin larger by a hundredth lists an additional tile, without effect. Operators are mutated."""
 
 MUTATED = (
     "warpgs/kernels/*.py", "warpgs/kernels/cameras/*.py", "warpgs/kernels/cuda/*.cu", "warpgs/runtime/interop.py",
@@ -36,10 +36,10 @@ CUDA_FUNCTIONS = {
     "warpgs/kernels/median_depth.py": ("make_native",),
     "warpgs/kernels/ssim.py": ("make_kernels", "_Launcher.padded", "_Launcher.launch"),
 }  # fmt: skip
-"""Code that only a CUDA device runs, beside what `sides` and `ends_cpu` find."""
+"""Code that only a CUDA device runs, in addition to code that `sides` and `ends_cpu` find."""
 
 CUDA_ARGUMENTS = {"deterministic", "block_dim"}
-"""Arguments that mean something on CUDA alone, where their defaults, and what is passed for them, are tested."""
+"""Arguments that have an effect only on CUDA, where their defaults and their values are tested."""
 
 LIMITS, LIMITS_PROJECT, LIMITS_BLEND = (f"kernels/test_limits{what}.py" for what in ("", "_project", "_blend"))
 SPANS, CUTS = "kernels/test_spans.py", "runtime/test_interop.py"
@@ -79,7 +79,7 @@ OPS = {
     "tsdf": ["kernels/test_tsdf.py"],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
 }  # fmt: skip
-"""The tests of a file by the beginning of its name (of cameras: folder/name), the longest that fits; soonest failing first."""
+"""Tests by the longest matching prefix of a file's name (for cameras: folder/name); tests that fail soonest come first."""
 
 CUDA_OPS = {
     "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS, "render/test_channels.py"], "cameras/": [GUARDS],
@@ -89,10 +89,10 @@ CUDA_OPS = {
     "project_backward": [GUARDS], "project_cuda": [BODIES, GUARDS], "ssim": [GUARDS],
     "tiles": [BODIES, GUARDS, "pipeline/test_step.py"],
 }  # fmt: skip
-"""More tests for CUDA: bodies one by one, memory beside a tensor, steps that are recorded and replayed."""
+"""Further tests for CUDA: single bodies, memory next to a tensor, captured steps."""
 
 SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
-"""Tests that take most of a minute, and check what another in the list checks to the same digits by other means."""
+"""Tests that take nearly a minute, and check the same digits as another test in the list."""
 
 
 def tests_of(file: str, cuda: bool) -> list[str]:
@@ -109,8 +109,8 @@ def tests_of(file: str, cuda: bool) -> list[str]:
 def left_out(node: ast.AST) -> bool:
     """Return whether a node is not mutated, with all below it.
 
-    Errors: their text, and what is computed for it, is no arithmetic. Formatted text: names of modules and messages.
-    Imports and `__all__` hold no operator. Hints and portions change the time, not the numbers. Slack: see `SLACK`.
+    Not mutated are errors, since their text is not arithmetic; formatted text, that is, names of modules and messages; imports
+    and `__all__`; hints and portions, which change the time but not the numbers; and slack, see `SLACK`.
     """
     match node:
         case ast.Raise() | ast.JoinedStr() | ast.Import() | ast.ImportFrom():
@@ -125,12 +125,12 @@ def left_out(node: ast.AST) -> bool:
 
 
 def is_hint(node: ast.AST) -> bool:
-    """Return whether a key of a dictionary is the name of a hint; its value is left out then."""
+    """Return whether a key of a dictionary is the name of a hint, so that its value is left out."""
     return isinstance(node, ast.Constant) and node.value in HINTS
 
 
 def number_left_out(statement: ast.stmt | None) -> bool:
-    """Return whether the numbers of a statement are left out, its operators not."""
+    """Return whether the numbers of a statement are left out, but not its operators."""
     return isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) in SLACK
 
 
@@ -151,7 +151,7 @@ def sides(node: ast.AST) -> tuple[bool, bool]:
 
 
 def ends_cpu(statement: ast.AST) -> bool:
-    """Return whether a statement is an ``if`` of the CPU alone that ends in a return: only CUDA runs what follows it."""
+    """Return whether a statement is an ``if`` for the CPU that ends in a return, so that only CUDA runs the code after it."""
     if not isinstance(statement, ast.If) or not isinstance(statement.body[-1], ast.Return):
         return False
     return re.fullmatch(r"[\w.]+\.type == 'cpu'", ast.unparse(statement.test)) is not None

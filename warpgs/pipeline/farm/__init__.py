@@ -1,1 +1,1 @@
-"""Farms: many fits, several at a time, on the engines that exist."""
+"""Farms: many fits, several at a time, on this machine or a cluster."""

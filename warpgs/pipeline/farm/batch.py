@@ -1,4 +1,4 @@
-"""The process of a Slurm job: runs the job of a file, and writes its state into another.
+"""The process of a Slurm job: runs the job described in one file, and writes the state of the job into another file.
 
 ``python -P -m warpgs.pipeline.farm.batch JOB ANSWER THREADS``
 """

@@ -26,15 +26,15 @@ class Engine(Protocol):
     """A place where jobs run."""
 
     name: str
-    """Name for people."""
+    """Name shown to the user."""
     slots: int
-    """Jobs that it runs at a time."""
+    """Largest number of jobs that run at a time."""
 
     def start(self, job: FarmJob) -> None:
         """Start a job; called while fewer than `slots` run."""
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return new events; waits up to this time."""
+        """Return new events, after at most ``seconds`` [s]."""
 
     def close(self) -> None:
         """Stop all jobs. A fit saves its state if it can, and the next farm continues it."""

@@ -31,9 +31,9 @@ class Outcome:
     metrics: dict[str, Any] | None
     """Contents of metrics.json, or of eval.json if LPIPS was measured later; None if the run failed."""
     note: str = ""
-    """Note on this run for readers of the study; empty where nothing is special."""
+    """Note on this run for readers of the study; empty if there is none."""
     error: WarpgsError | None = None
-    """Error that it failed with, if any."""
+    """Error that ended the run, if any."""
 
 
 def _scores(path: Path) -> dict[str, Any] | None:
@@ -50,7 +50,7 @@ def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, spl
     """Name the properties in which a stored run differs from the requested one; empty if it does not differ."""
     wanted = {
         "configuration": (record.get("config_hash"), config.fingerprint()),
-        "code of your own": (record.get("own_code", {}), config.own_code()),
+        "user code": (record.get("own_code", {}), config.own_code()),
         "data": (record.get("fingerprint"), fingerprint),
         "training views": (record.get("train"), split and list(split.train)),
         "held-out views": (record.get("test"), split and list(split.test)),
@@ -78,7 +78,7 @@ def _set_aside(folder: Path) -> Path:
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
-    """Return the scores of a finished run with LPIPS of the weights requested, measured now where they are missing yet."""
+    """Return the scores of a finished run with LPIPS for the requested weights; LPIPS is measured now if it is missing."""
     for found in (metrics, _scores(folder / "eval.json")):
         if found and found.get("config_hash") == metrics["config_hash"] and variants.items() <= found["variants"].items():
             return metrics | {k: found[k] for k in ("test", "views", "variants")}
@@ -96,19 +96,19 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the finished run that is requested.
+    """Ensure that a run folder holds the requested run, finished.
 
-    A finished run of the same configuration, code of the user's own, data, views, kind of device and version is kept. A
-    half-finished one is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
+    A finished run with the same configuration, user code, data, views, kind of device and version is kept. An interrupted run
+    is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
 
     Args:
-        request: The fit; ``out`` is its folder, ``resume`` is decided here.
+        request: The fit; ``out`` is its folder, ``resume`` is ignored.
         fingerprint: Fingerprint of the scene's data.
         split: Training and held-out views; None if no existing run can match.
         device: cpu or cuda.
         variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
-        resolved: The settings of ``request`` with those chosen that it leaves open; None where it leaves none open.
-        others: As `fit` takes them: on_step, verbose.
+        resolved: The settings of ``request`` with automatic ones chosen; None if no setting is automatic.
+        others: Further arguments of `fit`: on_step, verbose.
 
     Returns:
         The outcome. It contains the error of this run, if any, so that other runs continue.
@@ -122,11 +122,11 @@ def ensure_run(
 
 
 def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
-    """Return the record of a run folder, or None and why it has none."""
+    """Return the record of a run folder, or None and the reason why there is no record."""
     try:
-        return (read_record(folder) if (folder / CONFIG).exists() else None), "is no run"
+        return (read_record(folder) if (folder / CONFIG).exists() else None), "not a run folder"
     except DataError as e:
-        return None, f"cannot be used ({e})"
+        return None, f"unusable ({e})"
 
 
 def _outcome(
@@ -138,7 +138,7 @@ def _outcome(
         # the report is what a fit writes last
         metrics = _scores(folder / "metrics.json") if (folder / "report.html").is_file() else None
         if gap:
-            note = f"the run that was there had another {gap}; moved to {_set_aside(folder).name} and fitted again"
+            note = f"the old run differs in {gap}; moved to {_set_aside(folder).name} and fitted again"
             state = "redone"
         elif metrics is not None:
             if (folder / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
@@ -147,10 +147,10 @@ def _outcome(
             try:
                 scores = _with_lpips(metrics, folder, request, variants) if variants else metrics
             except WarpgsError as e:
-                return Outcome("failed", None, f"scoring it again: {e}", e)
+                return Outcome("failed", None, f"scoring the finished run failed: {e}", e)
             return Outcome("kept", scores)
         else:
-            resume, state, note = True, "continued", "was half done and has been continued from its last checkpoint"
+            resume, state, note = True, "continued", "was interrupted; continued from the last checkpoint"
     elif os.path.exists(folder) and not is_empty(folder):
         note = f"old results: {why}; moved to {_set_aside(folder).name} and fitted again"
         state = "redone"

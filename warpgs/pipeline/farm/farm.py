@@ -15,9 +15,9 @@ from warpgs.pipeline.farm.record import JobRecord, finished, read_record, write_
 from warpgs.runtime.folder_lock import hold_folder
 
 ATTEMPTS = 2
-"""Times that a job is started: once, and once more after a crash or where no memory was left."""
+"""Largest number of starts of a job; the second start follows a crash or a lack of memory."""
 POLL = 2.0
-"""Time after which a job that another farm works on is looked at again [s]."""
+"""Time between checks of a job that another farm works on [s]."""
 
 
 @dataclass
@@ -30,9 +30,9 @@ class JobStatus:
     step: int = 0
     """Steps done; 0 if unknown."""
     attempts: int = 0
-    """Times that it was started here."""
+    """Number of starts by this farm."""
     seconds: float = 0.0
-    """Time that it took here in all, 0 where it was not started here [s]."""
+    """Total time of its starts by this farm [s]; 0 if this farm did not start it."""
     began: float = 0.0
     """Time of its last start (`time.monotonic`)."""
     record: JobRecord | None = None
@@ -53,15 +53,15 @@ def run_farm(
 ) -> list[JobStatus]:
     """Run jobs until each is done or has failed.
 
-    A job that is finished and valid is skipped. If the process of a job dies or runs out of memory, the job is started once
-    more after the others, from its checkpoint. A folder of a job is locked while it is worked on here; one that another farm
-    has locked is looked at again later, and its result is taken over.
+    A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more after the
+    others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has locked is checked
+    again later, and its result is used.
 
     Args:
         jobs: The jobs.
         engine: Where they run; it is not closed.
         show: Called with the status of all jobs whenever one changed, and every ``poll`` seconds.
-        poll: Time after which a job that another farm works on is looked at again [s].
+        poll: Time between checks of a job that another farm works on [s].
 
     Returns:
         The status of each job.
@@ -73,7 +73,7 @@ def run_farm(
 
 
 class _Farm:
-    """The jobs of a farm and who holds them."""
+    """The jobs of a farm and the locks of their folders."""
 
     def __init__(self, jobs: list[FarmJob], engine: Engine, show: Callable[[list[JobStatus]], object], poll: float):
         self.all = [JobStatus(job, before=read_record(job.folder)) for job in jobs]
@@ -153,7 +153,7 @@ class _Farm:
             status.state, status.attempts = "elsewhere", status.attempts - 1
             waiting.append(status)
         elif event.state == "crashed" or record is None or (record.state == "failed" and record.again):
-            reason = event.message or (record.message if record is not None else "it left no record")
+            reason = event.message or (record.message if record is not None else "the job left no record")
             status.notes.append(f"attempt {status.attempts}: {reason}")
             if status.attempts < ATTEMPTS:
                 status.state = "waiting"
@@ -185,7 +185,7 @@ class _Farm:
 
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
-    """Return the time until all jobs are done [s], by the mean time of those done here; None before the first one is."""
+    """Estimate the time until all jobs are done [s] from the mean time of jobs done by this farm; None before the first."""
     took = [s.seconds for s in statuses if s.state == "done" and s.seconds]
     if not took:
         return None

@@ -1,4 +1,4 @@
-"""Results of a farm for people and for tables: index.html and results.csv, from the records of all its jobs."""
+"""Results of a farm: index.html and results.csv, from the records of all its jobs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def row_of(status: JobStatus) -> JobRow:
     if record is None:
         took = time.monotonic() - status.began if status.state == "running" else 0.0
         return JobRow(status.job.name, status.state, status.step, took, message=status.notes[-1] if status.notes else "")
-    message = record.message if record.state == "failed" else "" if status.attempts else "was there already"
+    message = record.message if record.state == "failed" else "" if status.attempts else "finished before"
     return JobRow(
         record.name, status.state, record.steps, record.seconds, record.psnr, record.gaussians,
         message or (status.notes[-1] if status.notes else ""),

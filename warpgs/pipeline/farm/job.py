@@ -1,4 +1,4 @@
-"""A job of a farm: a fit and the folder of its results, also as text for another process."""
+"""A job of a farm: a fit and the folder of its results, and the conversion to text for another process."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class FarmJob:
     folder: Path
     """Folder of the job's record, log and thumbnail, which is locked while a farm works on it."""
     results: Path | None = None
-    """Folder of all results, above ``folder``: below it no link is followed; None if it is ``folder``."""
+    """Folder of all results, which contains ``folder``; links below it are not followed. None if it is ``folder`` itself."""
 
     def identity(self) -> str:
-        """Return the first 16 hexadecimal digits of the SHA-256 of all that the result depends on but the images."""
+        """Return the first 16 hexadecimal digits of the SHA-256 of all inputs of the result except the images."""
         r = self.request
         weights = None if r.lpips_weights is None else str(r.lpips_weights)
         values = [dataclasses.asdict(r.scene), r.config.to_json(), weights, r.device]
@@ -55,10 +55,10 @@ def job_text(job: FarmJob) -> str:
 
 
 def job_of(text: str) -> FarmJob:
-    """Return the job of `job_text`; code of the user's own that it names is imported, as in the process that wrote it.
+    """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text.
 
     Raises:
-        UsageError: That code is missing.
+        UsageError: The user code cannot be imported.
     """
     values = schema.parse(text)
     r = values["request"]
@@ -69,7 +69,7 @@ def job_of(text: str) -> FarmJob:
         try:
             module_of(place)
         except (ImportError, OSError) as e:
-            raise UsageError(f"your code {place} cannot be imported ({e}); put it where the farm's processes find it") from e
+            raise UsageError(f"your code {place} cannot be imported ({e}); put it where all processes can import it") from e
     STRATEGIES.load(config["strategy"])
     for term in config["loss_terms"]:
         LOSS_TERMS.load(term["name"])

@@ -15,29 +15,29 @@ from warpgs.input_files import read_input, unread_reason
 from warpgs.io.readers import all_readers
 
 NAME = re.compile(r"(?:[^\W_]|[\udc80-\udcff])[^/\\:*?\"<>|\x00-\x1f]{0,99}")
-"""Names of jobs: those of a folder below the results on any system, and bytes that are not text where a folder has them."""
+"""Pattern of a job's name: a valid folder name on any system. Bytes that are not text are allowed, as folders may have them."""
 MOST_BYTES = 200
-"""Longest name of a job: file systems take 255 bytes, and names that begin with it, such as NAME.old1, must fit too."""
+"""Longest name of a job [bytes]: file systems allow 255, and longer names such as NAME.old1 must fit, too."""
 OWN_FILES = ("index.html", "results.csv")
 """Names in a results folder that do not belong to a job."""
 PLUGINS = ("preset", "strategy", "loss-terms", "view-modules", "reader")
-"""Flags that can name code: a file of jobs may name only that of warpgs."""
+"""Flags that can name code; in a file of jobs they may only name code of warpgs."""
 FARM_FLAGS = (
     "out", "resume", "view", "view-port", "device", "threads", "time-budget", "allow-outside", "help", "help-all", "h",
 )  # fmt: skip
-"""Flags of `warpgs fit` that a single job may not have."""
+"""Flags of `warpgs fit` that a single job may not set."""
 
 
 @dataclass(frozen=True)
 class ListedJob:
-    """A scene to fit, and the flags that it adds to those of all jobs."""
+    """A scene to fit, and the job's flags in addition to those of all jobs."""
 
     name: str
     """Name, unique in the farm; the folder of its results."""
     scene: Path
     """Folder of the scene, or a video."""
     flags: tuple[str, ...] = ()
-    """Words for the command line of `warpgs fit`."""
+    """Arguments of `warpgs fit`."""
 
 
 def list_jobs(jobs: str) -> list[ListedJob]:
@@ -76,7 +76,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
 
 
 def _named(scenes: list[Path]) -> list[ListedJob]:
-    """Name scenes by their folders, or by the whole path below the folder of all where two folders have one name."""
+    """Name scenes by their folders; if two folders have the same name, by their paths below the common folder."""
     scenes = [Path(os.path.abspath(s)) for s in scenes]
     if len({s.name.casefold() for s in scenes}) == len(scenes):
         return [ListedJob(s.name, s) for s in scenes]
@@ -85,12 +85,12 @@ def _named(scenes: list[Path]) -> list[ListedJob]:
 
 
 def _read(path: Path) -> list[ListedJob]:
-    """Read a file of jobs: ``{"scene": FOLDER}`` a line, with a ``name`` and flags of `warpgs fit` beside it."""
+    """Read a file of jobs: ``{"scene": FOLDER}`` per line, optionally with a ``name`` and flags of `warpgs fit`."""
     try:
         data = read_input(path, schema.MAX_BYTES)
     except OSError as e:
         raise DataError(
-            f"{path}: cannot be read ({unread_reason(e)}); give a file with a line of JSON for each job, or several farms"
+            f"{path}: cannot be read ({unread_reason(e)}); give a file with one line of JSON per job, and split a large one"
         ) from e
     found = []
     for number, line in enumerate(data.splitlines(), 1):
@@ -114,7 +114,7 @@ def _job(values: Any, folder: Path) -> ListedJob:
 
 
 def _flag(key: str, value: Any) -> list[str]:
-    """Return a setting of a line as words of a command line."""
+    """Return a setting of a line as arguments of a command line."""
     name = key.replace("_", "-")
     if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
         raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")

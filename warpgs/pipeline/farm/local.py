@@ -29,7 +29,7 @@ class Slot:
     threads: int
     """CPU threads."""
     environment: dict[str, str] = field(default_factory=dict)
-    """Variables of its process: the GPU that it sees."""
+    """Environment variables of the slot's process, which select its GPU."""
 
 
 def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
@@ -53,7 +53,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
         raise UsageError(f"--slots and --per-gpu must be numbers from 1 to {MAX_SLOTS}, not {slots} and {per_gpu}")
     if gpus and count > gpus * per_gpu:
         raise UsageError(
-            f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu}; give a larger --per-gpu"
+            f"--slots {count}: {gpus} GPUs with --per-gpu {per_gpu} have {gpus * per_gpu} slots; give a larger --per-gpu"
         )
     threads = max(1, torch.get_num_threads() // count)
     if not gpus:
@@ -80,7 +80,7 @@ class _Process:
 
 
 class LocalEngine:
-    """Runs each job in the process of a slot, which serves job after job until one fails or it dies."""
+    """Runs each job in the process of a slot; the process runs job after job until a job fails or the process dies."""
 
     name = "local"
 
@@ -119,9 +119,10 @@ class LocalEngine:
         _, line = self._news.get()
         if line is None or json.loads(line).get("state") != "done":
             code, errors = process.worker.end(0)
+            last = (errors.splitlines() or ["no message"])[-1]
             raise ResourceError(
-                f"kernels could not be compiled: the process ended with {code}; {errors.splitlines()[-1:] or ['no word']}. "
-                "run `warpgs doctor` to check this machine"
+                f"kernels could not be compiled: the process ended with exit code {code} ({last}); run `warpgs doctor` to "
+                "check this machine"
             )
 
     def workers(self) -> dict[str, int]:

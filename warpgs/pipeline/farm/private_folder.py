@@ -16,20 +16,20 @@ from warpgs.runtime.permissions import open_to_others
 
 LOCK = "lock"
 WAIT_FOR_OTHERS = 60.0
-"""Time that another farm gets to make its own folder [s]."""
+"""Longest wait while another farm makes its own folder [s]."""
 
 
 @contextlib.contextmanager
 def private_shared_folder(base: Path | None) -> Iterator[Path]:
     """Make a new folder with a random name that only this user can enter (mode 0700), and remove it after the block.
 
-    Folders that killed farms left beside it are removed as well: their locks are free.
+    Folders of killed farms, whose locks are free, are removed as well.
 
     Args:
-        base: Folder to make it in; None for ``warpgs/slurm`` in the user's cache.
+        base: Parent of the new folder; None for ``warpgs/slurm`` in the user's cache.
 
     Raises:
-        ResourceError: It cannot be written or locked.
+        ResourceError: The folder cannot be written or locked.
         UsageError: There is no home folder, or other users can write to ``base`` or to a folder above it.
     """
     home = cache_home()
@@ -42,7 +42,7 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
         others = open_to_others(base)
         if others is not None:
             raise UsageError(
-                f"{base}: Slurm's job files cannot lie here, as other users can write to {others} and could run code as you; "
+                f"{base}: not safe for Slurm's job files: other users can write to {others} and could run code as you; "
                 "name a private folder that all nodes see with --slurm-folder"
             )
         with FileLock(base / LOCK, timeout=WAIT_FOR_OTHERS, mode=0o600):  # no other farm is between making and locking its own

@@ -1,8 +1,8 @@
 """The engine for clusters that Ray runs: a task for each job, with a fraction of a GPU. Extra `ray`.
 
-Ray sends functions and results as pickles: every process that its ports accept can run code as the user. A cluster that is
-started here listens at the loopback address and accepts only processes with its token; the token of another cluster is its
-owner's choice.
+Ray sends functions and results as pickles, so every process that its ports accept can run code as the user. A cluster that this
+module starts listens at the loopback address and accepts only processes with its token. For other clusters, the owner chooses
+whether there is a token.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from warpgs.runtime.listening import listeners, say_what_is_open
 
 
 class RayEngine:
-    """Runs each job as a task of Ray, which finds a machine for it and starts it once more where its process dies."""
+    """Runs each job as a task of Ray; Ray finds a machine, and starts the task once more if its process dies."""
 
     name = "ray"
 
@@ -68,7 +68,7 @@ class RayEngine:
         self.use(run_job)
 
     def use(self, work: Callable[[str, int], str]) -> None:
-        """Run jobs by another function than `run_job`, of the same arguments and result."""
+        """Run jobs by a function other than `run_job`, with the same arguments and result."""
         self._task = self._ray.remote(**self._options)(work)
 
     def start(self, job: FarmJob) -> None:
@@ -95,15 +95,15 @@ class RayEngine:
 
 
 def _connect(ray: Any, address: str) -> None:
-    """Join a cluster, or start one whose sockets lie in a private folder: Ray gives its own folders to everybody (mode 0777).
+    """Join a cluster, or start one with its sockets in a private folder, because Ray's default folders have mode 0777.
 
-    The address is never that of ``/tmp/ray``, where other users can write one.
+    The address is never read from ``/tmp/ray``, where other users can write.
     """
     own = {"include_dashboard": False, "_temp_dir": str(private_folder() / "ray")} if address == "local" else {}
     try:
         ray.init(address=address, log_to_driver=False, logging_level="warning", **own)
     except (OSError, RuntimeError, ValueError) as e:
         remedy = "set TMPDIR to a folder with a short path" if own else "check RAY_ADDRESS and RAY_AUTH_TOKEN"
-        raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave --engine ray out") from e
+        raise ResourceError(f"Ray at {address} does not answer: {e}; {remedy}, or leave out --engine ray") from e
     if own:  # where Ray was imported before us it listens at every interface
         say_what_is_open(listeners())

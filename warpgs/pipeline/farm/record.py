@@ -25,7 +25,7 @@ CHECKED = (PLY, "metrics.json", CONFIG)
 """Files of a run with a checksum in the record."""
 FORMAT = 1
 MOST_FILES = 100_000
-"""Files, and folders, of a scene that are listed; one with more is read by the fit to know whether it is the same."""
+"""Largest number of files and folders of a scene to list. In a larger scene only the fit, which reads it, detects changes."""
 
 _DIGEST = schema.text
 _SCHEMA = schema.fields(
@@ -54,7 +54,7 @@ class JobRecord:
     message: str = ""
     """Error of a failed job, or a note on a finished one."""
     again: bool = False
-    """True where a failed job may succeed when it is tried again."""
+    """True if a failed job may succeed when it is repeated."""
     source: str = ""
     """SHA-256 of the scene's file names, sizes and times; empty if unknown."""
     seconds: float = 0.0
@@ -78,7 +78,7 @@ def write_record(folder: Path, record: JobRecord) -> None:
     """Write the record of a job.
 
     Raises:
-        ResourceError: It cannot be written.
+        ResourceError: The record cannot be written.
     """
     write_json(folder / RECORD, asdict(record))
 
@@ -97,7 +97,7 @@ def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal digits.
 
     Raises:
-        ResourceError: It cannot be read.
+        ResourceError: The file cannot be read.
     """
     try:
         return input_digest(path, path.parent)

@@ -19,19 +19,19 @@ from warpgs.runtime.terminal import say
 
 ENGINES = ("local", "ray", "slurm")
 SHOW_INTERVAL = 0.2
-"""Shortest time between two states of the table [s]."""
+"""Shortest time between two updates of the table [s]."""
 INDEX_INTERVAL = 30.0
-"""Time between two writings of the index while jobs run [s]."""
+"""Time between two updates of the index while jobs run [s]."""
 
 
 @dataclass(frozen=True)
 class EngineRequest:
-    """An engine and how many jobs it runs at a time."""
+    """An engine and its number of concurrent jobs."""
 
     engine: str = "local"
     """local (processes of this machine), ray or slurm."""
     slots: int | None = None
-    """Number of concurrent jobs; None for ``per_gpu`` for each GPU, one on a CPU, or the capacity of the cluster."""
+    """Number of concurrent jobs; None: ``per_gpu`` for each GPU, one on a CPU, or as many as the cluster has capacity for."""
     per_gpu: int = 1
     """Jobs that share a GPU."""
     threads: int = 1
@@ -49,7 +49,7 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
 
     Raises:
         ResourceError: The device is missing.
-        UsageError: The engine is unknown or not installed, it cannot have so many slots, or other users can write to
+        UsageError: The engine is unknown or not installed, it does not have so many slots, or other users can write to
             ``slurm_folder``.
     """
     r = request
@@ -107,7 +107,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
             write_index(results, statuses, time.monotonic() - began)
             return statuses
     except KeyboardInterrupt:
-        say("repeat the command to continue: finished jobs are kept, interrupted ones continue")
+        say("repeat the command to continue: finished jobs are kept, and interrupted jobs continue")
         raise
     finally:
         engine.close()
@@ -117,13 +117,13 @@ def check_failures(statuses: list[JobStatus]) -> None:
     """Check that no job failed.
 
     Raises:
-        ResourceError: Some did; the message names them.
+        ResourceError: A job failed; the message names up to five failed jobs.
     """
     failed = [s for s in statuses if s.state == "failed"]
     if failed:
         first = failed[0].record
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
         raise ResourceError(
-            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. The first: "
+            f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. First message: "
             f"{first.message.rstrip('.') if first else 'unknown'}. The same command tries them again"
         )

@@ -1,6 +1,7 @@
-"""The engine for clusters that Slurm runs: a job of Slurm for each scene, by sbatch, squeue and scancel.
+"""The engine for Slurm clusters: a Slurm job for each scene, by sbatch, squeue and scancel.
 
-A job goes to its node as JSON and comes back as one word, both in a private folder. All else is read from the job's record.
+A job is sent to its node as JSON, and its state comes back as one word, both in a private folder. All other results are in the
+job's record.
 """
 
 from __future__ import annotations
@@ -24,32 +25,32 @@ from warpgs.runtime.subprocesses import ProgramResult, run_program
 from warpgs.runtime.terminal import say
 
 QUEUED = 100
-"""Jobs that are handed to Slurm at a time, where nothing else is requested."""
+"""Default number of jobs that Slurm has at a time."""
 ASK_EVERY = 1.0
-"""Time between two looks for answers [s]."""
+"""Time between two checks for answers of jobs [s]."""
 QUEUE_EVERY = 15.0
 """Time between two calls of squeue, which lists all jobs [s]."""
 MISSED = 3
-"""Calls of squeue that do not list a job before it counts as ended: a network file system shows its answer late."""
+"""A job counts as ended once so many calls of squeue do not list it: a network file system may show its answer late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
 SECONDS_TO_SAVE = 120
 """Time before its limit at which Slurm interrupts a job, so that the fit saves its state [s]."""
 LAST_BYTES = 2000
-"""End of a job's output that is searched for its last line."""
+"""Length of the end of a job's output in which its last line is searched [bytes]."""
 PATIENCE = 60.0
-"""Time that a command of Slurm gets [s]."""
+"""Time limit of a command of Slurm [s]."""
 
 
 @dataclass
 class _Queued:
-    """A job that Slurm has."""
+    """A job that was handed to Slurm."""
 
     slurm_id: str
     number: int
-    """Number in the names of its files in the private folder."""
+    """Number in the names of the job's files in the private folder."""
     missed: int = 0
-    """Calls of squeue that did not list it."""
+    """Number of calls of squeue that did not list the job."""
 
 
 class SlurmEngine:
@@ -78,11 +79,11 @@ class SlurmEngine:
 
         Raises:
             ResourceError: The private folder cannot be written.
-            UsageError: There is no Slurm here, or other users can write to the folder.
+            UsageError: Slurm is not installed, or other users can write to the folder.
         """
         missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
         if missing:
-            raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: call it on a machine of the cluster")
+            raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: run warpgs on a machine of the cluster")
         self.slots, self._threads = slots or QUEUED, threads
         self._options = [
             f"--job-name={NAME}", f"--time={minutes}", "--ntasks=1", f"--cpus-per-task={threads}", "--open-mode=append",
@@ -156,13 +157,13 @@ class SlurmEngine:
     def _answered(self, name: str, job: _Queued) -> Event:
         state = (self._folder / f"{job.number}.answer").read_text("utf-8")
         if state not in STATES:
-            return Event(name, "crashed", f"Slurm's job {job.slurm_id} gave no known answer")
+            return Event(name, "crashed", f"Slurm's job {job.slurm_id} ended with an unknown answer")
         for kind in ("json", "answer", "log"):
             (self._folder / f"{job.number}.{kind}").unlink(missing_ok=True)
         return Event(name, state)
 
     def _output(self, job: _Queued) -> str:
-        """Return the end of what a job wrote outside its log."""
+        """Return the end of a job's output outside its log."""
         try:
             with (self._folder / f"{job.number}.log").open("rb") as f:
                 f.seek(0, os.SEEK_END)
@@ -182,7 +183,7 @@ class SlurmEngine:
 
 
 def _call(program: str, *options: str, script: str = "") -> ProgramResult:
-    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT hold; those of squeue are dropped, as they would hide jobs."""
+    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply; those of squeue are removed: they could hide jobs."""
     return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
 
 

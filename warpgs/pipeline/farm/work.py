@@ -45,7 +45,7 @@ from warpgs.runtime.native_output import output_to
 from warpgs.runtime.terminal import say
 
 THUMBNAIL_SIDE = 480
-"""Longest side of a thumbnail: a render beside the photograph [px]."""
+"""Longest side of a thumbnail, which shows a render beside the photograph [px]."""
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:
@@ -57,7 +57,7 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
         on_step: As in `fit`.
 
     Returns:
-        The state: done, failed, or held where another farm works on it. The job's record has all else.
+        The state: done, failed, or held if another farm works on the job. The job's record has all other results.
     """
     if threads:
         set_threads(threads)
@@ -71,7 +71,7 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
 
 @contextlib.contextmanager
 def _logged(path: Path) -> Iterator[None]:
-    """Append to a log all that is printed in the block, by native libraries too."""
+    """Append all output of the block to a log, including that of native libraries."""
     try:
         file = appending(path)
     except OSError as e:
@@ -81,7 +81,7 @@ def _logged(path: Path) -> Iterator[None]:
 
 
 def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Fit a job, continue it, or keep it where it is finished, and write its record; returns the state as `run_job` does.
+    """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does.
 
     Raises:
         ResourceError: The record cannot be written.
@@ -117,7 +117,7 @@ def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None)
 
 
 def _ensure(job: FarmJob, on_step: Callable[[StepReport], object] | None) -> Outcome:
-    """Return the outcome of the fit; the scene is read here only where a run is there that may be the same."""
+    """Return the outcome of the fit; the scene is read here only if an existing run may match."""
     request = job.request
     device, _ = choose_device(request.device)
     lpips = {} if request.lpips_weights is None else load_lpips(request.lpips_weights, device).variants()

@@ -1,8 +1,8 @@
-"""The process of a device slot: takes jobs as lines on stdin, one after another, and answers with lines of JSON.
+"""The process of a device slot: reads jobs as lines from stdin, one after another, and answers with lines of JSON.
 
-It serves until its stdin ends or a job fails, since a failed job may leave memory allocated. A line is ``{"kernels":
-"cpu"}``, to compile kernels before the first job, or ``{"job": TEXT, "threads": N}``. An answer holds ``step``, or ``state``,
-the last one on a job. If stdin ends during a job, the job saves its state and stops.
+The process ends when stdin ends or a job fails, since a failed job may leave memory allocated. A line is ``{"kernels":
+"cpu"}``, to compile kernels before the first job, or ``{"job": TEXT, "threads": N}``. An answer holds ``step``, or ``state``
+at the end of a job. If stdin ends during a job, the job saves its state and stops.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ STEP_INTERVAL = 0.5
 
 
 def _answers() -> Callable[..., None]:
-    """Return a function that answers; what else is printed goes to stderr from now on."""
+    """Return a function that answers; all other output goes to stderr from now on."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 
@@ -43,7 +43,7 @@ def _read(lines: queue.SimpleQueue[str | None], working: threading.Event) -> Non
 
 
 def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
-    """Do what a line asks for; return the state."""
+    """Carry out the request of a line; return the state."""
     if "kernels" in values:
         import torch
 

@@ -13,15 +13,16 @@ from warpgs.pipeline.films.rig import MIN_SWING, Rig
 from warpgs.scene import Camera
 
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
-"""Path of each kind of rig where none was requested."""
+"""Default path for each kind of rig."""
 WIDE_ARC = math.radians(75)
-"""Arc of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the captured area."""
+"""Range of azimuths of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the
+captured area."""
 SWING = 0.9
 """Fraction of the cameras' range that a film swings through: coverage is lower at its ends."""
 MAX_ELEVATION = math.radians(80)
 """Largest elevation of a film: above it, the upward direction is lost."""
 LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
-"""Smallest and largest side of a film [px], and vertical field of view [deg]."""
+"""Smallest and largest value of a film's sides [px], and of its vertical field of view [deg]."""
 
 
 def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | None = None, turned: bool = False) -> Camera:
@@ -55,7 +56,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
 
 
 def path_of(rig: Rig) -> str:
-    """Return the path of a rig where none was requested."""
+    """Return the default path of a rig."""
     wide = rig.kind == "forward" and rig.span is not None and rig.span[1] - rig.span[0] > WIDE_ARC
     return "interpolate" if wide else BY_KIND[rig.kind]
 
@@ -89,7 +90,7 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
 
 
 def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
-    """Return poses on a circle about the rig's centre, or looking around from it; a swing there and back without full coverage.
+    """Return poses on a circle about the rig's centre, or looking around from it; without full coverage a swing there and back.
 
     Args:
         rig: The rig.
@@ -116,9 +117,9 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
     """Return cameras along a path, closed to a loop, with the size and intrinsics of the first camera.
 
     Args:
-        kind: ``turntable``: a level circle at the cameras' distance and elevation, or a swing through their range and back
-            where they stand on one side; in a room a turn on the spot. ``spiral``: two turns that rise and fall; of cameras
-            that look to one side, two turns that open and close again.
+        kind: ``turntable``: a level circle at the cameras' distance and elevation; for cameras on one side, a swing through
+            their range and back; in a room, a turn on the spot. ``spiral``: two turns that rise and fall; for cameras that look
+            to one side, two turns that open and close again.
         rig: Arrangement of the training cameras.
         cameras: Training cameras, at least one.
         frames: Number of cameras.

@@ -33,11 +33,11 @@ SHEET = "sheet.png"
 SHEET_FRAMES = 6
 """Frames of a sheet, evenly spaced."""
 COVERAGE = "coverage"
-"""Subfolder for the images of what training views saw."""
+"""Subfolder for images that mark regions by the number of training views that saw them."""
 
 
 def _training_depths(model: FittedModel, views: bool | Sequence[View], options: RasterizeOptions) -> list[DepthView]:
-    """Return the depths of the training views of a model; with their masks where the views themselves are given."""
+    """Return the depths of the training views of a model; masks apply if the views themselves are given."""
     masks = [v.mask for v in views] if isinstance(views, Sequence) else None
     cameras = [v.camera for v in views] if isinstance(views, Sequence) else [model.cameras()[n] for n in model.train]
     return depth_views(model.gaussians(), cameras, options, masks)
@@ -55,7 +55,7 @@ class RenderedPath:
     """Result of `render_film`: files, and lines for the user."""
 
     files: list[Path]
-    """A PNG for each camera in order, unless only a film was requested; then the film, if any."""
+    """A PNG for each camera in order, unless only a film was requested; and last the film, if any."""
     notes: list[str]
     """Lines for the user: choices made, and frames that show nothing."""
 
@@ -74,7 +74,7 @@ def _check_plan(plan: FilmPlan, out: Path, coverage: bool, sheet: bool) -> tuple
     one_size = len({(c.width, c.height) for _, c in plan.cameras}) == 1
     if (alone or sheet) and not one_size:
         raise UsageError(
-            f"{out}: the views differ in size, not allowed in a film or sheet; give --size, or a folder without --sheet"
+            f"{out}: the views differ in size, but a film or sheet needs one size; give --size, or a folder without --sheet"
         )
     if alone and coverage:
         raise UsageError(f"{out}: coverage images are PNG files; give a folder instead of a film")
@@ -124,7 +124,7 @@ def _frames(
 
 
 def _older_images(folder: Path, files: list[Path]) -> list[str]:
-    """Return notes on images of an earlier film that lie between those of this one."""
+    """Return notes on images of an earlier film in the same folder."""
     older = [p for p in folder.glob("*.png") if p not in files and p.name != SHEET]
     return [f"{len(older)} older images are also in {folder}: remove them, or give a new folder"] if older else []
 
@@ -144,10 +144,10 @@ def render_film(
     Args:
         model: The model.
         plan: The frames.
-        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, which is
-            then all that is written.
+        out: Folder for a PNG of each frame and film.mp4; or a film with one of the suffixes of `warpgs.report.film`, to write
+            only the film.
         settings: Settings of the film.
-        coverage: As in `render_path`; of a folder only.
+        coverage: As in `render_path`; only if ``out`` is a folder.
         sheet: True to also write six frames in one image: sheet.png in the folder, or beside the film.
         tell: Called with a line before each frame is rendered, and before the film is finished.
 

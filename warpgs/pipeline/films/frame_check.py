@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 EMPTY = 0.1
-"""Mean alpha of a frame that shows nearly nothing, as a fraction of that of the training views' renders."""
+"""A frame shows nearly nothing if its mean alpha is below this fraction of that of the training views' renders."""
 MIN_COVERAGE = 0.002
-"""Mean alpha below which any frame shows nearly nothing."""
+"""A frame shows nearly nothing if its mean alpha is below this, whatever the training views' renders have."""
 BLACK = 1 / 255
 """Mean of the brightest channel below which a frame is black."""
 
@@ -18,7 +18,7 @@ OUTSIDE = 0.1
 
 
 def _ranges(numbers: list[int]) -> str:
-    """Return rising numbers in words: 3 to 7, 9 and 12 to 20; after five ranges the rest is counted."""
+    """Return ascending numbers as text such as "3 to 7, 9 and 12 to 20"; after five ranges, the number of the others."""
     runs: list[list[int]] = []
     for n in numbers:
         if runs and n == runs[-1][1] + 1:
@@ -36,18 +36,18 @@ class FrameCheck:
     """Faults of the frames of a film, noticed while they are rendered."""
 
     coverage: float
-    """Mean alpha of the training views' renders; 0 where that is not known."""
+    """Mean alpha of the training views' renders; 0 if unknown."""
     empty: list[int] = field(default_factory=list)
     """Numbers of the frames that show nearly nothing."""
     black: list[int] = field(default_factory=list)
     """Numbers of the other frames that are black."""
     outside: list[int] = field(default_factory=list)
-    """Numbers of the other frames with more than `OUTSIDE` outside all photographs."""
+    """Numbers of the other frames of which a fraction above `OUTSIDE` is outside all photographs."""
     count: int = 0
-    """Number of frames looked at."""
+    """Number of checked frames."""
 
     def look(self, image: np.ndarray, alpha: np.ndarray, outside: float = 0.0) -> None:
-        """Look at the next frame: image [H, W, 3] and alpha [H, W] in [0, 1], and its fraction outside all photographs."""
+        """Check the next frame: image [H, W, 3] and alpha [H, W] in [0, 1], and its fraction outside all photographs."""
         if float(alpha.mean(dtype=np.float64)) < max(EMPTY * self.coverage, MIN_COVERAGE):
             self.empty.append(self.count)
         elif float(image.max(2).mean(dtype=np.float64)) < BLACK:
@@ -57,13 +57,13 @@ class FrameCheck:
         self.count += 1
 
     def notes(self, remedy: str, nearer: str) -> list[str]:
-        """Return a line for the user on each fault, with what to do; ``nearer`` for frames that show other places too."""
+        """Return a line for the user on each fault, with advice: ``nearer`` for frames outside photographs, else ``remedy``."""
         return [
-            f"{len(numbers)} of {self.count} frames {words}, numbers {_ranges(numbers)}: {advice}"
+            f"{len(numbers)} of {self.count} frames {words} (frames {_ranges(numbers)}): {advice}"
             for numbers, words, advice in (
                 (self.empty, "show nearly nothing", f"the path leaves the captured area; {remedy}"),
                 (self.black, "are black", f"the camera is inside geometry, or the scene is unlit; {remedy}"),
-                (self.outside, f"show over {OUTSIDE:.0%} that no photograph saw", f"expect smears there; {nearer}"),
+                (self.outside, f"have over {OUTSIDE:.0%} of pixels in no photograph", f"expect artefacts there; {nearer}"),
             )
             if numbers
         ]

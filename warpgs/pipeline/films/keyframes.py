@@ -20,9 +20,9 @@ from warpgs.scene import Camera, Normalization
 
 MAX_KEYFRAMES = 10_000
 MAX_BYTES = 16 * 2**20
-"""Largest file of keyframes."""
+"""Size of the largest file of keyframes [bytes]."""
 MAX_SKEW = 1e-3
-"""Largest difference between a matrix of a file and the rotation nearest to it."""
+"""Largest entry of R R^T - I for the upper left 3 x 3 matrix R of a pose in a file."""
 MIN_SECONDS, MAX_SECONDS = 1e-3, 86400.0
 """Least and largest time from one keyframe to the next [s]: slopes of the curve between them stay finite."""
 MAX_REACH = 1e12
@@ -36,9 +36,9 @@ class Keyframe:
     camera: Camera
     """The camera, a pinhole."""
     seconds: float
-    """Time at which the path is there [s]."""
+    """Time at which the path passes through the camera [s]."""
     reach: float = 0.0
-    """Distance along the optical axis to what the camera looks at [u]; 0 where that is not known."""
+    """Distance along the optical axis to the point that the camera looks at [u]; 0 if unknown."""
 
 
 def _fov_y(camera: Camera) -> float:
@@ -83,9 +83,9 @@ def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -
 def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> list[Camera]:
     """Return cameras on a smooth curve through keyframes, at even times from the first to the last.
 
-    The points looked at, distances to them, rotations and fields of view are one spline, so that an object that all cameras
-    look at stays where it is while they go around it. Rotations are quaternions, normalised at each frame: between neighbours
-    they turn nearly as evenly as spherical interpolation, and they do not jerk at a keyframe.
+    One spline interpolates the points looked at, the distances to them, rotations and fields of view. So an object that all
+    cameras look at stays in place while they go around it. Rotations are quaternions, normalised at each frame: between
+    neighbours they turn nearly as evenly as by spherical interpolation, and they do not jerk at a keyframe.
 
     Args:
         keyframes: At least one, at rising times; of a closed path the last is the first again.
@@ -136,7 +136,7 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
         The keyframes in scene units, the first at 0 s.
 
     Raises:
-        DataError: The file cannot be read, or a value in it is another than it may be; the message names it.
+        DataError: The file cannot be read, or one of its values is invalid; the message names the value.
     """
     try:
         values = schema.parse(read_input(path, MAX_BYTES))
@@ -166,8 +166,8 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
             raise DataError(f"{path}: fov_y of keyframe {i} is {value['fov_y']:g} rad; give radians, below 3.1")
         if result and not MIN_SECONDS <= value["seconds"] - values[i - 1]["seconds"] <= MAX_SECONDS:
             raise DataError(
-                f"{path}: seconds of keyframe {i} is not after that of keyframe {i - 1}, by {MIN_SECONDS:g} to "
-                f"{MAX_SECONDS:g}; put them in order of time"
+                f"{path}: seconds of keyframe {i} must be {MIN_SECONDS:g} to {MAX_SECONDS:g} above those of keyframe {i - 1}; "
+                "sort the keyframes by time"
             )
         viewmat, rotation = np.eye(4), nearest_rotation(rotation)
         viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -matmul(rotation.T, matrix[:3, 3])

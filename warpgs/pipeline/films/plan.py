@@ -23,16 +23,16 @@ from warpgs.scene import Camera, Gaussians
 from warpgs.suggestion import did_you_mean
 
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
-"""Names of paths; the name of a JSON file of keyframes is one, too."""
+"""Names of paths; a path may also be a JSON file of keyframes."""
 SECONDS = 3.0
 """Default duration of a film."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
-"""Duration of a film through training views: for each view, and at most."""
+"""Duration of a film through training views [s]: for each view, and largest in all."""
 MIN_FRAMES_PER_VIEW = 4
-"""Frames from one training view to the next; where a film has fewer, it passes through some of the views only."""
+"""Fewest frames from one training view to the next; a film with too few frames passes through some of the views only."""
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
-"""Field of a film's image above which it is wider than the photographs, as a fraction of theirs."""
+"""A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
 EMPTY_VIEW = "the model shows nothing there: `warpgs eval` scores each view"
 """Advice for training views that show nothing."""
 
@@ -45,7 +45,7 @@ class FilmSettings:
     """Number of frames; None for seconds times fps. The number of frames of ``views`` and of the user's own cameras is
     fixed."""
     seconds: float | None = None
-    """Duration [s]; None for what suits the path."""
+    """Duration [s]; None for the default of the path."""
     fps: int = 30
     """Frames per second."""
     size: tuple[int, int] | None = None
@@ -75,7 +75,7 @@ class FilmSettings:
             raise UsageError(f"a film must have 1 to {MAX_FRAMES:,} frames, not {self.frames}")
 
     def count(self, seconds: float) -> int:
-        """Return the number of frames of a film that lasts ``seconds`` where no duration is given."""
+        """Return the number of frames of a film; ``seconds`` is its duration if the settings have none."""
         if self.frames is not None:
             return self.frames
         return min(max(1, round((self.seconds or seconds) * self.fps)), MAX_FRAMES)
@@ -88,20 +88,20 @@ class FilmPlan:
     cameras: list[tuple[str, Camera]]
     """Stem of the file and camera of each frame, in scene units [u]."""
     coverage: float
-    """Fraction of a training view's pixels that the model covers; 0 where that is not known."""
+    """Fraction of a training view's pixels that the model covers; 0 if unknown."""
     remedy: str
     """Advice for frames that show nothing."""
     notes: list[str]
     """Lines for the user on the choices made."""
     nearer: str = "move the cameras nearer to those of the photographs"
-    """Advice for frames that show places outside the photographs."""
+    """Advice for frames that show areas outside the photographs."""
 
 
 @torch.no_grad()
 def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[float, float]:
     """Return the median rendered depth [u] over covered pixels and the median alpha of at most five cameras' images.
 
-    The depth is 1 where nothing is covered.
+    The depth is 1 if no pixel is covered.
     """
     depths, alphas = [], []
     for camera in cameras[:: max(1, len(cameras) // 5)]:
@@ -185,7 +185,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
 
 
 def _nearer(cameras: Sequence[Camera], train: Sequence[Camera], path: str) -> str:
-    """Return advice for frames that show places outside the photographs: their shape where the film is wider, else ``path``."""
+    """Return advice for frames that show areas outside the photographs: on size if the film is wider, else ``path``."""
     (wide, high), photo = _field(cameras[0]), [_field(c) for c in train]
     if min(wide, high) > WIDER * min(map(min, photo)) or max(wide, high) > WIDER * max(map(max, photo)):
         return "keep the shape and the field of view of the photographs"

@@ -15,7 +15,7 @@ NAMES = {
     "forward": "on one side of the scene", "ring": "around the scene", "room": "looking outwards, as in a room",
     "free": "without a known layout",
 }  # fmt: skip
-"""Words for each kind, after "training cameras"."""
+"""Description of each kind, to follow "training cameras"."""
 MIN_AGREEMENT = 0.8
 """Fraction of the cameras that must look at one point, or away from it."""
 MIN_COSINE = 0.8
@@ -23,7 +23,7 @@ MIN_COSINE = 0.8
 MIN_RING = math.radians(100)
 """Range of azimuths about a point below which cameras photographed it from one side."""
 MAX_GAP = math.radians(150)
-"""Largest gap between azimuths of neighbouring cameras that a film turns through: three even views leave 120 degrees."""
+"""Largest gap between azimuths of neighbouring cameras that a turntable crosses: three even views have gaps of 120 degrees."""
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
@@ -45,18 +45,18 @@ class Rig:
     first: np.ndarray
     """Level direction of azimuth 0, perpendicular to ``up``, length 1, shape [3]."""
     span: tuple[float, float] | None
-    """First and last azimuth of the cameras (of their viewing directions, in a room) [rad]; None if they are all around."""
+    """First and last azimuth of the cameras (of their viewing directions, in a room) [rad]; None if they cover all sides."""
     distance: float
     """Median distance of the cameras from ``center`` [u]."""
     elevation: float
-    """Mean elevation of the cameras above ``center``, or of the direction they look in, in a room [rad]."""
+    """Mean elevation of the cameras above ``center``, or of their viewing directions, in a room [rad]."""
     rise: float
     """Standard deviation of the elevations [rad]."""
     turned: bool
     """True if the photographs are rotated by a quarter turn, so that an upright film swaps width and height."""
 
     def describe(self) -> str:
-        """Return a phrase on where the cameras are."""
+        """Return a phrase on the positions of the cameras."""
         if self.span is None:
             return f"{NAMES[self.kind]}, from all sides" if self.kind == "ring" else NAMES[self.kind]
         degrees = math.degrees(self.span[1] - self.span[0])
@@ -68,7 +68,7 @@ class Rig:
         return math.cos(elevation) * level + math.sin(elevation) * self.up
 
     def is_watched(self, cameras: list[Camera]) -> bool:
-        """Return whether cameras all look at the point that matters."""
+        """Return whether all cameras look at a common point."""
         to_center = [self.center - c.center for c in cameras]
         cosines = [(d * c.viewmat[2, :3]).sum() / max(math.sqrt((d * d).sum()), 1e-12) for c, d in zip(cameras, to_center)]
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
@@ -85,10 +85,10 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 
 def _plane_normal(points: np.ndarray) -> np.ndarray | None:
-    """Return the unit normal [3] of the plane that points [N, 3] lie in; None where they fill space or lie on a line.
+    """Return the unit normal [3] of the plane of points [N, 3]; None if the points fill space or lie on a line.
 
-    The eigenvector of the smallest eigenvalue of their covariance, by squaring its inverse, without LAPACK (see
-    `warpgs.geometry.matmul`).
+    The normal is the eigenvector of the smallest eigenvalue of their covariance, computed by squaring the inverse, without
+    LAPACK (see `warpgs.geometry.matmul`).
     """
     offsets = points - points.mean(0)
     covariance = (offsets[:, :, None] * offsets[:, None, :]).mean(0)
@@ -109,8 +109,8 @@ def _plane_normal(points: np.ndarray) -> np.ndarray | None:
 def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the upward direction [3] of a film, and whether the photographs lie on their side.
 
-    Cameras on a level circle name it by the plane they stand in, which a turned photograph does not change; else it is the
-    mean of the cameras' own upward directions.
+    For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. Else
+    it is the mean of the cameras' own upward directions.
     """
     rights, ups, forwards = (sign * np.array([c.viewmat[i, :3] for c in cameras]) for i, sign in ((0, 1), (1, -1), (2, 1)))
     centers = np.array([c.center for c in cameras])
@@ -175,8 +175,8 @@ def _kind(cameras: list[Camera], focus: np.ndarray, depth: float) -> str:
 def rig_of(cameras: list[Camera], depth: float) -> Rig:
     """Return the arrangement of cameras around their subject.
 
-    Cameras whose optical axes meet stand around the point nearest to all axes, unless they see it from one side. Then, and
-    where axes are nearly parallel, the point is ``depth`` in front of their mean centre.
+    If the optical axes meet, the subject is the point nearest to all axes. If the cameras see it from one side, or the axes are
+    nearly parallel, the subject is ``depth`` in front of their mean centre.
 
     Args:
         cameras: Training cameras, at least one.

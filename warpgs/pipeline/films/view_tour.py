@@ -12,9 +12,9 @@ from warpgs.pipeline.films.keyframes import Keyframe
 from warpgs.scene import Camera
 
 MAX_DETOUR = 1.5
-"""Largest accepted length of a tour in order of names, as a multiple of the length from neighbour to neighbour."""
+"""Longest accepted tour in the order of names, as a multiple of the length of the tour from neighbour to neighbour."""
 MAX_IMPROVED = 200
-"""Number of views up to which every pair of legs is looked at; a tour of more is smooth enough without."""
+"""Largest number of views for which every pair of legs is checked; longer tours are smooth enough without the check."""
 
 
 def _distances(cameras: list[Camera]) -> list[list[float]]:
@@ -27,7 +27,7 @@ def _distances(cameras: list[Camera]) -> list[list[float]]:
 
 
 def _neighbour_tour(distances: list[list[float]]) -> list[int]:
-    """Return an order of N cameras from each to the nearest one left, without crossings that reversing a stretch undoes."""
+    """Return an order of N cameras, each followed by the nearest unvisited one; then crossings are removed (2-opt)."""
     count = len(distances)
     order, left = [0], set(range(1, count))
     while left:
@@ -55,18 +55,18 @@ class Tour:
     keyframes: list[Keyframe]
     closed: bool
     by_name: bool
-    """True where the views are passed in the order of their names."""
+    """True if the views are passed in the order of their names."""
 
 
 def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> Tour:
     """Return a path through training views at an even pace.
 
-    They are passed in the order of their names where that is the order they were taken in, that is where it is not much
-    longer than going from neighbour to neighbour. The path is closed where its ends are neighbours.
+    The order of their names is used if it is probably the order in which they were taken, that is, if this path is not much
+    longer than one from neighbour to neighbour. The path is closed if its ends are neighbours.
 
     Args:
         cameras: Cameras of the views by name, at least one; pinholes.
-        reaches: Distance along each optical axis to what the camera looks at [u]; 0 where that is not known.
+        reaches: Distance along each optical axis to the point that the camera looks at [u]; 0 if unknown.
         seconds: Duration of the path [s].
         most: Largest number of views passed through; of more, evenly spaced ones are taken.
     """

@@ -19,13 +19,13 @@ TOLERANCE = 0.02
 difference, the squared colour difference of two photographs is twice (3 dB) that at the best agreement of depths (decision
 019)."""
 MIN_ALPHA = 0.5
-"""Least opacity of a pixel that shows a surface, and so has a depth."""
+"""Least opacity of a pixel that shows a surface; other pixels have no depth."""
 MAX_COUNT = 255
-"""Largest count of views that is stored."""
+"""Largest number of views that is stored for a pixel; higher counts are clamped."""
 GRID = 32
-"""Points along the longer side of an image that `fraction_outside` looks at."""
+"""Number of points along the longer side of an image that `fraction_outside` checks."""
 MAX_PIXELS = 2**26
-"""Most pixels of all depth maps that are held at a time, 256 MiB; with more the maps are rendered smaller."""
+"""Most pixels of all depth maps together, 256 MiB; to stay below, maps are rendered at a smaller size."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,8 @@ def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
 def _seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Return column and row [px] and z-depth [u] in another view of the points at a view's pixels, shape [H, W] each.
 
-    Without a product of matrices: its bits would depend on the processor. Columns and rows mean nothing behind the other.
+    No product of matrices is used, because its bits would depend on the processor. For points behind the other view, columns
+    and rows are undefined.
     """
     rotation, translation = relative_pose(camera, other)
     K, other_K = camera.K, other.K
@@ -163,8 +164,8 @@ class Coverage:
 def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView], tolerance: float = TOLERANCE) -> Coverage:
     """Count at each pixel of a render the training views that saw the point it shows.
 
-    A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind it (occluded) nor in
-    front of it (the view looks through). The model's depth decides, so a count is as good as the model's geometry.
+    A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind the surface (occluded)
+    nor in front of it (the view looks through). Counts use the model's depth, so they are as accurate as the model's geometry.
 
     Args:
         depth: z-depth of the render [u], 0 where there is no surface, shape [H, W], as `depth_of` gives it.
@@ -190,7 +191,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
 def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
     """Return the fraction of a render's pixels that show a point outside the images of all photographs, in steps of a grid.
 
-    Unlike `coverage_map` it renders nothing, and counts points that another surface hides as seen.
+    Unlike `coverage_map`, this function renders nothing, and counts occluded points as seen.
 
     Args:
         depth: z-depth of the render [u], 0 where there is no surface, shape [H, W].

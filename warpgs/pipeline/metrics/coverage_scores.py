@@ -24,18 +24,18 @@ CLASSES = {
 }  # fmt: skip
 """Classes of pixels, with a description of each for the user. Where no view of a scene has an alpha, nothing is background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
-"""Upper ends of the classes of depth difference by which an error is expected; the last holds all that is beyond."""
+"""Upper bounds of the classes of depth difference, each with its expected error; the last class has no bound."""
 PROBED = 6
-"""Most training views that are compared with each other, evenly spaced: 30 pairs."""
+"""Most training views that are compared with each other, evenly spaced: 6 give 30 ordered pairs."""
 
 
 @torch.no_grad()
 def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
-    """Measure how far two training photographs of one point differ, by how far their depths do.
+    """Measure the colour difference between two training photographs of one point, by the difference of their depths.
 
-    Each photograph is carried to another view by the model's depth and compared with the photograph there, pixel by pixel.
-    This is the expected error of a pixel with colour from a view that differs as much, measured on training data after a fit to
-    the same data. It includes differences between the photographs, such as reflections and exposure.
+    Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
+    result estimates the error of a pixel whose nearest training view has this depth difference. The estimate uses the data that
+    the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
 
     Args:
         train: Training views.
@@ -138,7 +138,7 @@ def score_by_coverage(
     show: Callable[[View, np.ndarray, dict[str, np.ndarray]], object] = lambda *_: None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Split the scores of held-out views by how many training views saw what their pixels show.
+    """Split the scores of held-out views by the number of training views that saw each pixel's point.
 
     Args:
         gaussians: N Gaussians in the units of the views' cameras.
@@ -150,8 +150,8 @@ def score_by_coverage(
 
     Returns:
         ``classes``: over all held-out views together, by class, the number of scored ``pixels``, their ``share_of_pixels`` and
-        ``share_of_error`` (squared), and their ``psnr`` [dB], ``ssim`` and ``expected_psnr`` [dB], which is that of
-        `photo_errors` and None with a single training view; ``views``: the same for each view by ``name``;
+        ``share_of_error`` (squared), and their ``psnr`` [dB], ``ssim`` and ``expected_psnr`` [dB] (by `photo_errors`; None with
+        a single training view); ``views``: the same values for each view by ``name``;
         ``depth_differences`` and ``photo_psnr``: the table of `photo_errors`; ``tolerance``; ``summary``, a sentence.
 
     Raises:
@@ -187,4 +187,4 @@ def _summary(rows: dict[str, dict[str, Any]]) -> str:
     if unseen is None:
         return "every held-out pixel was seen by a training view"
     pixels, error = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
-    return f"{pixels} of the held-out pixels were seen by no training view; they have {error} of the squared error"
+    return f"{pixels} of the held-out pixels were seen by no training view; they account for {error} of the squared error"

@@ -1,4 +1,4 @@
-"""Scores of a model on images it has not seen: PSNR, SSIM in two variants, LPIPS, and baselines without a fit."""
+"""Scores of a model on held-out images: PSNR, SSIM in two variants, LPIPS, and baselines without a fit."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ VARIANTS = {
     "ssim": "as in 3DGS papers: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
     "ssim_skimage": "scikit-image, as in NeRF papers: the same window, without the border; about 0.005 lower",
 }
-"""Definition of each score, for result files and reports. Every paper's table depends on these words."""
+"""Definition of each score, for result files and reports. Scores by other definitions are not comparable."""
 ALPHA_VARIANTS = {
-    "psnr_whole": "of a view with an alpha channel: over all unmasked pixels, over the background of the fit",
-    "psnr_foreground": "the same over the pixels of an opacity above 0.5",
-    "alpha_empty": "mean rendered alpha over the pixels of an opacity below 0.02: 0 is right",
-    "alpha_object": "mean rendered alpha over the pixels of an opacity above 0.98: 1 is right",
+    "psnr_whole": "of views with an alpha channel: over all unmasked pixels, with the background of the fit behind both images",
+    "psnr_foreground": "as for the whole image, over the pixels with an opacity above 0.5",
+    "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
+    "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
 }
 """Definition of each score of views with an alpha channel. A mean is over the views that have such pixels."""
 EMPTY, OPAQUE, OBJECT = 0.02, 0.5, 0.98
-"""Opacities below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
+"""Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
 NO_LPIPS = "not measured: no --lpips-weights were given"
 SSIM_WINDOW = 11
@@ -89,8 +89,8 @@ def _opacity_scores(
 def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
     """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view.
 
-    With a mask the recipe is that of DTU's protocol (Niemeyer et al. 2022 and all since): PSNR over the mask's pixels alone,
-    SSIM and LPIPS on both images with white outside of it.
+    Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
+    LPIPS on both images with white outside the mask.
     """
     from skimage.metrics import structural_similarity
 
@@ -147,8 +147,8 @@ def evaluate(
 def baselines(train: list[View], test: list[View]) -> dict[str, float]:
     """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats.
 
-    ``mean_photo``: the mean of the training images; ``nearest_photo``: the training image taken from nearest by. Images of
-    another size than the test view's are left out; a baseline that no view allows is left out too.
+    ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
+    images whose size differs from the test view's are left out, and so is a baseline without any score.
     """
     scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
     for view in test:

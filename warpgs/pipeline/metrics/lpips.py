@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from warpgs.pipeline.metrics.lpips_weights import Net, read_lpips
 
 MODES = ("legacy", "standard")
-"""legacy: colours are passed unchanged, in [0, 1], as the evaluation code of Kerbl et al. 2023 and all that build on it do;
+"""legacy: colours are passed unchanged, in [0, 1], as the evaluation code of Kerbl et al. 2023 and its descendants do;
 standard: rescaled to [-1, 1], as Zhang et al. 2018 trained the heads. The same images score differently."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """ImageNet's mean and deviation of colours in [-1, 1] (PerceptualSimilarity, scaling layer)."""
@@ -47,7 +47,7 @@ class Lpips:
 
     @torch.no_grad()
     def distance(self, image: np.ndarray, target: np.ndarray, mode: str) -> float:
-        """Return LPIPS of two images [H, W, 3] in [0, 1]: 0 for equal ones; NaN where they are too small for the network."""
+        """Return LPIPS of two images [H, W, 3] in [0, 1]: 0 for equal images; NaN if they are too small for the network."""
         if min(image.shape[:2]) < self.net.smallest:
             return math.nan
         device = self.tensors["lin0.model.1.weight"].device

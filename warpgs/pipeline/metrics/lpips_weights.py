@@ -19,7 +19,7 @@ from warpgs.input_files import open_input, read_input, unread_reason
 
 FORMAT = "warpgs-lpips-1"
 MAX_PICKLE = 2**20
-"""Largest size of everything in a .pth file but the tensors [bytes]; published files have a few KiB. torch copies it twice."""
+"""Largest size of a .pth file without its tensors [bytes]; published files have a few KiB. torch copies these bytes twice."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,12 @@ class Net:
     title: str
     """Name as papers write it."""
     layers: tuple[tuple[Any, ...], ...]
-    """Layers in order: ("conv", number, inputs, outputs, kernel, stride, padding), ("tap",) after a rectified convolution that
-    is compared, or ("pool", kernel, stride)."""
+    """Layers in order: ("conv", number, inputs, outputs, kernel, stride, padding), ("pool", kernel, stride), or ("tap",) after
+    a rectified convolution whose features are compared."""
     smallest: int
-    """Shortest image side that leaves the last compared layer a pixel [px]."""
+    """Shortest image side for which the last compared layer has at least a pixel [px]."""
     published: str
-    """First digits of the SHA-256 of torchvision's file, which its name carries."""
+    """First digits of the SHA-256 of torchvision's file, as in the name of that file."""
 
     @property
     def channels(self) -> tuple[int, ...]:
@@ -131,7 +131,7 @@ def _mapped(file: BinaryIO) -> str | BinaryIO:
 
 
 def _check_unpacked(file: BinaryIO) -> None:
-    """Check that an archive unpacks to no more than its own size, for torch packs nothing, and has no large pickle.
+    """Check that an archive has no large pickle and unpacks to no more than its own size, since torch does not compress.
 
     Raises:
         ValueError: The archive unpacks to more, or has a large pickle.
@@ -144,9 +144,9 @@ def _check_unpacked(file: BinaryIO) -> None:
             raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
         others = sum(member.file_size for member in members if Path(member.filename).parent.name != "data")
         if others > MAX_PICKLE:
-            raise ValueError(f"it holds {others:,} bytes beside its tensors, more than {MAX_PICKLE:,}")
+            raise ValueError(f"it holds {others:,} bytes besides its tensors, more than {MAX_PICKLE:,}")
         if any(member.compress_type != zipfile.ZIP_STORED for member in members):
-            raise ValueError("its tensors are packed")
+            raise ValueError("its tensors are compressed; torch.save stores them uncompressed")
     file.seek(0)
 
 
@@ -173,7 +173,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
         Lines for the user: the written file, and whether a source differs from the published one.
 
     Raises:
-        DataError: A source is missing, no state dict, of another network, or not finite.
+        DataError: A source is missing, is not a state dict, belongs to another network, or is not finite.
         ResourceError: The file cannot be written.
         UsageError: ``out`` exists.
     """
@@ -191,8 +191,8 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
         if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
             found = f"is {list(value.shape)}" if isinstance(value, torch.Tensor) else "is missing"
             raise DataError(
-                f"{path}: {name} {found}, {net.title} has {list(shape)} there; the heads are those of {net.title}, so give "
-                f"torchvision's weights of the same network"
+                f"{path}: {name} {found}, expected {list(shape)} of {net.title}; the heads belong to {net.title}, so give "
+                "torchvision's weights of that network"
             )
         if not bool(torch.isfinite(value).all()):
             raise DataError(f"{path}: {name} is not finite; download it again from its source")
@@ -205,9 +205,7 @@ def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
     write_bytes(out, save(tensors, metadata))
     notes = [f"{out}: LPIPS with {net.title}, heads of version {version}"]
     if not backbone_hash.startswith(net.published):
-        notes.append(
-            f"{backbone} is not the file that torchvision publishes (SHA-256 {net.published}...); scores are not comparable"
-        )
+        notes.append(f"{backbone} is not torchvision's published file (SHA-256 {net.published}...); scores are not comparable")
     if version == "unknown":
         notes.append(f"{heads} is neither v0.0 nor v0.1 of the published heads; scores are not comparable")
     return notes
@@ -242,7 +240,7 @@ def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]
     net = NETS[metadata["net"]]
     for name, shape in net.shapes().items():
         if name not in tensors or tuple(tensors[name].shape) != shape:
-            raise DataError(f"{path}: lacks {name} of shape {list(shape)}; write it again with `warpgs convert-lpips`")
+            raise DataError(f"{path}: no {name} of shape {list(shape)}; write the file again with `warpgs convert-lpips`")
         if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
-            raise DataError(f"{path}: {name} is not finite float32; write it again with `warpgs convert-lpips`")
+            raise DataError(f"{path}: {name} is not finite float32; write the file again with `warpgs convert-lpips`")
     return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}

@@ -10,10 +10,10 @@ from warpgs.pipeline.metrics.psnr import psnr
 from warpgs.pipeline.metrics.region import scored_region
 from warpgs.scene import View
 
-RULE = "after the affine map of colours that fits the left half of each best, over its right half"
-"""Rule of the score, as text for the user."""
+RULE = "over the right half of each view, after an affine colour map fitted to its left half"
+"""Definition of the score, as text for the user."""
 RIDGE = 1e-6
-"""Added to the variances of the colours, so that an image of one colour has a map, too: a thousandth of full range."""
+"""Added to the variances of the colours, so that an image of one colour has a map, too: a deviation of 0.001 of full range."""
 
 
 def affine_map(rendered: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

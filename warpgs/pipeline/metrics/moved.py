@@ -14,30 +14,31 @@ from warpgs.priors.epipolar import nearest_views, pixel_grid
 from warpgs.scene import Camera, View
 
 MAX_PIXELS = 20_000
-"""Number of pixels to which views are reduced before they are compared."""
+"""Largest number of pixels of the reduced views that are compared."""
 MIN_RESIDUAL = 0.05
-"""Residual in [0, 1] from which a pixel differs."""
+"""Least residual, in [0, 1], of a pixel that differs from the model."""
 MIN_FACTOR = 3.0
-"""Smallest factor between the residual of a pixel and that of other views at the same point."""
+"""Least ratio of a differing pixel's residual to that of other views at the same point."""
 FLOOR = 0.005
-"""Residual of other views in [0, 1] below which they fully agree with the model."""
+"""Lower bound, in [0, 1], of the residual of other views in that ratio."""
 MIN_VIEWS = 2
 """Fewest other views that must show a point."""
 MIN_TRAINING = 6
 """Fewest training views for this check: with fewer, the model can fit objects that only one view shows."""
 NEIGHBORS = 8
-"""Views taken nearest by in which a point is looked up."""
+"""Number of nearest views in which a point is looked up."""
 MAX_DEPTH_ERROR = 0.1
 """Largest relative difference between the depths at which two views show the same point."""
 MIN_AREA = 0.004
-"""Fraction of the image that one region must fill to be reported; static scenes have up to 0.002 (decision 019)."""
+"""Least area of a reported region, as a fraction of the image; in static scenes regions reach 0.002 (decision 019)."""
 MAX_MISFIT = 5.0
-"""Median residual of a view, as a multiple of the median over views, above which the whole view fits badly, so that no single
-region is reported."""
+"""A view fits badly as a whole if its median residual exceeds the median over views by this factor; no region of it is
+reported."""
 HIGH_MISFIT = 0.002
-"""Median over views of their median residuals above which a fit is too early for this check; finished fits have up to 0.001."""
+"""The fit is too early for this check if the median over views of their median residuals exceeds this; finished fits reach
+0.001."""
 LOW_MISFIT = 0.0005
-"""Median residual in [0, 1] below which a view never counts as a bad fit."""
+"""Lower bound, in [0, 1], of the median over views in that comparison."""
 SMOOTHING = 32
 """Width of the image over the side of the square in which residuals are averaged."""
 
@@ -106,8 +107,8 @@ def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[i
 def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
     """Return for each training view the fraction of its pixels, in [0, 1], in regions that it shows differently from others.
 
-    A pixel counts where the view is farther from its render than other views are from theirs at the same point, and at least
-    two others show that point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for a fit that is not far enough.
+    A pixel counts if the view's residual is much larger than those of other views at the same point, and at least two other
+    views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
 
     Args:
         views: The training views, at least one.

@@ -1,4 +1,4 @@
-"""Smaller models for the same images: merge neighbours, remove Gaussians, lower degrees, as long as a test accepts it."""
+"""Smaller models for the same images: lower degrees, merge neighbours and remove Gaussians, as far as a test accepts."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians
 
 ROUNDS = 5
-"""Halvings of the interval in which the largest fraction is looked for."""
+"""Number of bisection steps in the search for the largest fraction."""
 PASSES = 8
 """Most rounds of merging: up to 2^8 neighbours become one."""
 DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
-"""Fractions of the allowed loss of a model that may be spent once degrees are lowered, and once neighbours are merged; removing
-may spend all of it."""
+"""Fractions of the allowed loss that may be used up after degrees are lowered, and after neighbours are merged; removal may use
+up the rest."""
 RAMP = 3
-"""Rounds of merging over which the loss that they may spend grows to all of it."""
+"""Number of rounds over which the loss allowed for merging grows to its full value."""
 WORTHWHILE = 0.02
-"""Fraction of the Gaussians that a round of merging must take; two rounds in a row that take less are the last."""
+"""Least fraction of the Gaussians that a round must merge away; merging ends after two rounds in a row with less."""
 
 
 def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
-    """Return the largest fraction in [0, 1] that is accepted, by bisection; 1 is tried first, 0 is taken without asking.
+    """Return the largest accepted fraction in [0, 1], by bisection; 1 is tried first, 0 needs no test.
 
-    The fraction returned was itself accepted, or is 0, so acceptance need not be monotone.
+    The result was accepted itself, or is 0, so acceptance need not be monotone.
     """
     if accepted(1.0):
         return 1.0
@@ -51,8 +51,8 @@ def _ranks(values: torch.Tensor) -> torch.Tensor:
 def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor:
     """Return the rows of the Gaussians in the order in which they may be removed, int64 [N].
 
-    A Gaussian's place is the later of its places by largest contribution and by Fisher sensitivity: it is removed only if both
-    scores are low, so thin Gaussians and wide faint ones stay if one score is high.
+    Gaussians are ranked by largest contribution and by Fisher sensitivity; the higher of both ranks decides. So a Gaussian is
+    removed only if both scores are low; thin Gaussians and wide faint ones stay if one score is high.
 
     Args:
         maxima: Largest blending weight of each, shape [N].
@@ -66,7 +66,7 @@ def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
 
     Args:
         order: Rows, int64, shape [N].
-        fraction: Part that goes, in [0, 1].
+        fraction: Fraction to remove, in [0, 1].
 
     Returns:
         Rows in ascending order, int64, shape [K].
@@ -90,9 +90,9 @@ def with_degrees(gaussians: Gaussians, degrees: torch.Tensor) -> Gaussians:
 
 
 def degree_order(gaussians: Gaussians, seen: Coverage) -> torch.Tensor:
-    """Return the rows of the Gaussians, those that need their harmonics least first, int64 [N].
+    """Return the rows of the Gaussians by ascending need for harmonics, int64 [N].
 
-    The order is by energy above degree 0 times the largest contribution: in an orthonormal basis the sum of squares is, up to a
+    The need is the energy above degree 0 times the largest contribution: in an orthonormal basis the sum of squares is, up to a
     constant, the variance of the colour over directions.
     """
     return torch.argsort(gaussians.sh[:, 1:].square().sum((1, 2)).sqrt() * seen.maxima, stable=True)
@@ -105,7 +105,7 @@ def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
 
 
 def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
-    """Return the same Gaussians without degrees that are unused by all; a file has one number of coefficients for all."""
+    """Return the same Gaussians without degrees that no Gaussian uses; in a file all have the same number of coefficients."""
     degrees = stored_degrees(gaussians.sh)
     highest = int(degrees.max()) if len(degrees) else 0
     return Gaussians(**(gaussians.tensors() | {"sh": gaussians.sh[:, : (highest + 1) ** 2].contiguous()}))
@@ -113,26 +113,26 @@ def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
 
 @dataclass(frozen=True)
 class ViewSet:
-    """The training views, as measurements on a model use them."""
+    """The training views for measurements on a model."""
 
     cameras: list[Camera]
     """Cameras with tensors on the device of the model."""
     options: RasterizeOptions
-    """Settings that they are rendered with."""
+    """Options for rendering them."""
     seed: int
     """Seed of the random signs of `fisher`."""
 
     def coverage(self, gaussians: Gaussians) -> Coverage:
-        """Return what these views see of each Gaussian, as `coverage` measures it."""
+        """Return the coverage of each Gaussian by these views, as `coverage` measures it."""
         return coverage(gaussians, self.cameras, self.options)
 
     def fisher(self, gaussians: Gaussians) -> torch.Tensor:
-        """Return how sensitive these views are to each Gaussian, as `fisher` estimates it, shape [N]."""
+        """Return the sensitivity of these views to each Gaussian, as `fisher` estimates it, shape [N]."""
         return fisher(gaussians, self.cameras, self.options, self.seed)
 
 
 def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians], bool]) -> int:
-    """Return how many of the pairs, the cheapest first, may be merged so that the result is accepted."""
+    """Return the number of pairs, the cheapest first, that may be merged so that the result is accepted."""
     count, total = len(gaussians), len(pairs.first)
     return int(total * largest_fraction(lambda s: accepted(changed(gaussians, pairs.change(count, int(s * total))))))
 
@@ -140,14 +140,15 @@ def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians]
 def merge_neighbours(
     gaussians: Gaussians, kinds: torch.Tensor, view_set: ViewSet, accepted: Callable[[Gaussians, float], bool]
 ) -> Gaussians:
-    """Merge pairs, cheapest first, in rounds while these are worthwhile; return the smaller set.
+    """Merge pairs, cheapest first, in rounds while they are worthwhile; return the smaller set.
 
     Args:
         gaussians: The set.
         kinds: Only Gaussians of the same number are paired, int, shape [N].
         view_set: Training views.
         accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent. The fraction
-            grows over the first `RAMP` rounds: the cheapest pairs of the second are cheaper than the dearest of the first.
+            grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last of the round
+            before.
     """
     idle = 0
     for number in range(PASSES):
@@ -213,7 +214,7 @@ def prune_model(
         accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent.
 
     Returns:
-        The smaller model, which was accepted with fraction 1; the model itself where nothing may go.
+        The smaller model, which was accepted with fraction 1; the model itself if nothing may be removed.
     """
     degrees, model = stored_degrees(gaussians.sh), gaussians
     if bool((degrees > 0).any()):

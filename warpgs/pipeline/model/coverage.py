@@ -11,7 +11,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255
-"""Least blending weight at which a view sees a Gaussian: below, it changes no pixel by more than four of 255 levels."""
+"""Least blending weight at which a view sees a Gaussian: with less, it changes no pixel by more than four of 255 levels."""
 PROBES = 2
 """Random images per view for the Fisher sensitivity."""
 
@@ -46,11 +46,11 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
 
 @torch.enable_grad()  # the caller may have switched gradients off, as the trainer does when the set changes
 def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
-    """Estimate how much the images change when a Gaussian moves by its own width or its axes grow.
+    """Estimate the change of the images when a Gaussian moves by its own width or its axes grow.
 
-    The trace of PUP-3DGS' sensitivity (arXiv 2406.10219, eq. 6: the sum over pixels of the outer product of the gradient of the
-    colour in mean and scale), in units of the Gaussian's width, where PUP has the log-determinant. With random signs e as the
-    gradient of an image, the backward pass gives J^T e, and the mean of its square is the diagonal of J^T J.
+    The result is the trace of PUP-3DGS' sensitivity (arXiv 2406.10219, eq. 6: the sum over pixels of the outer product of the
+    gradient of the colour in mean and scale), in units of the Gaussian's width; PUP uses the log-determinant instead. With
+    random signs e as the gradient of an image, the backward pass gives J^T e; the mean of its square is the diagonal of J^T J.
 
     Args:
         gaussians: N Gaussians.

@@ -1,7 +1,7 @@
-"""The coarse start: one Gaussian per pixel with geometrically consistent depth, coarser ones where no other view confirms any.
+"""The coarse start: one Gaussian per pixel with geometrically consistent depth, and wider ones where depth is not confirmed.
 
-The paper's first level ("initialized using the method proposed in" NexusGS, Zheng et al. 2025). Sources, merging and filling
-were measured in docs/decisions/007-coarse-start.md.
+It is the paper's first level ("initialized using the method proposed in" NexusGS, Zheng et al. 2025). Sources, merging and
+filling were measured in docs/decisions/007-coarse-start.md.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 NOTHING = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 """No points."""
 FREE_SPACE = 0.95
-"""A filled point nearer to another view than this fraction of that view's depth would occlude its surface."""
+"""A filled point occludes the surface of another view if its depth there is below this fraction of the view's depth."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
-"""Multiples of the 2nd and of the 98th percentile of the depths of known points between which planes lie: few planes for
-distant surfaces, many for near ones."""
+"""Factors of the 2nd and of the 98th percentile of the depths of known points; the planes lie between the two products. Few
+planes are at distant surfaces, many at near ones."""
 MIN_KNOWN = 10
-"""Known points that a view must hold to bound its depths."""
+"""Fewest known points in a view that can bound its depths."""
 
 
 def joined(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -34,7 +34,7 @@ def joined(clouds: Sequence[PointCloud]) -> PointCloud:
 
 
 def depth_bounds(view: View, known: np.ndarray, default: tuple[float, float]) -> tuple[float, float]:
-    """Return the range of depths [u] to search in a view, from known points [N, 3], or ``default`` where it holds too few."""
+    """Return the range of depths [u] to search in a view, from known points [N, 3], or ``default`` if the view has too few."""
     _, z = geometry.project_points(view.camera, known)
     z = z[geometry.in_image(view.camera, known)]
     if len(z) < MIN_KNOWN:
@@ -77,7 +77,7 @@ def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointClo
 
 
 def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
-    """Return a mask [N], True if a point [N, 3] is in front of the depths [H, W] (0: none) of a view other than ``without``."""
+    """Return a mask [N], True if a point [N, 3] occludes the depths [H, W] (0: none) of a view other than ``without``."""
     hides = np.zeros(len(points), bool)
     for j, (view, depth) in enumerate(zip(views, depths)):
         if j != without:
@@ -101,14 +101,14 @@ def focal_length(camera: Camera) -> float:
 
 @dataclass(frozen=True)
 class KnownPoints:
-    """Points of a reconstruction that at least two views saw, as one of them sees each."""
+    """Points of a reconstruction that at least two views saw."""
 
     cloud: PointCloud
     """Points and colours, N of them."""
     widths: np.ndarray
-    """Width of a pixel at each in the nearest view that saw it [u], shape [N]."""
+    """Width of a pixel at the depth of each point in the nearest view that saw it [u], shape [N]."""
     pixels: list[tuple[np.ndarray, np.ndarray, np.ndarray]]
-    """Rows and columns of the points that each view saw, and their z-depths [u], the farthest first; shape [S] each."""
+    """Rows, columns and z-depths [u] of the points that each view saw, the farthest first; shape [S] each."""
 
     @staticmethod
     def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:
@@ -146,17 +146,17 @@ def coarse_points(
     Args:
         views: Training views.
         depths: Geometrically consistent depth of each, confirmed by other views.
-        merge_px: Width of the cells in which consistent points become one [px]; 0 keeps every pixel.
-        fill_px: Width of the cells of points where no depth is consistent [px]; 0 leaves those places empty. Their depths are
-            those of `complete`; none is in space that another view sees through, or beside a consistent point. Views without
-            estimated depth are left out, so that the work for each view is bounded.
+        merge_px: Width of the cells in which consistent points are merged into one [px]; 0 keeps every pixel.
+        fill_px: Width of the cells of filled points, where no depth is consistent [px]; 0 fills in none. Their depths come from
+            `complete`. No filled point is in space that another view sees through, or in the cell of a consistent point. Views
+            without estimated depth get none, so that the work for each view is bounded.
         source: Name of the source in the notes, sweep or flow.
-        known: Points of a reconstruction. Those that two of the views saw are taken where no depth is consistent, and their
+        known: Points of a reconstruction. Points that two of the views saw are used where no depth is consistent, and their
             depths are filled in around them.
 
     Returns:
-        The cloud, consistent points first, then those of the reconstruction, empty where there are none; and notes: one per
-        view ("image001.png: 71 % of pixels by flow, 20 % filled") and one on the merged cloud.
+        The cloud: consistent points first, then points of the reconstruction, then filled points. And notes: one per view
+        ("image001.png: 71 % of pixels by flow, 20 % filled") and one on the merged cloud.
     """
     regions = [fitted_region(v) for v in views]
     consistent = [d.valid if r is None else d.valid & r for d, (r, _) in zip(depths, regions)]
@@ -196,7 +196,7 @@ def coarse_points(
 def _elsewhere(
     points: np.ndarray, widths: np.ndarray, more: np.ndarray, colors: np.ndarray, more_widths: np.ndarray, cell: float
 ) -> tuple[PointCloud, np.ndarray]:
-    """Return more points [M, 3], merged, where no point [N, 3] lies in their cells; and which of them are in it, bool [M].
+    """Return points ``more`` [M, 3], merged, of cells without any of ``points`` [N, 3]; and which of them these are, bool [M].
 
     Widths [N] and [M] [u] are those of a pixel, and ``cell`` is the width of a cell [px].
     """

@@ -1,8 +1,8 @@
 """Extrapolated points where no view looks: beyond the images, and behind the near side of depth edges.
 
-Between few cameras, renders show much that no photograph shows. The points extrapolate into these areas: colour and depth of an
-image's border outwards, and a far surface a little behind the near one that occludes it
-(docs/decisions/026-extrapolated-points.md).
+With few cameras, renders of other views show large areas that no photograph shows. The points extrapolate into these areas:
+colour and depth of an image's border continue outwards, and a far surface continues a little behind the near one that occludes
+it (docs/decisions/026-extrapolated-points.md).
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from warpgs.priors.opencv import single_threaded_opencv
 from warpgs.scene import PointCloud, View, ViewDepth
 
 EXTRAPOLATED_OPACITY = 0.5
-"""First opacity of an extrapolated Gaussian."""
+"""Initial opacity of an extrapolated Gaussian."""
 BEYOND, BEYOND_PX = 0.25, 16
-"""Width of the extrapolated frame around an image, as a fraction of the image's width; and of its cells, a point each [px]."""
+"""Width of the extrapolated frame around an image, as a fraction of the image's; width of its cells, one point each [px]."""
 DEPTH_PX, COLOR_PX = 31, 6
-"""Reach of the means of depth and of colour that the frame takes from the image's border [px]."""
+"""Radius within which depth and colour at the image's border are averaged for the frame [px]."""
 REACH, BEHIND_PX, BEHIND_COLOR_PX = 24, 8, 3
-"""Reach of a far surface behind a near one; width of its cells, a point each; and reach of the mean of its colour [px]."""
+"""Distance by which a far surface is continued behind a near one; width of its cells, one point each; and radius within which
+its colour is averaged [px]."""
 STEP, EDGE = 1.02, 1.15
-"""Ratios of depth: that of neighbouring pixels above which a surface ends; and that of the far to the near side above which
-points are added."""
+"""Ratios of depth: a surface ends between neighbouring pixels above the first; points are added if that of the far to the near
+side is above the second."""
 SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and direction of the four neighbours of a pixel."""
 
@@ -75,11 +76,11 @@ def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
 
 
 def _behind(views: Sequence[View], i: int, depth: np.ndarray, confirmed: Sequence[np.ndarray]) -> PointCloud:
-    """Return points of far surfaces behind near ones in view ``i``; none lies before confirmed depth of another view.
+    """Return points of far surfaces behind near ones in view ``i``; none occludes confirmed depth of another view.
 
     Args:
         views: All views.
-        i: Number of the view.
+        i: Index of the view.
         depth: Its z-depth [u], known everywhere, shape [H, W].
         confirmed: Consistent depth of each view, 0 where there is none, shape [H, W] each.
     """

@@ -20,15 +20,15 @@ from warpgs.pipeline.model.scale_limits import NEEDLE, ROUNDING, long_axes
 from warpgs.scene import Gaussians
 
 INNER = 0.02
-"""Fraction of the means left out at either end of each axis where the size of the scene is measured."""
+"""Fraction of the means that is left out at both ends of each axis when the size of the scene is measured."""
 NEEDLE_LENGTH = 0.2
-"""Fraction of the scene's size that a Gaussian beyond the ratio `NEEDLE` must be long to be removed: shorter needles are hairs
-and edges of a good model. With a tenth instead, removal costs up to 0.08 dB on held-out views
+"""A Gaussian beyond the ratio `NEEDLE` is removed if it is longer than this fraction of the scene's size: shorter needles are
+hairs and edges of a good model. With a tenth instead, removal costs up to 0.08 dB on held-out views
 (docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
-"""Largest file of a box that is read [bytes]."""
+"""Size of the largest file of a box that is read [bytes]."""
 _NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
-"""Nodes and weights of Gauss and Legendre's rule with five points, the last two also mirrored: exact to degree 9."""
+"""Nodes and weights of the Gauss-Legendre rule with five points, the last two also mirrored: exact to degree 9."""
 _AZIMUTHS = 10
 """Points of the rule around the axis, exact to order 9; products of harmonics of degree 4 have degree 8."""
 
@@ -40,13 +40,13 @@ class Box:
     center: tuple[float, float, float]
     """Middle [file units]."""
     size: tuple[float, float, float]
-    """Whole lengths of the sides [file units]."""
+    """Full lengths of the sides [file units]."""
     rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     """Columns: the directions of the sides in the world, shape [3, 3]."""
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """Return finite numbers of a shape; UsageError if ``value`` is not that."""
+    """Return finite numbers of a shape; UsageError if ``value`` is anything else."""
     try:
         array = np.array(value, np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -60,8 +60,8 @@ def box_of(text: str) -> Box:
     """Return the box of a user's text.
 
     Args:
-        text: JSON with center, size and perhaps rotation; the name of a .json file that holds it; or six numbers with commas:
-            the least x, y, z and the largest.
+        text: JSON with center, size and optionally rotation; the name of a .json file with this JSON; or six numbers separated
+            by commas: the least x, y, z and the largest x, y, z.
 
     Raises:
         DataError: The file cannot be read, or holds something else.
@@ -90,7 +90,7 @@ def box_of(text: str) -> Box:
 
 
 def _box_of_file(path: Path) -> Box:
-    """Return the box of a JSON file, such as the viewer saves; DataError where it holds none."""
+    """Return the box of a JSON file, as the viewer saves it; DataError if the file has no box."""
     try:
         text = read_input(path, MAX_BOX_BYTES).decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
@@ -101,7 +101,7 @@ def _box_of_file(path: Path) -> Box:
             raise UsageError("expected a JSON object with center and size")
         return box_of(text)
     except UsageError as e:
-        raise DataError(f"{path}: holds no box: {e}. Save it again in the viewer") from e
+        raise DataError(f"{path}: not a box ({e}); save the box again in the viewer") from e
 
 
 def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
@@ -110,7 +110,7 @@ def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
 
 
 def inside(gaussians: Gaussians, box: Box) -> torch.Tensor:
-    """Return whether each mean is in a box, bool [N]; both in the same units."""
+    """Return whether each mean is in a box, bool [N]; box and Gaussians are in the same units."""
     offsets = gaussians.means.double() - torch.tensor(box.center, dtype=torch.float64, device=gaussians.means.device)
     directions = np.array(box.rotation).T
     out = torch.ones(len(gaussians), dtype=torch.bool, device=offsets.device)
@@ -138,7 +138,7 @@ def disturbing(gaussians: Gaussians, maxima: torch.Tensor | None = None) -> dict
     needle = longest - middle > math.log(NEEDLE) + ROUNDING  # a fit holds many at the ratio itself
     found = {
         "larger than the scene": longest > math.log(size),
-        f"needles beyond {NEEDLE:g} to 1": needle & (longest > math.log(NEEDLE_LENGTH * size)),
+        f"needles over {NEEDLE:g} times as long as wide": needle & (longest > math.log(NEEDLE_LENGTH * size)),
     }
     if maxima is not None:
         found = {"seen by no training view": maxima < SEEN} | found
@@ -162,7 +162,7 @@ def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
     """Return the matrix that turns coefficients with the scene, float64 [25, 25] (Wigner's D for degrees 0 to 4, real).
 
-    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), which a product rule of 50 points takes exactly.
+    Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), exact by a product rule of 50 points.
 
     Args:
         rotation: The rotation, shape [3, 3].
@@ -180,11 +180,11 @@ def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
 
 
 def rotate(gaussians: Gaussians, rotation: np.ndarray) -> Gaussians:
-    """Return Gaussians turned about the origin: means, shapes and the directions that colours depend on.
+    """Return Gaussians rotated about the origin: means, shapes and the directions that colours depend on.
 
     Args:
         gaussians: N Gaussians.
-        rotation: New axes from old ones, shape [3, 3], determinant 1.
+        rotation: Rotation matrix, new from old coordinates, shape [3, 3].
     """
     like = {"dtype": torch.float64, "device": gaussians.means.device}
     turn = torch.tensor(np.asarray(rotation), **like)
@@ -205,11 +205,11 @@ def rotation_about(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation [3, 3] by an angle [rad] about an axis [3] of any length (Rodrigues).
 
     Raises:
-        UsageError: The axis has no length.
+        UsageError: The axis has length 0, or a number is not finite.
     """
     length = math.sqrt(float((np.asarray(axis) ** 2).sum()))
     if not (math.isfinite(length) and length > 0 and math.isfinite(angle)):
-        raise UsageError("--rotate: the axis has no length, or a number is not finite")
+        raise UsageError("--rotate: the axis has length 0, or a number is not finite")
     x, y, z = np.asarray(axis, np.float64) / length
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * matmul(cross, cross)

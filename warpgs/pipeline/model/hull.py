@@ -1,6 +1,6 @@
 """The visual hull: the largest object that explains all silhouettes (Laurentini 1994), carved from an octree.
 
-Where views stand far apart a sweep finds little, but the opacity of each view says which space is empty.
+If views are far apart, a sweep finds few depths, but the alpha channel of each view shows which space is empty.
 """
 
 from __future__ import annotations
@@ -15,33 +15,33 @@ from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
 from warpgs.scene import Camera, PointCloud, View
 
 MARGIN = 1.5
-"""Distance from the nearest opaque pixel at which a point is in the empty region of a view [px]."""
+"""Least distance from the nearest opaque pixel of a point in the empty region of a view [px]."""
 FINEST = 1.5
-"""Largest width of the finest cells in the views, their median [px]."""
+"""Largest width of the finest cells, as the median over the views [px]."""
 PROJECTIONS = 2**25
-"""Projections of a cell into a view that one level of the octree may take: a few seconds."""
+"""Most projections of cells into views at one level of the octree; they take a few seconds."""
 MAX_LEVELS = 20
-"""Most levels: the finest cells are a millionth of the first one."""
+"""Most levels of the octree: the finest cells are then a millionth as wide as the first one."""
 TOLERANT = 12
-"""Number of views per tolerated error: with this many views, two empty ones make a cell empty; with twice as many, three."""
+"""Number of views per tolerated error: from this many views on, two must find a cell empty to remove it; from twice as many on,
+three."""
 SEEN = 0.9
-"""Fraction of the views that must have a cell in their image: space that few look into cannot be carved."""
+"""Least fraction of the views that have a cell in their image: space that few views look into cannot be carved."""
 OPAQUE_COLOR = 0.9
-"""Opacity from which a pixel shows only the object, and has its colour."""
+"""Least opacity of a pixel whose colour is that of the object alone."""
 LEAST_VIEWS = 2
-"""Number of views that must see a cell, because unseen cells are inside the object or outside the photographs."""
+"""Fewest views that must see a cell, because unseen cells are inside the object or outside the photographs."""
 LIKE = 0.15
-"""Largest standard deviation of a cell's colour over views at which the colours are similar, in the channel that differs
-most."""
+"""Largest standard deviation over views of similar colours of a cell, in the channel that differs most."""
 BEHIND_CELLS = 3.0
-"""Distance behind the first cell of a pixel from which on a cell is hidden, as a multiple of the width of a cell."""
+"""A cell is hidden if it is farther than this behind the first cell at its pixel, in widths of a cell."""
 
 
 class Silhouette:
     """The opaque pixels of a view, and their number in any rectangle."""
 
     def __init__(self, view: View):
-        """Sum up the pixels: those of `fitted_region`, all where a view has no such region."""
+        """Sum up the pixels of `fitted_region`, or all pixels if a view has no such region."""
         region, _ = fitted_region(view)
         opaque = np.ones(view.image.shape[:2], bool) if region is None else region
         self.view, self.size = view, np.array([view.camera.width, view.camera.height])
@@ -79,7 +79,7 @@ def silhouettes(views: Sequence[View]) -> list[Silhouette]:
 
 
 def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndarray:
-    """Return a mask [N], True if a point [N, 3] is at least `MARGIN` px from opaque pixels in more views than may err."""
+    """Return a mask [N]: points [N, 3] at least `MARGIN` px from opaque pixels in more views than `TOLERANT` allows."""
     votes = sum((s.look(points, 0.0, MARGIN)[0].astype(int) for s in shapes), np.zeros(len(points), int))
     return votes > len(shapes) // TOLERANT
 
@@ -87,8 +87,8 @@ def in_empty_region(shapes: Sequence[Silhouette], points: np.ndarray) -> np.ndar
 def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
     """Return the centres [N, 3] [u] of the finest cells on the surface of the hull, and their width [u].
 
-    A cell is empty if more views than may err show nothing there, and inside if all views that see it show only the object.
-    Other cells are divided, until cells are `FINEST` px wide in the views, or as many as `PROJECTIONS` allows.
+    A cell is empty if more views than `TOLERANT` allows show nothing there, and inside if all views that see it show only the
+    object. Other cells are divided until they are `FINEST` px wide in the views, or `PROJECTIONS` is reached.
 
     Args:
         shapes: At least two silhouettes.
@@ -131,8 +131,8 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean colours [N, 3] of cells of that width [u] where they are seen, and the cells that are kept, bool [N].
 
-    A cell is kept where at least `LEAST_VIEWS` see it at an opaque pixel with none before it, and in similar colours; the
-    others may be empty parts of the hull.
+    A cell is kept if at least `LEAST_VIEWS` views see it at an opaque pixel, unoccluded by other cells, and in similar colours;
+    other cells may be empty parts of the hull.
     """
     total, squares, counts = np.zeros((len(cells), 3)), np.zeros((len(cells), 3)), np.zeros(len(cells), int)
     for shape in shapes:
@@ -158,10 +158,10 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
 
     Args:
         views: Training views; those with an alpha channel carve.
-        merge_px: Width of the cells in which points become one [px]; 0 keeps one for every pixel.
+        merge_px: Width of the cells in which points are merged into one [px]; 0 merges none.
 
     Returns:
-        The cloud, empty where fewer than two views have an alpha channel or nothing is in all of them.
+        The cloud, empty if fewer than two views have an alpha channel or the silhouettes do not overlap.
     """
     shapes = silhouettes(views)
     nothing = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
@@ -174,4 +174,4 @@ def hull_points(views: Sequence[View], merge_px: float) -> tuple[PointCloud, str
     total, cells, colors = len(cells), cells[kept], colors[kept]
     wide = max(width, merge_px * _footprint([s.view.camera for s in shapes], cells))
     cloud = merge(cells, colors, merge_cells(cells, np.full(len(cells), wide)))
-    return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of its {total:,} cells"
+    return cloud, f"{len(cloud):,} points on the hull of {len(shapes)} silhouettes, from {len(cells):,} of {total:,} cells"

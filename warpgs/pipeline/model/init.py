@@ -1,4 +1,4 @@
-"""The first Gaussians: from depths that views confirm, from the reconstruction's points, or at random."""
+"""The initial Gaussians: from depths that views confirm, from the reconstruction's points, from a visual hull, or at random."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth
 
 SOURCES = ("auto", "sweep", "flow", "points", "hull", "random")
 MIN_POINTS = 100
-"""Fewest sparse points to start from: fewer leave most of the image empty, and a random start is better."""
+"""Fewest sparse points to start from: with fewer, most of the image is empty, and a random start is better."""
 
 
 @dataclass(frozen=True)
 class InitConfig:
-    """Source and first values of the Gaussians."""
+    """Source and initial values of the Gaussians."""
 
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
-    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto: sweep for few views or
-    given depth, else points if training views saw at least 100, else random. If views have an alpha channel, points in an empty
-    area of a view are left out."""
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep for few
+    views or given depth, else points if training views saw at least 100, else random. If views have an alpha channel, points in
+    an empty area of a view are left out."""
     sweep_up_to: int = 0
-    """auto: largest number of training views for a start by sweep, which takes a second for each view on two cores."""
+    """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
     random_count: int = 20_000
     """Number of random points."""
     opacity: float = 0.1
-    """First opacity, in (0, 1)."""
+    """Initial opacity, in (0, 1)."""
     scale_factor: float = 1.0
-    """First standard deviation of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
+    """Initial standard deviation of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
     near_views: int = 4
     """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
@@ -55,17 +55,17 @@ class InitConfig:
     fill_px: float = 16.0
     """sweep, flow: cell width [px] for filling in points where depth is not consistent; 0 fills in none."""
     extrapolate: bool | None = False
-    """sweep, flow: add extrapolated points where no view looks, beyond the images and behind edges of depth
-    (docs/decisions/026-extrapolated-points.md). If there are some, opacity decay spares Gaussians that a step does not use.
-    There are none if a view has a mask, an alpha channel or a black background. None: by the number of views."""
+    """sweep, flow: add extrapolated points where no view looks, beyond the images and behind depth edges
+    (docs/decisions/026-extrapolated-points.md). In a fit with such points, opacity decay spares Gaussians that a step does not
+    use. No points are added if a view has a mask, an alpha channel or a black background. None: by the number of views."""
     flow: str = "dis"
-    """flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
+    """flow: source of optical flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
     """flow: range of input colours of an ONNX file: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
     max_residual: float = 1.0
     """flow: largest distance of a match from its epipolar line [px]."""
     blend: str = "least_sensitive"
-    """flow: combination of the depths from several views: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
+    """flow: rule to combine depths from several views: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
 
     def __post_init__(self):
         if self.source not in SOURCES:
@@ -87,7 +87,7 @@ class InitConfig:
         """Return the settings of depth from flow.
 
         Raises:
-            UsageError: One of them is out of range.
+            UsageError: A setting is out of range.
         """
         return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
 
@@ -98,11 +98,11 @@ class Start(NamedTuple):
     cloud: PointCloud
     """Positions and colours."""
     how: str
-    """Source of the points, for the user."""
+    """Description of the points and their source, for the user."""
     depths: list[ViewDepth] | None = None
     """Geometrically consistent depth of each view; None if not computed."""
     extrapolated: int = 0
-    """Number of points, the last ones, that are extrapolated where no view looks."""
+    """Number of extrapolated points, where no view looks; they are the last ones."""
 
 
 def consistent_depths(
@@ -135,9 +135,9 @@ def consistent_points(
 ) -> Start:  # fmt: skip
     """Return points behind pixels whose depth other views confirm, and a line on each view.
 
-    With fewer than `MIN_POINTS` such points the start is random, with a note.
+    If fewer than `MIN_POINTS` points are found, the start is random, with a note.
     """
-    reason, depths, given, source = "a single view has no other to compare with", None, [], config.source
+    reason, depths, given, source = "depth needs at least two views", None, [], config.source
     if len(views) > 1:
         depths = consistent_depths(views, points, config, device, progress)
     if any_given(views):
@@ -161,13 +161,14 @@ def _number_extrapolated(views: list[View], count: int) -> str:
     """Return how many points are extrapolated, for the user, and why there are none."""
     if count:
         return f"{count:,} extrapolated where no view looks"
-    return "none extrapolated" + ("" if all_count(views) else ", since masks, alpha or black leave out parts of the views")
+    hidden = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of the views"
+    return f"none extrapolated{hidden}"
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
     """Return the reconstruction's points that two of the views saw, or the only view; none without a reconstruction.
 
-    A point that only one of them saw was triangulated with held-out views.
+    A point that only one of several views saw was triangulated with held-out views.
     """
     return NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
 
@@ -178,7 +179,7 @@ def sweeps(config: InitConfig, views: int) -> bool:
 
 
 def extrapolates(config: InitConfig, views: list[View]) -> bool:
-    """Return whether the start of a fit of these views has extrapolated points, where it finds depth."""
+    """Return whether the start of a fit of these views has extrapolated points, if it finds depth."""
     if not config.extrapolate or len(views) < 2:
         return False
     searches = config.source == "flow" or sweeps(config, len(views)) or (config.source == "auto" and any_given(views))
@@ -189,11 +190,11 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
     """Check that a start from points has points that the training views saw.
 
     Raises:
-        DataError: There are none, and ``config`` needs them.
+        DataError: The training views saw no points, and ``config`` needs them.
     """
     if config.source == "points" and len(seen_points(views, points)) == 0:
         raise DataError(
-            "--init.source points needs 3D points that the training views saw, and the scene has none; use --init.source "
+            "--init.source points needs 3D points that the training views saw, but the scene has none; use --init.source "
             "random, or give a reconstruction with points"
         )
 
@@ -201,7 +202,7 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
 def on_object(start: Start, views: list[View]) -> Start:
     """Return the start without points that are empty in a view with an alpha channel.
 
-    If fewer than `MIN_POINTS` are left, it is unchanged.
+    If fewer than `MIN_POINTS` points would be left, the start is unchanged.
     """
     shapes = silhouettes(views)
     if not shapes:
@@ -212,8 +213,9 @@ def on_object(start: Start, views: list[View]) -> Start:
         return start
     count = int(keep.sum())
     if count < MIN_POINTS:
-        return start._replace(how=f"{start.how}\nonly {count} of them are in no empty area of a view; check the poses")
-    how = f"{start.how}\n{len(keep) - count:,} of them left out, in empty areas of a view"
+        few = f"only {count} of these points are outside the empty areas of all views; check the poses"
+        return start._replace(how=f"{start.how}\n{few}")
+    how = f"{start.how}\n{len(keep) - count:,} of these points left out: they are in an empty area of a view"
     return start._replace(cloud=PointCloud(cloud.points[keep], cloud.colors[keep]), how=how)
 
 
@@ -237,7 +239,7 @@ def initial_points(
         return Start(cloud, f"{made}, instead of --init.source hull: {how}")
     found = on_object(_found_points(views, points, config, generator, device, progress), views)
     if config.extrapolate and found.depths is None:
-        return found._replace(how=f"{found.how}\nno extrapolated points, which need --init.source sweep or flow")
+        return found._replace(how=f"{found.how}\nno extrapolated points: they need --init.source sweep or flow")
     return found
 
 
@@ -245,7 +247,7 @@ def _found_points(
     views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
     device: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
-    """Return the points of any source but the hull."""
+    """Return the points of a source other than the hull."""
     usable = seen_points(views, points)
     if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
         return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
@@ -260,18 +262,18 @@ def _found_points(
 
 
 def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
-    """Return the start with at most that many points, sampled at random; their Gaussians are wider, since they are sparser."""
+    """Return the start with at most ``most`` points, sampled at random; sparser points get wider Gaussians."""
     count = len(start.cloud)
     if count <= most:
         return start
     keep = np.sort(generator.permutation(count)[:most])
-    how = f"{start.how}\n{most:,} of these {count:,} points, sampled at random: --max-gaussians is {most:,}"
+    how = f"{start.how}\nused {most:,} of these {count:,} points, sampled at random, because --max-gaussians is {most:,}"
     cloud = PointCloud(start.cloud.points[keep], start.cloud.colors[keep])
     return start._replace(cloud=cloud, how=how, extrapolated=int((keep >= count - start.extrapolated).sum()))
 
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
-    """Return the size of the scene [u]: that of the camera set, or a tenth of the cloud's if all cameras are in one place."""
+    """Return the size of the scene [u]: that of the camera set, or a tenth of the cloud's size if all cameras coincide."""
     extent = geometry.camera_extent(cameras)
     spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
@@ -286,7 +288,7 @@ def initial_gaussians(
         cloud: At least one point.
         config: Opacity, and the factor of the widths.
         sh_degree: Degree of the spherical harmonics, 0 to 4.
-        extent: Size of the scene [u]; widths are kept between 1e-6 and 0.1 of it, so coincident or lone points get one too.
+        extent: Size of the scene [u]; widths are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
         device: Device of the tensors, float32.
         extrapolated: Number of points, the last ones, that start with `EXTRAPOLATED_OPACITY`.
 

@@ -28,7 +28,7 @@ def _area(log_scales: torch.Tensor) -> torch.Tensor:
 
 
 def _covered(opacity: torch.Tensor, area: torch.Tensor, own: torch.Tensor, means: torch.Tensor) -> torch.Tensor:
-    """Return the integral of 1 - (1 - a G)(1 - b H) over a plane that pairs are seen on face on, over 2 pi [u^2], shape [P].
+    """Return the integral of 1 - (1 - a G)(1 - b H) over the plane on which both are seen face on, over 2 pi [u^2], shape [P].
 
     Args:
         opacity: a and b, shape [P, 2].
@@ -48,9 +48,9 @@ class Merges:
     """Pairs that could become one, the cheapest first."""
 
     first: torch.Tensor
-    """Rows, int64, shape [P]; no row occurs twice in ``first`` and ``second`` together."""
+    """Row of one Gaussian of each pair, int64, shape [P]; no row occurs twice in ``first`` and ``second`` together."""
     second: torch.Tensor
-    """The other row of each, int64, shape [P]."""
+    """Row of the other Gaussian of each pair, int64, shape [P]."""
     merged: dict[str, torch.Tensor]
     """Merged Gaussian of each pair: rows of the five tensors, shape [P, ...]."""
 
@@ -64,7 +64,7 @@ class Merges:
 
 
 def _curve(means: torch.Tensor, shift: float) -> torch.Tensor:
-    """Return the rows of means [N, 3] along the Morton curve of a box that is wider than theirs by ``shift`` on one side."""
+    """Return the rows of means [N, 3] along the Morton curve of their bounding box, enlarged by ``shift`` on one side."""
     low, high = means.amin(0), means.amax(0)
     boxed = torch.cat([means, (low - shift * (high - low))[None]])
     return torch.argsort(morton_codes(boxed)[:-1], stable=True)
@@ -72,20 +72,20 @@ def _curve(means: torch.Tensor, shift: float) -> torch.Tensor:
 
 @torch.no_grad()
 def merges(gaussians: Gaussians, maxima: torch.Tensor, kinds: torch.Tensor, odd: bool, shift: float = 0.0) -> Merges:
-    """Pair neighbours along the Morton curve, and compute what each pair would become.
+    """Pair neighbours along the Morton curve, and compute the merged Gaussian of each pair.
 
-    Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. Opacity times area becomes
-    the area that the pair covers face on, with the overlap counted once. If that needs an opacity above `OPAQUE`, the two
-    longer axes grow instead: else a surface of opaque Gaussians would get holes. A pair costs its largest blending weight times
-    the sum of three differences: of the colours, of the area covered (logarithm of new over old: pairs far apart or of unlike
-    planes bulge), and of the logarithm of the area by which the axes had to grow.
+    Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. The new opacity times area is
+    the area that the pair covers face on, with the overlap counted once. If this needs an opacity above `OPAQUE`, the two
+    longer axes grow instead: otherwise a surface of opaque Gaussians would get holes. The cost of a pair is its largest
+    blending weight times the sum of three terms: the difference of the colours; the logarithm of new over old covered area,
+    since distant pairs or pairs of different planes bulge; and the logarithm of the area by which the axes had to grow.
 
     Args:
         gaussians: N Gaussians.
         maxima: Largest blending weight of each, shape [N].
-        kinds: Only Gaussians of the same number are paired, int, shape [N].
+        kinds: Only Gaussians of the same kind are paired, int, shape [N].
         odd: Pair the second with the third, and so on, instead of the first with the second.
-        shift: Part of the cloud's size by which the curve is moved: neighbours on two sides of a large cell meet on another.
+        shift: Fraction of the cloud's size by which the curve is moved, so that neighbours in two large cells can be paired.
     """
     order = _curve(gaussians.means, shift)[int(odd) :]
     order = order[: len(order) // 2 * 2].reshape(-1, 2)

@@ -99,9 +99,7 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     tensors = {n: t.detach().cpu().contiguous() for n, t in gaussians.tensors().items()}
     for name, t in tensors.items():
         if not bool(torch.isfinite(t).all()):
-            raise DataError(
-                f"{path}: not written, {name} holds numbers that are not finite; save an earlier state of the model"
-            )
+            raise DataError(f"{path}: not written, {name} holds non-finite values; save an earlier state of the model")
     header = {
         "format": FORMAT, "version": __version__, "units": units, "scale": repr(float(normalization.scale)),
         "offset": json.dumps([float(v) for v in normalization.offset]),
@@ -153,21 +151,21 @@ def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussi
         where: Path of their file, for messages.
 
     Raises:
-        DataError: One is missing or not finite, or their shapes or types do not go together.
+        DataError: A tensor is missing or not finite, or shapes or types do not match.
     """
     names = Gaussians.__dataclass_fields__
     missing = [n for n in names if n not in tensors]
     if missing:
-        raise DataError(f"{where}: lacks {', '.join(missing)}; restore it, or write it again")
+        raise DataError(f"{where}: {', '.join(missing)} missing; restore the file, or write it again")
     gaussians = Gaussians(**{n: tensors[n] for n in names})
     try:
         check_stored(gaussians)
         _check_type(gaussians)
     except (TypeError, ValueError) as e:
-        raise DataError(f"{where}: {e}; restore it, or write it again") from e
+        raise DataError(f"{where}: {e}; restore the file, or write it again") from e
     for name, t in gaussians.tensors().items():
         if not bool(torch.isfinite(t).all()):
-            raise DataError(f"{where}: {name} holds numbers that are not finite; restore it, or write it again")
+            raise DataError(f"{where}: {name} holds non-finite values; restore the file, or write it again")
     return gaussians
 
 

@@ -1,4 +1,4 @@
-"""Random first points: where cameras look, around matched points where there are some, and on the object that views show."""
+"""Random initial points: where cameras look, around matched points if there are any, and on the object that views show."""
 
 from __future__ import annotations
 
@@ -12,21 +12,22 @@ from warpgs.priors.matches import triangulate_matches
 from warpgs.scene import PointCloud, View
 
 OBJECTS = ("foreground", "object")
-"""Names of the regions of an object (`fitted_region`): on black, and cut out."""
+"""Names of the regions of an object (`fitted_region`): object on black, and object that an alpha channel cuts out."""
 MIN_MATCHES = 10
-"""Fewest matched points of a view from which its random points take their depths."""
+"""Fewest matched points of a view for its random points to take their depths from them."""
 NEIGHBORS = 5
-"""Matched points that a random pixel takes its depth from."""
+"""Number of nearest matched points from which a random pixel takes its depth."""
 PAIRS = 2**20
-"""Distances that are held at a time while neighbours are searched."""
+"""Most distances in memory at a time while neighbours are searched."""
 DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
 
 def camera_depths(views: list[View]) -> tuple[float, float]:
-    """Return near and far depth [u] where nothing else is known: 0.1 and 10 times the distance to the cameras' focus point.
+    """Return the default near and far depth [u]: 0.1 and 10 times the distance to the cameras' focus point.
 
-    Cameras in one place with one direction have no such point; then it is one unit, which the scene's scale was chosen for.
+    Cameras in one place with one direction have no focus point; then the distance is one unit, for which the scene's scale was
+    chosen.
     """
     focus = geometry.focus_point([v.camera for v in views])
     distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
@@ -46,7 +47,7 @@ def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Depths:
-    """Random depths for pixels of one view: near those of matched points around the pixel, else anywhere the cameras allow."""
+    """Random depths for pixels of one view: near those of matched points around the pixel, else between the default bounds."""
 
     def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
         seen = geometry.in_image(view.camera, matched.points)
@@ -69,7 +70,7 @@ class _Depths:
 
 
 def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
-    """Count the views that see each point [N, 3] over the empty background, int [N]: 0 within the visual hull."""
+    """Count the views in which each point [N, 3] falls on the empty background, int [N]: 0 within the visual hull."""
     votes = np.zeros(len(points), int)
     for view, (region, name) in zip(views, regions):
         if name not in OBJECTS:
@@ -82,10 +83,10 @@ def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]],
 def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
     """Return points behind random pixels of the training views with the pixels' colours, and a sentence on how they were made.
 
-    A view in which at least 10 triangulated SIFT matches lie takes each depth from one of the 5 matches nearest to the pixel,
-    spread by a tenth (docs/decisions/003-random-start.md); any other view samples inverse depths uniformly, and keeps points
-    that a second view sees where there are any. If views show an object on black, or have an alpha channel, points start on the
-    object. Those that the fewest views see in front of empty pixels come first, so that none is in empty space.
+    A view with at least 10 triangulated SIFT matches takes each depth from one of the 5 matches nearest to the pixel, spread by
+    a tenth (docs/decisions/003-random-start.md). Any other view samples inverse depths uniformly, and prefers points that a
+    second view sees. If views show an object on black, or have an alpha channel, points start on the object. Of several
+    candidates those are taken that fall on empty pixels in the fewest views, so that no point is in empty space.
 
     Raises:
         DataError: Masks leave no pixel of any training view.
@@ -124,7 +125,7 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
     how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
     objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
     if objects:
-        how += f", on the object that {objects} views show on black"
+        how += f", on the object ({objects} views show it on black)"
     if cut_out:
-        how += f", where {cut_out} views are opaque"
+        how += f", in the opaque areas of {cut_out} views"
     return PointCloud(np.concatenate(points), np.concatenate(colors)), how

@@ -1,4 +1,4 @@
-"""Limits of the size and the shape of every Gaussian, held by the steps of a fit; and figures of what a model holds."""
+"""Limits of the size and the shape of every Gaussian, applied in each step of a fit; and statistics of sizes and shapes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from warpgs.kernels.pixel_size import pixel_size
 from warpgs.scene import Camera, Gaussians, PointCloud
 
 WITHIN = 0.9
-"""Fraction of the first points that the radius of a scene holds; the farthest are often wrong."""
+"""Fraction of the initial points within the radius of a scene; the farthest points are often wrong."""
 NEEDLE = 30.0
-"""Longest over middle axis above which a Gaussian is counted as a needle."""
+"""Ratio of the longest to the middle axis above which a Gaussian is counted as a needle."""
 MAX_CENTERS = 32
-"""Most cameras that a Gaussian's distance is measured to in every step."""
+"""Most cameras to which the distance of every Gaussian is measured in a step."""
 ROUNDING = 1e-5
-"""Distance of logarithms up to which an axis at its limit is within it: ten times what float32 rounds them by."""
+"""Tolerance of the logarithm of an axis at its limit: ten times the rounding error of float32."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Limits:
 
     @torch.no_grad()
     def hold(self, params: dict[str, torch.Tensor], cameras: TrainingCameras, going: torch.Tensor | None = None) -> None:
-        """Bring logarithms of axes [N, 3] within the limits, in place; a second time changes nothing.
+        """Bring logarithms of axes [N, 3] within the limits, in place; a second call changes nothing.
 
-        Axes are raised to the smallest size and cut to the largest, which comes before the smallest; where the longest is then
-        too long for the middle one, the middle one grows. A flat disk stays one. Moments of Adam stay. It may be part of a
-        captured step.
+        Axes are raised to the smallest size, then cut to the largest, which has priority. If the longest axis is then too long
+        for the middle one, the middle one grows. A flat disk stays flat. Moments of Adam do not change. The call may be part of
+        a captured step.
 
         Args:
             params: ``means`` [N, 3] and ``log_scales`` [N, 3] of `Gaussians`.
@@ -81,13 +81,13 @@ class LimitConfig:
     """Largest ratio of the longest axis to the middle one, at least 1; 0 for no limit."""
     max_reach: float = 1 / 3
     """Largest standard deviation of an axis, as a fraction of the distance to the nearest training camera; 0 for no limit. With
-    a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras are fog in front of
-    other views."""
+    a third, three standard deviations reach no camera; larger Gaussians beside or behind training cameras would be fog in other
+    views."""
     min_pixels: float = 0.2**0.5
     """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
     most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
     ratio_from: float = 0.7
-    """Fraction of the steps after which that ratio is held, in [0, 1]. Long Gaussians help the first steps."""
+    """Fraction of the steps after which ``max_ratio`` applies, in [0, 1]. Long Gaussians help the first steps."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_size <= 1e6:
@@ -105,7 +105,7 @@ class LimitConfig:
         """Return the limits of a step.
 
         Args:
-            progress: Fraction of the fit that is done before it, in [0, 1]; 1 for the last step, which has all of them.
+            progress: Fraction of the fit that is done before the step, in [0, 1]; 1 for the last step, which has all limits.
             radius: Result of `scene_radius` [u].
             antialiased: True in an antialiased fit.
         """
@@ -120,7 +120,7 @@ class TrainingCameras(NamedTuple):
     centers: torch.Tensor
     """Result of `camera_centers`, shape [K, 3]."""
     rows: torch.Tensor
-    """All of them as `pixel_size` takes them, float32, shape [C, 9]."""
+    """All cameras as `pixel_size` takes them, float32, shape [C, 9]."""
 
     @staticmethod
     def of(cameras: Sequence[Camera], device: torch.device) -> TrainingCameras:
@@ -132,8 +132,8 @@ class TrainingCameras(NamedTuple):
 def _camera_row(camera: Camera) -> np.ndarray:
     """Return a camera as `pixel_size` takes it, shape [9]; its cone holds eight points of the border of the image.
 
-    Where a lens does not reach one of them, the cone is all that the model can see. For a model without centre, pixels have
-    size 0 and limit nothing.
+    If a lens does not reach one of these points, the cone is all that the model can see. For a model without centre, pixels
+    have size 0 and limit nothing.
     """
     f, center = np.array([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
     ends = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
@@ -155,16 +155,16 @@ def camera_centers(cameras: Sequence[Camera], device: torch.device) -> torch.Ten
 
 
 def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the logarithms of the longest and of the middle axis, shape [N] each, of those of all three, shape [N, 3]."""
+    """Return the logarithms of the longest and of the middle axis, shape [N] each, from those of all axes, shape [N, 3]."""
     a, b, c = log_scales.unbind(1)
     low, high = torch.minimum(a, b), torch.maximum(a, b)
     return torch.maximum(high, c), torch.maximum(low, torch.minimum(high, c))
 
 
 def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
-    """Return the radius of the scene around the mean of its cameras [u]: it holds them, and 90 % of the first points.
+    """Return the radius around the mean of the cameras that contains all cameras and 90 % of the initial points [u].
 
-    It is not `scene_extent`, the size of the camera set alone: the photographed scene may be much larger or smaller.
+    `scene_extent` differs: it is the size of the camera set alone. The photographed scene may be much larger or smaller.
     """
     center = np.mean([c.center for c in cameras], axis=0)
     reach = float(np.quantile(np.linalg.norm(cloud.points - center, axis=1), WITHIN)) if len(cloud) else 0.0
@@ -178,17 +178,17 @@ def shape_figures(
 
     Args:
         gaussians: N Gaussians.
-        config: Limits; those that are 0 count nothing as beyond them.
+        config: Limits; no Gaussian counts as beyond a limit that is 0.
         radius: Result of `scene_radius` [u].
         extent: Result of `scene_extent` [u].
         cameras: Training cameras, at least one.
 
     Returns:
-        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], over the radius and over the extent, and the
-        largest over the distance to the nearest camera, of those that `camera_centers` chooses; ``needles``,
-        the fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one, ``needles_by_opacity`` with
-        each counted by its opacity, and ``thin``, the fraction whose longest axis is more than so many times the shortest; the
-        number ``beyond`` the limits.
+        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], absolute, over the radius and over the extent,
+        and the largest ratio to the distance of the nearest camera, of those that `camera_centers` chooses; ``needles``, the
+        fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one; ``needles_by_opacity``, the same
+        weighted by opacity; ``thin``, the fraction whose longest axis is more than `NEEDLE` times the shortest; and the number
+        of Gaussians ``beyond`` the limits.
     """
     scales = gaussians.log_scales.detach().cpu().double()
     longest, middle = long_axes(scales)
@@ -214,11 +214,11 @@ def shape_figures(
 
 
 def shape_summary(figures: dict[str, Any]) -> str:
-    """Return one line for people from the figures of `shape_figures`."""
+    """Return the values of `shape_figures` as one line for the user."""
     f = figures
     return (
         f"shape: the largest axis is {f['largest_over_radius']:.2g} of the scene's radius, "
         f"{f['largest_over_extent']:.2g} of the cameras' extent, and {f['largest_over_distance']:.2g} of the distance to the "
         f"nearest camera; {f['needles']:.1%} of the Gaussians are needles, more than "
-        f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} beyond the limits"
+        f"{NEEDLE:g} times as long as wide ({f['needles_by_opacity']:.1%} by opacity); {f['beyond']:,} exceed the limits"
     )

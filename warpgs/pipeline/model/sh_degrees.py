@@ -1,4 +1,4 @@
-"""Degrees of each Gaussian's harmonics: packed coefficients up to that degree, and the bytes of a model."""
+"""Degrees of each Gaussian's harmonics: coefficients packed up to these degrees, and the size of a model in bytes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from warpgs.kernels.sh import MAX_DEGREE
 
 FLOAT = 4
-"""Bytes of a stored number."""
+"""Size of a stored number [bytes]."""
 
 
 def model_bytes(degrees: torch.Tensor) -> int:
@@ -37,13 +37,13 @@ def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
     """Return the coefficients [N, K, 3] that `pack` stored, K that of the highest degree, zeros above each one's degree.
 
     Raises:
-        ValueError: The degrees are not integers from 0 to 4, or others than those that the coefficients were packed with.
+        ValueError: The degrees are not integers from 0 to 4, or do not match the packed coefficients.
     """
     whole = degrees.ndim == 1 and not degrees.is_floating_point() and bool(((degrees >= 0) & (degrees <= MAX_DEGREE)).all())
     count = 3 * int((degrees.long() + 1).square().sum()) if whole else -1
     if packed.shape != (count,):
         raise ValueError(
-            f"{list(packed.shape)} packed coefficients do not go with {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
+            f"{list(packed.shape)} packed coefficients do not match {list(degrees.shape)} degrees from 0 to {MAX_DEGREE}"
         )
     highest = int(degrees.max()) if len(degrees) else 0
     sh, at = packed.new_zeros(len(degrees), (highest + 1) ** 2, 3), 0

@@ -1,7 +1,7 @@
-"""One table of what training learns: parameters, their Adam moments and named columns, one row each.
+"""A table of learned values: parameters, their Adam moments and named columns, one row per Gaussian or view.
 
-A fit has a table of Gaussians. A second one, of its training views, has a row a view; it is empty unless view modules ask for
-parameters of each view.
+A fit has a table of Gaussians. A second table has a row for each training view; it has no parameters unless view modules learn
+some.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class DensityUpdate:
     """A change of the set of Gaussians: rows that stay, rows that are overwritten, rows that are appended."""
 
     keep: torch.Tensor
-    """Numbers of the surviving rows in ascending order, int64, shape [S]."""
+    """Indices of the surviving rows in ascending order, int64, shape [S]."""
     added: Mapping[str, torch.Tensor]
     """New rows of each parameter, shape [A, ...]; their moments start at zero."""
     parents: torch.Tensor
-    """Parent of each new row, by its number before the change, -1 for none, int64, shape [A]."""
+    """Parent of each new row, by its index before the change, -1 for none, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
-    """Values for new rows without a parent, and for columns that are not inherited; columns left out take their ``fill``."""
+    """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
     overwritten: torch.Tensor | None = None
-    """Numbers, before the change, of the rows to overwrite: parameters are replaced, and moments start again at zero. Int64,
-    shape [R]; None for none."""
+    """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
+    [R]; None for none."""
     values: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
@@ -99,7 +99,7 @@ class Table:
         return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
 
     def growth_bytes(self, before: int, after: int) -> int:
-        """Return the bytes needed to add rows: the new rows, one tensor before and after, and numbers of rows and parents."""
+        """Return the bytes needed to add rows: the new rows, one tensor before and after, and indices of rows and parents."""
         added = min(2 * (after - before), after)  # a split replaces one row by two
         largest = max(t.element_size() * t[0].numel() for t in self.params.values())
         return self.row_bytes * added + largest * (before + after) + 8 * after
@@ -120,7 +120,7 @@ class Table:
         Args:
             lrs: Learning rate of each parameter, for steps of one view.
             step: Number of the step, from 1.
-            head_lrs: Learning rate of the first 3 numbers of each row, for parameters with a different one.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters whose first numbers have their own.
         """
         row, factor = [], math.sqrt(self.batch)
         for name in self.params:
@@ -139,8 +139,8 @@ class Table:
             gradients: Gradients of all or some parameters by name.
             lrs: A row of `lr_row`, float32, shape [3 P].
             skip: 0, or the reason for skipping the step, int32, shape [1].
-            factors: Fraction of its step that each mean takes, shape [N]; None for 1. It scales the step, because Adam's step
-                does not depend on the scale of the gradient. All rows are updated then.
+            factors: Factor of the step of each mean, shape [N]; None for 1. Steps are scaled, not gradients, because Adam's
+                step does not depend on the scale of the gradient. With factors, all rows are updated.
             rows: Rows to update.
         """
         before = None if factors is None else self.params["means"].detach().clone()
@@ -164,8 +164,8 @@ class Table:
         rows = {n: len(update.added[n]) if n in update.added else None for n in self.params}
         if any(count != len(update.parents) for count in rows.values()):
             raise UsageError(
-                f"a DensityUpdate names {len(update.parents)} parents and adds {rows} rows: each parameter needs one "
-                "row for each parent (-1 for none)"
+                f"a DensityUpdate has {len(update.parents)} parents but adds {rows} rows: each parameter needs one row for "
+                "each entry of parents (-1 for a row without a parent)"
             )
         if update.overwritten is not None:
             self._overwrite(update.overwritten, update.values)
@@ -234,8 +234,8 @@ class Table:
             t = state[name]
             if len(rows) > 1 or t.shape[1:] != own_tensor.shape[1:] or t.dtype != own_tensor.dtype:
                 raise DataError(
-                    f"the stored table does not fit together: {name} has shape {list(t.shape)} and type {t.dtype}, where "
-                    f"[N, {', '.join(map(str, own_tensor.shape[1:]))}] and {own_tensor.dtype} are needed, with one N for all"
+                    f"the stored table is inconsistent: {name} has shape {list(t.shape)} and type {t.dtype}, expected "
+                    f"[N, {', '.join(map(str, own_tensor.shape[1:]))}] and {own_tensor.dtype}, with one N for all tensors"
                 )
         for group, tensors in self._groups().items():
             for name in tensors:

@@ -29,8 +29,7 @@ def check_batched(
         resume: Whether a run is continued.
 
     Raises:
-        UsageError: A step has fewer views than there are processes, or each process would choose settings or find poses of its
-            own.
+        UsageError: A step has fewer views than processes, or each process would choose its own settings or find its own poses.
     """
     check_ranks(config.batch, ranks)
     if ranks.count == 1:
@@ -38,12 +37,12 @@ def check_batched(
     path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
     if path is not None and not resume and needs_poses(path):
         raise UsageError(
-            f"{path}: has no cameras, and {ranks.count} ranks would each find poses of their own; find them once with `warpgs "
-            f"poses {path} --out SCENE`, and fit that"
+            f"{path}: has no cameras, and each of {ranks.count} ranks would find other poses; run `warpgs poses {path} --out "
+            "SCENE` first, and fit SCENE"
         )
     if time_budget is not None:
         raise UsageError(
-            f"--time-budget measures the speed of one process, and {ranks.count} would choose different steps: give --steps"
+            f"--time-budget measures the speed of a process, so {ranks.count} ranks would choose different steps; give --steps"
         )
 
 
@@ -56,16 +55,16 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
         ranks: The processes.
 
     Raises:
-        UsageError: One of them differs from the first, in every process.
+        UsageError: A process differs from the first one; raised in every process.
     """
     if ranks.count == 1:
         return
     parts = {
-        "another version of warpgs": (record["versions"]["warpgs"], "install the same version everywhere"),
-        "another scene": (record["fingerprint"], "give all ranks the same files and options for reading"),
-        "another split": ([record["train"], record["test"]], "give all ranks the same --split"),
-        "other settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
-        "another checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
+        "a different version of warpgs": (record["versions"]["warpgs"], "install the same version everywhere"),
+        "a different scene": (record["fingerprint"], "give all ranks the same files and options for reading"),
+        "a different split": ([record["train"], record["test"]], "give all ranks the same --split"),
+        "different settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
+        "a different checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
     }
     own = {name: hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest() for name, (value, _) in parts.items()}
     first, *others = map(json.loads, ranks.texts(json.dumps(own)))
@@ -80,13 +79,13 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     if config.batch == 1:
         return []
     notes = [
-        f"batch: each of the {config.steps:,} steps renders {config.batch} views and takes the mean of their gradients; "
-        f"learning rates are those of one view times {config.batch**0.5:.3g}"
+        f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; "
+        f"learning rates are {config.batch**0.5:.3g} times those for one view"
     ]
     if ranks.count > 1:
         counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
         notes.append(
-            f"ranks: {ranks.count} processes by {ranks.backend}, each renders {' or '.join(map(str, counts))} of the views of "
-            "a step; the model is the same to the bit for any number of them"
+            f"ranks: {ranks.count} processes ({ranks.backend}), each renders {' or '.join(map(str, counts))} views of a step; "
+            "the model has the same bits for any number of ranks"
         )
     return notes

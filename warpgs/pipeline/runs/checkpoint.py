@@ -19,7 +19,7 @@ from warpgs.version import __version__
 
 TENSORS = "checkpoint.safetensors"
 FORMAT = 2
-"""Number of the format of run folders: config.json and the checkpoint. 1 was that of warpgs 0.1.0."""
+"""Version of the format of run folders: config.json and the checkpoint. warpgs 0.1.0 wrote version 1."""
 DTYPES = {
     torch.float64: "F64",
     torch.float32: "F32",
@@ -32,7 +32,7 @@ DTYPES = {
 
 
 def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str]) -> list[memoryview | bytes]:
-    """Return a safetensors file in pieces; those of tensors on the CPU are their own memory, so nothing is held twice."""
+    """Return a safetensors file in pieces; pieces of CPU tensors share their memory, so nothing is copied."""
     ordered = sorted(tensors.items(), key=lambda item: (-item[1].element_size(), item[0]))  # aligned for every reader
     parts = [t.detach().cpu().contiguous().reshape(-1).view(torch.uint8) for _, t in ordered]
     header: dict[str, Any] = {"__metadata__": metadata}
@@ -46,9 +46,9 @@ def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
-    """Write one checkpoint, replacing the last one only once the new one is complete on disk.
+    """Write a checkpoint; it replaces the last one only once it is complete on disk.
 
-    ``state`` travels in the header of the same file, so tensors and state can never be of two different steps.
+    ``state`` is stored in the header of the same file, so tensors and state always belong to the same step.
 
     Args:
         folder: The run folder.
@@ -99,9 +99,9 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
     except FileNotFoundError as e:
         raise DataError(f"{folder} holds no {TENSORS}: no checkpoint yet; run `warpgs fit` first") from e
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore it, or fit again") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); restore the file, or fit again") from e
     if hashlib.sha256(body).digest() != digest:
-        raise DataError(f"{path}: the checksum does not match, so the file was truncated or altered; fit again, or restore it")
+        raise DataError(f"{path}: the checksum does not match: the file was truncated or altered; restore it, or fit again")
     try:
         tensors = load(body)
         length = int.from_bytes(body[:8], "little")
@@ -118,5 +118,5 @@ def load_checkpoint(folder: Path) -> tuple[dict[str, torch.Tensor], dict[str, An
         state = schema.parse(metadata["state"])
         schema.mapping(schema.anything)(state, "")
     except (KeyError, schema.SchemaError) as e:
-        raise DataError(f"{path}: its state is incomplete or damaged ({e}); fit again, or restore it") from e
+        raise DataError(f"{path}: the stored state is incomplete or damaged ({e}); restore the file, or fit again") from e
     return tensors, state

@@ -32,10 +32,13 @@ from warpgs.report.progress import Stages, waiting
 from warpgs.runtime.folder_lock import hold_folder
 from warpgs.scene import Scene, View
 
-VP9 = "the film is VP9, for browsers and VLC; for other players: ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
-"""Note on a film in .mp4, of which {} is the path."""
+VP9 = (
+    "the film is VP9, which browsers and VLC play; convert it for other players: "
+    "ffmpeg -i {} -c:v libx264 -pix_fmt yuv420p film-h264.mp4"
+)
+"""Note on a film in .mp4; {} stands for its path."""
 ALPHAS = {"alpha_empty": "where empty", "alpha_object": "in the object"}
-"""Scores of the rendered alpha, with the words for each view's line."""
+"""Scores of the rendered alpha, with their names in the line of a view."""
 
 
 def scene_of(
@@ -53,7 +56,7 @@ def scene_of(
     """
     scene, _, _ = read_scene(stored.scene_request(reader), tell)
     if scene.fingerprint != stored.record["fingerprint"]:
-        raise DataError(f"{scene.path}: its images or cameras are not those that {stored.folder} was fitted to; restore them")
+        raise DataError(f"{scene.path}: images or cameras have changed since the fit of {stored.folder}; restore them")
     if stored.record["config"]["view_modules"]:
         scene = with_cameras(scene, stored.scene_cameras)
     scene, split = over_background(scene, stored.background), Split(stored.train, stored.test)
@@ -69,14 +72,14 @@ def evaluate(
 ) -> list[str]:
     """Score a run on its held-out views and render them again; returns lines for the user.
 
-    The scores go to eval.json beside metrics.json, which stays as the fit wrote it.
+    The scores are written to eval.json; metrics.json, which the fit wrote, is not changed.
 
     Args:
         folder: The run folder.
         device_name: auto, cpu or cuda.
         lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
         reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
-        by_coverage: Whether to split the scores by how many training views saw what a pixel shows.
+        by_coverage: Whether to split the scores by the number of training views that saw each pixel's point.
 
     Raises:
         DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the file of
@@ -124,12 +127,13 @@ def render(
     """Render a run or a file of Gaussians along a path to PNG files and a film, or only to a film; returns lines for the user.
 
     Args:
-        folder: The run folder; or the file, where ``file_of`` is given.
+        folder: The run folder; or the file, if ``file_of`` is given.
         path: One of `PATHS`, or a JSON file of keyframes.
         out: Folder or film to write; None for `path-PATH` in the run folder, or beside the file.
-        settings: Settings of the film; their background is not looked at.
+        settings: Settings of the film; their background is ignored.
         device_name: auto, cpu or cuda.
-        background: Colour behind the scene; auto for that of the fit, and transparent images of cut-out objects.
+        background: Colour behind the scene; auto for that of the fit, and for transparent images if the scene's images have an
+            alpha channel.
         coverage: True to also write images of the coverage by training views.
         sheet: Whether to write six frames in one image, too.
         file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.
@@ -185,4 +189,4 @@ def repeat_failed_step(path: Path, device_name: str) -> list[str]:
         ResourceError: The device is missing.
     """
     device, where = choose_device(device_name)
-    return [f"{path}, computed again {where}:", *findings(read_failed_step(path, device))]
+    return [f"{path}, repeated {where}:", *findings(read_failed_step(path, device))]

@@ -20,8 +20,8 @@ from warpgs.scene import Gaussians, View
 FOLDER = "coverage"
 """Folder in a run folder with an image of each held-out view."""
 EXPECTED = (
-    "The expected PSNR compares training photographs with each other where their depths differ as much: an estimate from "
-    "training data, not a bound."
+    "The expected PSNR is that between training photographs at points whose depths differ as much: an estimate from training "
+    "data, not a bound."
 )
 """Meaning of the expected PSNR, as text for the user."""
 
@@ -48,7 +48,7 @@ def coverage_of_run(
         tell: Called with a line for each view before it is rendered.
 
     Returns:
-        What `score_by_coverage` returns.
+        The result of `score_by_coverage`.
 
     Raises:
         ResourceError: An image cannot be written.
@@ -75,7 +75,7 @@ def coverage_table(coverage: dict[str, Any]) -> list[list[str]]:
 
 
 def coverage_lines(coverage: dict[str, Any]) -> list[str]:
-    """Return the table as lines for people, then a summary, and a legend of the images."""
+    """Return the table as lines for the user, then a summary, and a legend of the images."""
     rows = coverage_table(coverage)
     widths = [max(map(len, column)) for column in zip(*rows)]
     lines = ["  ".join(c.ljust(w) if i < 2 else c.rjust(w) for i, (c, w) in enumerate(zip(r, widths))) for r in rows]

@@ -28,7 +28,7 @@ class Filters:
     clean: bool | None = None
     """True to remove floaters and needles; None for the format's default (`Format.cleaned`)."""
     sh_degree: int | None = None
-    """Highest degree of harmonics; None for all that the format holds."""
+    """Highest degree of harmonics; None for all that the format can store."""
     rotate: str | None = None
     """Axis and angle as x,y,z,degrees; or level, to rotate the upward direction of a run's cameras to -y; None for no
     rotation."""
@@ -50,7 +50,7 @@ def filtered(
         cleaned: Default for cleaning.
 
     Returns:
-        The Gaussians that are left, the rotation [3, 3] that turned them (None for none), and lines for the user.
+        The remaining Gaussians, their rotation [3, 3] (None for no rotation), and lines for the user.
 
     Raises:
         UsageError: A filter is invalid, or needs the cameras of a run.
@@ -72,7 +72,7 @@ def filtered(
         gaussians = rotate(gaussians, rotation)
         lines.append(turned_line(rotation))
     if filters.sh_degree is not None and filters.sh_degree < gaussians.sh_degree:
-        lines.append(f"harmonics above degree {filters.sh_degree} are left out, as asked")
+        lines.append(f"harmonics above degree {filters.sh_degree} are left out (--sh-degree)")
     if filters.sh_degree is not None:
         gaussians = limit_degree(gaussians, filters.sh_degree)
     return gaussians, rotation, lines
@@ -97,7 +97,7 @@ def _maxima(stored: StoredRun) -> torch.Tensor:
 
 
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
-    """Return the rotation [3, 3] of a user's text, None for none.
+    """Return the rotation [3, 3] of a user's text; None for no rotation.
 
     Args:
         wish: Axis and angle as x,y,z,degrees; level; or None.
@@ -125,11 +125,11 @@ def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | 
 def turned_line(rotation: np.ndarray) -> str:
     """Return a line for the user on a rotation [3, 3]."""
     degrees = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
-    return f"turned by {degrees:.1f} degrees about the origin; export Gaussians and cameras with the same --rotate"
+    return f"rotated by {degrees:.1f} degrees about the origin; use the same --rotate for Gaussians and cameras"
 
 
 def rotate_camera(camera: Camera, rotation: np.ndarray) -> Camera:
-    """Return a camera turned about the origin with its scene by a rotation [3, 3]; both in the same units, numpy arrays."""
+    """Return a camera after a rotation [3, 3] of the scene about the origin; numpy arrays."""
     viewmat = np.array(camera.viewmat, np.float64)
     viewmat[:3, :3] = matmul(viewmat[:3, :3], rotation.T)
     return replace(camera, viewmat=viewmat)

@@ -40,16 +40,16 @@ def convert(
     """Write a file of Gaussians, or of cameras, in another format; returns lines for the user.
 
     Args:
-        source: The file to read; of cameras also a folder with a COLMAP reconstruction.
+        source: The file to read; for cameras also a folder with a COLMAP reconstruction.
         target: The file to write; its suffix selects the format.
         filters: Filters; cameras are rotated only.
-        formats: Formats that are taken where a file's name ends as their files do, as in `write_gaussians`, before any other.
+        formats: Formats that have priority for files with their suffix, as in `write_gaussians`.
 
     Raises:
-        DataError: The file cannot be read or is malformed, or nothing is left of it.
-        ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: A suffix is unknown, a given format is that of neither file, a filter is invalid, or needs the cameras
-            of a run.
+        DataError: The file cannot be read or is malformed, or no Gaussian is left.
+        ResourceError: Another process writes into the target's folder, or the target cannot be written.
+        UsageError: A suffix is unknown, a given format fits neither file, a filter is invalid, or a filter needs the cameras of
+            a run.
     """
     if holds_cameras(target):
         _check_for_cameras(filters, formats)
@@ -81,9 +81,9 @@ def export(
         format: Format to write, as in `write_gaussians`; None for the format of the suffix.
 
     Raises:
-        DataError: The folder is not a run, or nothing is left of its model.
-        ResourceError: Another process writes into the target's folder, or it cannot be written.
-        UsageError: The suffix has no format, or not the given one, or a filter is invalid.
+        DataError: The folder is not a run, or no Gaussian is left.
+        ResourceError: Another process writes into the target's folder, or the target cannot be written.
+        UsageError: The suffix has no format or does not fit the given one, or a filter is invalid.
     """
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))
@@ -100,7 +100,7 @@ def _written(
     """Filter Gaussians in file units, and write them; returns lines for the user."""
     gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned)
     if not len(gaussians):
-        raise DataError(f"{target}: not written, no Gaussian is left. Give a larger box, or --no-clean")
+        raise DataError(f"{target}: not written, because no Gaussian is left; give a larger --crop, or --no-clean")
     if kind.max_degree < gaussians.sh_degree:
         lines.append(f"harmonics above degree {kind.max_degree} are dropped, because {kind.suffix} files cannot store them")
         gaussians = limit_degree(gaussians, kind.max_degree)
@@ -138,7 +138,7 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
     """Check that only a rotation is requested.
 
     Raises:
-        UsageError: Another filter is, which cameras do not have, or a format of Gaussians.
+        UsageError: A filter other than a rotation, or a format of Gaussians, is requested.
     """
     if formats:
         raise UsageError("--format does not apply to cameras; leave it out")
@@ -147,7 +147,7 @@ def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
 
 
 def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, filters: Filters) -> list[str]:
-    """Turn cameras in file units, and write them; ``level`` are those that say where up is. Returns lines for the user."""
+    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user."""
     rotation, lines = rotation_of(filters.rotate, level), []
     if rotation is not None:
         cameras = [rotate_camera(c, rotation) for c in cameras]
@@ -156,4 +156,4 @@ def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, f
         lines += write_cameras(target, cameras)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
-    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px, named by number, in {target}"]
+    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}, named by numbers"]

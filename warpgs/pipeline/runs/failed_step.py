@@ -1,4 +1,4 @@
-"""The step with a non-finite loss, in one small file: enough to compute that loss again without the scene."""
+"""The step with a non-finite loss, in one small file, from which the loss can be computed again without the scene."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
 
     Args:
         trainer: The fit, in the state before the step.
-        view: Number of the step's view.
-        name: Its name.
-        slot: Its number among the views of the step.
+        view: Index of the step's view.
+        name: Name of the view.
+        slot: Index of the view among those of the step.
     """
     number = trainer.step + 1
     plan = trainer.plan_of(number)
@@ -71,7 +71,7 @@ def save_failed_step(path: Path, bundle: Bundle) -> None:
 
 
 def read_failed_step(path: Path, device: torch.device) -> Bundle:
-    """Read what `save_failed_step` wrote, tensors of shape [...] on a device.
+    """Read a file of `save_failed_step`; tensors, of shape [...], are on ``device``.
 
     Raises:
         DataError: The file is missing or not a failed step.
@@ -85,7 +85,7 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
     except OSError as e:
         raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give the {FILE} of a run folder") from e
     except (SafetensorError, KeyError, ValueError, RecursionError) as e:
-        raise DataError(f"{path}: not a failed step ({e}); give the {FILE} of a run folder") from e
+        raise DataError(f"{path}: not the inputs of a failed step ({e}); give the {FILE} of a run folder") from e
 
 
 def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
@@ -116,10 +116,9 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
 
 
 def findings(bundle: Bundle) -> list[str]:
-    """Compute a failed step again; returns a line for everything that it reads and computes, and whether that is finite.
+    """Compute a failed step again; returns a line for every input and result, with its range or its non-finite values.
 
-    Terms of the loss from outside warpgs are computed where their modules are loaded. The strategy's terms of the loss are not
-    computed.
+    User-defined loss terms are computed if their modules are loaded. The strategy's loss terms are not computed.
 
     Raises:
         DataError: A tensor or a value is missing or of another shape.
@@ -138,15 +137,15 @@ def findings(bundle: Bundle) -> list[str]:
                 continue
             of = torch.autograd.grad(value, list(params.values()), retain_graph=True, allow_unused=True)
             broken = [n for n, g in zip(params, of) if g is not None and not bool(torch.isfinite(g).all())]
-            lines += [f"    its gradient by {n} is not finite" for n in broken]
+            lines += [f"    gradient with respect to {n}: not finite" for n in broken]
         lines += [f"  view module {n}: {float(t.detach()):g}" for n, t in found.of_views.items()]
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as e:
-        raise DataError(f"the failed step is incomplete ({e!r}); fit again to write it again") from e
+        raise DataError(f"the stored step is incomplete ({e!r}); fit again to store it again") from e
     return lines
 
 
 def _state(values: torch.Tensor) -> str:
-    """Describe numbers: their range, or how many are not finite."""
+    """Describe values: their range, or the number of non-finite ones."""
     values = values.detach()
     if not values.numel():
         return "empty"

@@ -61,8 +61,8 @@ from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Camera, Scene
 
-COMPILING = "compiling kernels, once on this machine, a minute or two in all"
-"""Line on a wait for kernels."""
+COMPILING = "compiling kernels, once on this machine, for a minute or two"
+"""Message while kernels are compiled."""
 State = tuple[dict[str, torch.Tensor], dict[str, Any]]
 """Tensors and plain values of a checkpoint."""
 
@@ -131,7 +131,7 @@ def fit(
     """
     out = None if out is None else Path(out)
     if resume and out is None:
-        raise UsageError("resume needs the run folder that it continues: give out")
+        raise UsageError("resume requires out, the run folder to continue")
     check_overrides(overrides)
     config, origin = chosen_settings(preset, overrides)
     spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
@@ -164,7 +164,7 @@ def fit(
 def _opened(
     out: Path | None, resume: bool, verbose: bool | Literal["progress"]
 ) -> Iterator[tuple[list[str], Callable[[str], object], list[float]]]:
-    """Hold the run folder; yields notes on it, the function that shows progress, and seconds spent on compiling."""
+    """Lock the run folder; yields notes on it, the function that shows progress, and the time spent on compiling [s]."""
     nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
     folder = nothing if out is None else run_folder(out, resume)
     stages = Stages() if verbose else Stages(lambda line: None)
@@ -173,7 +173,7 @@ def _opened(
 
 
 def _settle(job: FitJob, time_budget: float | None) -> None:
-    """Put the scene over its background, and choose the settings that are left open."""
+    """Composite the scene over its background, and choose the automatic settings."""
     if time_budget is not None:
         job.config, note = within_budget(job.config, time_budget, job.train, job.device)
         job.notes.append(note)
@@ -182,12 +182,12 @@ def _settle(job: FitJob, time_budget: float | None) -> None:
     job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
     job.notes += [*([background] if background else []), *chosen]
     if job.config.antialiased:
-        job.notes.append("antialiased: other programs show exported files correctly only in their antialiased mode")
+        job.notes.append("antialiased: other programs must use their antialiased mode to show exported files correctly")
     check_renders(job.config.batch, job.config.steps or 0)
 
 
 def fit_request(request: FitRequest, **others: Any) -> FitResult:
-    """Run `fit` for the command line, a study or a farm; ``others`` are its on_model, on_step and ranks.
+    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`.
 
     Raises:
         KeyboardInterrupt: A signal ended the fit; the message explains how to continue.
@@ -211,7 +211,7 @@ def _scene_of(
     device: str,
     progress: Callable[[str], object],
 ) -> tuple[SceneRequest, Scene, Split, list[str]]:
-    """Read and split a scene that is given in one of four ways; its notes come last."""
+    """Read and split a scene that is given in one of four ways; returns it, the split and notes."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
         return SceneRequest("", spec, 1).with_scale(device), scene, split, [*scene.notes, *notes]
@@ -238,7 +238,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
     with background_warmup(c, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
-            job.notes.append(f"camera model {models}: photographs are not compared; coverage is not measured")
+            job.notes.append(f"camera model {models}: photographs cannot be compared, so coverage is not measured")
         else:
             job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background
@@ -249,7 +249,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
 
 
 def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
-    """Take the steps, score the model, and write the run folder where there is one."""
+    """Take the steps, score the model, and write the run folder, if any."""
     if job.out is not None and not resume:
         write_json(job.out / CONFIG, record)
     if state is not None:

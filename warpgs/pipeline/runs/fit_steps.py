@@ -1,4 +1,4 @@
-"""The steps of a fit in its run: progress for the user, log, checkpoints, and the end of a fit that is not finite."""
+"""The steps of a fit: progress for the user, log, checkpoints, and the end of a fit with a non-finite loss."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Names = tuple[str, ...]
 
 
 class RunRecorder:
-    """Log and checkpoints of a fit in its run folder; without a folder it keeps nothing."""
+    """Log and checkpoints of a fit in its run folder; nothing is written without a folder."""
 
     def __init__(self, job: FitJob, step: int, images_written: Callable[[], None]):
         """Open the log after ``step``; ``images_written`` waits for the images before a checkpoint is written."""
@@ -52,7 +52,7 @@ class RunRecorder:
         save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
 
     def restore(self, trainer: Trainer) -> bool:
-        """Load the last checkpoint, and cut the log back to it; returns False without one."""
+        """Load the last checkpoint, and truncate the log to it; returns False without a checkpoint."""
         out = self.job.out
         if out is None or self.log is None or not (out / TENSORS).is_file():
             return False
@@ -73,7 +73,7 @@ class StepTeller:
         """Start before the first step; ``progress`` is None for a fit that shows none."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
-        """The last step that compiled kernels and so took longer; the number of kernels compiled by then."""
+        """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""
 
     def __call__(self, r: StepReport) -> None:
         """Take one report."""
@@ -96,7 +96,7 @@ class StepTeller:
 
 
 def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
-    """Take all remaining steps, with a log and checkpoints where there is a run folder; images come before a checkpoint.
+    """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
 
     Raises:
         NotFiniteError: A loss or the state is not finite; with a run folder the state before is saved.
@@ -126,15 +126,15 @@ def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteErr
     save_failed_step(out / FAILED, failed_step(trainer, error.view, name, error.slot))
     return NotFiniteError(
         f"{error}, on {name}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` names the non-finite values. --resume repeats the same step; fit again into a new --out with "
-        "lower learning rates"
+        f"{out / FAILED}` names the non-finite values. --resume would fail at the same step; fit again into a new --out "
+        "with lower learning rates"
     )
 
 
 def model_fields(
     job: FitJob, trainer: Trainer
 ) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
-    """Return the fields of the `FittedModel` that a fit has by now."""
+    """Return the fields of the current `FittedModel` of a fit."""
     cameras = cameras_of(job.scene)
     names, rule = (job.split.train, job.split.test), job.config.rule
     return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step

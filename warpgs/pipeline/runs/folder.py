@@ -1,4 +1,4 @@
-"""Run folders: what config.json records, the format it is in, and reading a run back."""
+"""Run folders: contents and format of config.json, and reading of runs."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from warpgs.version import __version__
 
 CONFIG = "config.json"
 METRICS_FILE = "metrics.json"
-"""Scores, sizes and times, which a fit writes at its end."""
+"""File of scores, sizes and times, written at the end of a fit."""
 IMAGE_FOLDERS = ("renders", "depth", "coverage", "sampling")
 """Folders in a run folder with the images that its fit writes."""
 POSED_SCENE = "scene"
-"""Folder in a run folder with the scene that was made of photographs without cameras."""
+"""Folder in a run folder with the scene made from photographs without cameras."""
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of everything that a result depends on, by name."""
+    """Return the versions of all software that a result depends on, by name."""
     names = ("torch", "warp-lang", "numpy", "opencv-contrib-python-headless", "scikit-image", "safetensors")
     found = {"warpgs": __version__, "python": platform.python_version(), "system": platform.platform(terse=True)}
     for name in names:
@@ -55,14 +55,14 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
-    """Hold a run folder for a fit: a new or an empty one, or one with a run to continue; yields notes for the user.
+    """Lock a run folder for a fit: a new or empty one, or one with a run to continue; yields notes for the user.
 
-    One that holds found poses alone, as a fit leaves it that ended before its first step, is taken in both cases.
+    A folder with found poses only, from a fit that ended before its first step, is accepted in both cases.
 
     Raises:
         FolderHeldError: Another process writes into the folder.
-        ResourceError: It cannot be written.
-        UsageError: The folder holds something already, or no run to continue.
+        ResourceError: The folder cannot be written.
+        UsageError: The folder is not empty, or has no run to continue.
     """
     _check_folder(out, resume)
     with hold_folder(out, *IMAGE_FOLDERS) as notes:
@@ -71,7 +71,7 @@ def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
 
 
 def _check_folder(out: Path, resume: bool) -> None:
-    """Raise a UsageError for a folder that holds no run to continue, or that must be new and is not."""
+    """Raise a UsageError if a folder has no run to continue, or must be new but is not."""
     try:
         if not (out / CONFIG).exists() and (out / POSED_SCENE / POSES).is_file():
             return
@@ -91,7 +91,7 @@ def camera_values(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any]) -> Camera:
-    """Return the camera of values that `camera_values` made; UsageError where its model is missing."""
+    """Return the camera from the result of `camera_values`; UsageError if its camera model is missing."""
     arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
     camera = Camera(**(values | arrays))
     check_camera(camera)
@@ -99,7 +99,7 @@ def _camera(values: dict[str, Any]) -> Camera:
 
 
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
-    """Return cameras by name that a file holds; DataError where a model is missing."""
+    """Return the cameras of a file by name; DataError if a camera model is missing."""
     try:
         return {n: _camera(c) for n, c in stored.items()}
     except UsageError as e:
@@ -124,11 +124,11 @@ def record_of(
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read config.json of a run folder, its format first.
+    """Read config.json of a run folder; its format is checked first.
 
     Raises:
-        DataError: The folder is not a run, its record is incomplete, or another version of warpgs wrote it in a format that
-            this one does not read; the message names that version and the remedy.
+        DataError: The folder is not a run, its record is incomplete, or another version of warpgs wrote it in an unsupported
+            format; the message names that version and the fix.
     """
     path = folder / CONFIG
     try:
@@ -152,19 +152,19 @@ def read_record(folder: Path) -> dict[str, Any]:
     try:
         check_record(record)
     except schema.SchemaError as e:
-        raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again into a new --out") from e
+        raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again into a new --out") from e
     return record
 
 
 def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> None:
-    """Check that a continued run is the same run: same data, views, settings and kind of device.
+    """Check that a continued run has the same data, views, settings, user code and kind of device as before.
 
     Raises:
-        UsageError: It is another, or code of the user's own is not named again.
+        UsageError: The run differs, or its user code is not named again.
     """
     if "pruned" in stored:
         raise UsageError(
-            f"--resume: {out} is a pruned model without the state of its fit; continue the run it came from, "
+            f"--resume: {out} is a pruned model without the state of its fit; resume the original run, "
             f"{stored['pruned']['source']}"
         )
     _check_named_again(record["config"], stored["config"], out)
@@ -173,8 +173,8 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
         if now != then:
             if key == "own_code":
                 raise UsageError(
-                    f"--resume: the code of {', '.join(now or then or {})} was edited since the run in {out} began, or its "
-                    "version is not recorded; restore that file, or give a new --out"
+                    f"--resume: the code of {', '.join(now or then or {})} has changed since the run in {out} began, or the "
+                    "run did not record its version; restore the code, or give a new --out"
                 )
             if isinstance(now, dict) and isinstance(then, dict):
                 changed = [k for k in now if now[k] != then.get(k)]
@@ -187,7 +187,7 @@ def check_same(record: dict[str, Any], stored: dict[str, Any], out: Path) -> Non
             was = f" ({', '.join(o for o in options if not o.startswith('path '))})" if key != "device" else ""
             raise UsageError(
                 f"--resume: {words.get(key, key)} differs from the run in {out}{was if len(was) > 3 else ''}. To continue with "
-                f"the flags that it was started with, use only --out {shlex.quote(str(out))} --resume; else give a new --out"
+                f"the run's own flags, give only --out {shlex.quote(str(out))} --resume; for other flags, give a new --out"
             )
 
 
@@ -195,7 +195,7 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
     """Check that a checkpoint belongs to the fit of its config.json: same settings, data and training views.
 
     Raises:
-        DataError: It is of another.
+        DataError: The checkpoint belongs to another fit.
     """
     for key in ("config", "fingerprint", "train"):
         found, wanted = plain(state.get(key)), stored.get(key)
@@ -204,12 +204,12 @@ def check_checkpoint(state: dict[str, Any], stored: dict[str, Any], out: Path) -
                 key = ", ".join(k for k in {**found, **wanted} if found.get(k) != wanted.get(k))
             raise DataError(
                 f"--resume: {out / TENSORS} and {CONFIG} beside it belong to different fits: {key} differs. Restore both "
-                "from the same run, or fit again into a new --out"
+                "files of one run, or fit again into a new --out"
             )
 
 
 def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> None:
-    """Raise a UsageError where a run used code from outside warpgs that is not named again."""
+    """Raise a UsageError if a run used code from outside warpgs that is not named again."""
 
     def outside(config: dict[str, Any]) -> dict[str, list[str]]:
         names = {"--strategy": [config.get("strategy")]}
@@ -220,8 +220,8 @@ def _check_named_again(now: dict[str, Any], then: dict[str, Any], out: Path) -> 
     for flag, names in outside(then).items():
         if set(names) - set(outside(now)[flag]):
             raise UsageError(
-                f"--resume: the run in {out} was fitted with {', '.join(names)}, code from outside warpgs. A run folder never "
-                f"decides which code is loaded: name it again with {flag} {','.join(names)}"
+                f"--resume: the run in {out} was fitted with user code. A run folder never decides which code is loaded; give "
+                f"{flag} {','.join(names)} again"
             )
 
 
@@ -238,8 +238,8 @@ class StoredRun(FittedModel):
         """Return a note for the user if the fit has not ended; nothing for a finished or a pruned run."""
         if "pruned" in self.record or (self.folder / METRICS_FILE).is_file():
             return []
-        why = f"unfinished, the fit stopped after step {self.step:,}"
-        return [f"{self.folder}: {why}; to finish it, repeat its command with --resume"]
+        why = f"the fit stopped after step {self.step:,}"
+        return [f"{self.folder}: {why}; to finish, repeat the fit's command with --resume"]
 
     def scene_request(self, reader: str | None = None) -> SceneRequest:
         """Return the fitted scene with the options for reading it.
@@ -259,21 +259,21 @@ def _stored_scene(folder: Path, record: dict[str, Any], reader: str | None) -> S
     """Return the scene of a run's record, as `StoredRun.scene_request` does."""
     if record["scene"]["path"] is None:
         raise DataError(
-            f"{folder}: its scene was passed from Python and has no folder; score the model there with warpgs.evaluate"
+            f"{folder}: the scene was passed from Python and has no folder; score the model in Python with warpgs.evaluate"
         )
     request = SceneRequest(**record["scene"])
     if not os.path.exists(request.path) and (folder / POSED_SCENE / POSES).is_file():
         request = replace(request, path=str(folder / POSED_SCENE))  # the run folder was moved, and its scene with it
     if request.reader is not None and ":" in request.reader and reader != request.reader:
         raise UsageError(
-            f"{folder}: its scene was read with {request.reader}, code from outside warpgs. A run folder never decides which "
-            f"code is loaded: name it again with --reader {request.reader}"
+            f"{folder}: the scene was read with user code. A run folder never decides which code is loaded; give --reader "
+            f"{request.reader} again"
         )
     return request
 
 
 def stored_request(folder: Path) -> FitRequest:
-    """Return the request that continues a run, with everything as the run was started.
+    """Return the request that continues a run, with the scene and all settings that the run was started with.
 
     Raises:
         DataError: The folder is not a run, its settings are invalid, or its scene was passed from Python.
@@ -284,11 +284,11 @@ def stored_request(folder: Path) -> FitRequest:
         scene = _stored_scene(folder, record, None)
         _check_named_again({}, record["config"], folder)
     except UsageError as e:
-        raise UsageError(f"{e}, beside the scene and all other flags that the run was started with") from e
+        raise UsageError(f"{e}, with the scene and all other flags of the run") from e
     try:
         config = FitConfig.from_json(record["config"])
     except (UsageError, schema.SchemaError) as e:
-        raise DataError(f"{folder / CONFIG}: its settings are invalid ({e}); restore it, or fit the scene again") from e
+        raise DataError(f"{folder / CONFIG}: invalid settings ({e}); restore the file, or fit the scene again") from e
     return FitRequest(scene, folder, config, record["device"], resume=True)
 
 
@@ -322,15 +322,15 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
 
 
 def _model_of(tensors: dict[str, torch.Tensor], state: dict[str, Any], path: Path) -> tuple[Gaussians, int]:
-    """Return the Gaussians of a checkpoint and the number of steps done; DataError where the two are not in it."""
+    """Return the Gaussians of a checkpoint and the number of steps done; DataError if either is missing."""
     try:
         MODEL_STATE(state, "")
     except schema.SchemaError as e:
-        raise DataError(f"{path}: its state is incomplete or damaged: {e}; restore it, or fit the scene again") from e
+        raise DataError(f"{path}: stored state incomplete or damaged: {e}; restore the file, or fit the scene again") from e
     found = {n.removeprefix("params."): t for n, t in tensors.items() if n.startswith("params.")}
     if "sh_packed" in found and "degrees" in tensors:
         try:
             found["sh"] = unpack(found.pop("sh_packed"), tensors["degrees"])
         except ValueError as e:
-            raise DataError(f"{path}: incomplete or damaged: {e}; restore it, or fit the scene again") from e
+            raise DataError(f"{path}: incomplete or damaged: {e}; restore the file, or fit the scene again") from e
     return checked_gaussians(found, str(path)), state["step"]

@@ -1,4 +1,4 @@
-"""Rendered depth and normals of training views beside those that were given, in figures for metrics.json and the report."""
+"""Comparison of rendered with given depth and normals of training views, for metrics.json and the report."""
 
 from __future__ import annotations
 
@@ -27,13 +27,14 @@ def given_figures(
 
     Args:
         train: The views to fit.
-        views: The same with the maps of the loss terms.
+        views: The same views, with the maps of the loss terms.
         gaussians: The fitted model.
-        options: Settings of its renders.
+        options: Options for rendering it.
 
     Returns:
-        By ``depth`` and ``normals``, each only where a loss term compared it: ``views`` with name, fraction of the pixels with
-        a map and median difference (relative, and in degrees), NaN where nothing was rendered; and ``summary``.
+        For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a
+        given value, and median difference (relative for depth, in degrees for normals; NaN without rendered pixels); and
+        ``summary``.
     """
     rows: dict[str, list[dict[str, Any]]] = {"depth": [], "normals": []}
     for view, mapped in zip(train, views, strict=True):
@@ -57,8 +58,8 @@ def given_figures(
             cosine = (given[both] * found[both]).sum(-1).clip(-1, 1)
             rows["normals"].append(_row(view.name, at, np.degrees(np.arccos(cosine))))
     words = {
-        "depth": "given depth: rendered depth differs from it by {:.2%} in the median (worst view {:.2%})",
-        "normals": "given normals: those of rendered depth differ by {:.1f} degrees in the median (worst view {:.1f})",
+        "depth": "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})",
+        "normals": "given normals: median difference of the normals of rendered depth {:.1f} degrees (worst view {:.1f})",
     }
     found = {}
     for name, own in rows.items():
@@ -66,7 +67,7 @@ def given_figures(
             continue
         off = [r["difference"] for r in own if np.isfinite(r["difference"])] or [float("nan")]
         share = float(np.mean([r["coverage"] for r in own]))
-        summary = f"{words[name].format(float(np.median(off)), max(off))}, at {share:.1%} of the pixels of {len(own)} views"
+        summary = f"{words[name].format(float(np.median(off)), max(off))}, over {share:.1%} of the pixels of {len(own)} views"
         found[name] = {"views": own, "summary": summary}
     return found
 

@@ -57,7 +57,7 @@ class FitJob:
 
     @property
     def other_models(self) -> list[str]:
-        """Camera models of the views without a pinhole of the same K, which no comparison of views can take."""
+        """Camera models that have no pinhole of the same K; views with these models cannot be compared."""
         return sorted({v.camera.model for v in self.scene.views} - {*CENTRAL})
 
     def say(self, line: str) -> None:
@@ -66,13 +66,13 @@ class FitJob:
             say(line)
 
     def note(self, line: str) -> None:
-        """Keep a line for the report, and print it where a user may act on it."""
+        """Keep a line for the report, and print it unless it is a detail."""
         self.notes.append(line)
         if not isinstance(line, Detail):
             self.say(f"  {line}")
 
     def announce(self, notes: list[str]) -> None:
-        """Print the scene, and every choice made for the user so far, ``notes`` last."""
+        """Print the scene and all automatic choices so far, ``notes`` last."""
         before, self.notes = self.notes, []
         camera = self.train[0].camera
         size = f"{camera.width} x {camera.height} px"

@@ -1,4 +1,4 @@
-"""Cameras of a run's views as its view modules have learned them, and figures of the modules for the report."""
+"""Cameras of a run's views after its view modules, and values of the modules for the report."""
 
 from __future__ import annotations
 

@@ -63,12 +63,12 @@ def mesh(
         up = common_up(cameras)
         write_mesh(target, made, up)
     if up is None and target.suffix.lower() == ".glb":
-        notes = [*notes, "the cameras have no common upward direction, so the mesh may be rotated in a viewer"]
+        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
     return [*run.notes(), *notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
 
 
 def _lines(found: FusedMesh, views: int) -> list[str]:
-    """Return the size of a mesh as a line for the user."""
+    """Return lines for the user on the size and the coverage of a mesh."""
     mesh, lines = found.mesh, []
     lines.append(
         f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; "
@@ -79,5 +79,5 @@ def _lines(found: FusedMesh, views: int) -> list[str]:
         "the mesh is open there"
     )
     if found.uncolored:
-        lines.append(f"{found.uncolored:,} vertices without an observed colour have that of their nearest neighbour")
+        lines.append(f"{found.uncolored:,} vertices without an observed colour take that of the nearest vertex with one")
     return lines

@@ -1,4 +1,4 @@
-"""Files of Gaussians, trained anywhere, with cameras from another file: models that render as runs do."""
+"""Files of Gaussians, trained with any program, with cameras from another file: models that render like runs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warpgs.rules import rule_named
 from warpgs.scene import Camera, Normalization
 
 RULE = "inria"
-"""Rule that files of Gaussians are rendered with where none is named: most were trained with it."""
+"""Default rule for files of Gaussians: most models were trained with it."""
 
 
 def open_file(
@@ -29,17 +29,17 @@ def open_file(
     device: str = "auto",
     antialiased: bool = False,
 ) -> tuple[FittedModel, list[str]]:
-    """Read a file of Gaussians and the cameras that it is seen through; returns the model and notes for the user.
+    """Read a file of Gaussians and a file of cameras; returns the model and notes for the user.
 
     Args:
         path: The file, in any format of `warpgs.export.formats`.
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
-        rule: Name of the cut-offs that it was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
+        rule: Name of the cut-offs of its training: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
         antialiased: True for a model that was trained with `RasterizeOptions.antialiased`, if its file does not declare it.
 
     Raises:
-        DataError: The model or the cameras cannot be read, or an image would be larger than any photograph may be.
+        DataError: The model or the cameras cannot be read, or an image would be larger than the limit for photographs.
         ResourceError: The device is missing.
         UsageError: No cameras are given, or the rule is unknown.
     """
@@ -53,7 +53,7 @@ def open_file(
     for name, c in found.items():
         if c.width * c.height > MAX_PIXELS:
             raise DataError(
-                f"{cameras}, {name}: an image of {c.width} x {c.height} px has more than {MAX_PIXELS:,} pixels; write less"
+                f"{cameras}, {name}: an image of {c.width} x {c.height} px has over {MAX_PIXELS:,} pixels; give a smaller size"
             )
     # the unit stays that of the file, since the near plane of a rule is in that unit
     normalization = Normalization(np.mean([c.center for c in found.values()], axis=0))
@@ -61,9 +61,9 @@ def open_file(
     gaussians = gaussians.to(where)
     notes += [note] if (note := format_of(path).note) else []
     if declared:
-        notes.append(f"{path.name} is antialiased, and so are its renders, with a pixel filter of {LOW_PASS:g} px²")
+        notes.append(f"{path.name} declares an antialiased model; renders use a pixel filter of {LOW_PASS:g} px²")
     if rule is None:
-        notes.append(f"rendered by the cut-offs of {RULE}; --rule gsplat-1.6 or gsplat-1.5 suits models of gsplat")
+        notes.append(f"rendered with the cut-offs of {RULE}; for models of gsplat, give --rule gsplat-1.6 or gsplat-1.5")
     in_scene = {name: convert_camera(c, normalization, "file", "scene") for name, c in found.items()}
     shown = (in_scene, tuple(in_scene), (), rule or RULE, (0.0, 0.0, 0.0), 0)
     model = FittedModel(gaussians, normalization, *shown, antialiased=antialiased or declared)

@@ -1,4 +1,4 @@
-"""Plots of a run: its cameras among its Gaussians or start points, in their colours or by how many views saw them."""
+"""Plots of a run: its cameras with its Gaussians or initial points, in their own colours or coloured by coverage."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ SIZES = (64, 8192)
 MIN_OPACITY = 0.1
 """Least opacity of a Gaussian that is shown: fainter ones are invisible."""
 MAX_POINTS = {"gaussians": 50_000, "start": 300_000}
-"""Number of Gaussians and of points shown; of more, a sample."""
+"""Largest number of Gaussians and of points shown; of more, a random sample is shown."""
 CLASSES = (
     (0, "seen by no training view", "#d6219c"), (1, "by 1", "#f0a020"), (2, "by 2", "#a6bf3a"), (3, "by 3 to 5", "#2fa37c"),
     (6, "by 6 and more", "#2878b5"),
 )  # fmt: skip
-"""Least number of training views, words and colour of each class of coverage."""
+"""Least number of training views, description and colour of each class of coverage."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class PlotSettings:
     size: tuple[int, int] = (1600, 1000)
     """Width and height [px]."""
     cameras: bool = True
-    """True where cameras are shown."""
+    """True to show cameras."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work.
@@ -66,7 +66,7 @@ class PlotSettings:
         if not all(SIZES[0] <= s <= SIZES[1] for s in self.size):
             raise UsageError(f"--size {self.size[0]} {self.size[1]}: each side must have {SIZES[0]} to {SIZES[1]} px")
         if self.points == "start" and self.color == "coverage":
-            raise UsageError("--color coverage: coverage is measured of Gaussians; leave out --points start")
+            raise UsageError("--color coverage needs Gaussians; leave out --points start")
 
 
 def _gaussians(stored: StoredRun, train: list[Camera], by_coverage: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ def _start(stored: StoredRun) -> tuple[np.ndarray, np.ndarray, None]:
 
 
 def _eye(rig: Rig) -> np.ndarray:
-    """Return the direction [3] from the scene to the eye: aslant from above, behind cameras that look to one side."""
+    """Return the direction [3] from the scene to the viewer: from above at an angle, behind cameras that look to one side."""
     azimuth = 0.0 if rig.span is None else 0.5 * (rig.span[0] + rig.span[1])
     return rig.direction(azimuth + 0.7, max(rig.elevation + 0.35, 0.5))
 
@@ -106,17 +106,17 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     Args:
         folder: The run folder.
         out: File to write, .png; None for plot.png in the run folder.
-        settings: Contents and looks.
+        settings: Settings of the plot.
         device_name: auto, cpu or cuda.
 
     Raises:
         DataError: The folder is not a run, or the scene has no points to show.
         ResourceError: This machine cannot render, or the file cannot be written.
-        UsageError: The file is no .png.
+        UsageError: The file is not a .png file.
     """
     out = folder / PLOT if out is None else out
     if out.suffix.lower() != ".png":
-        raise UsageError(f"{out}: a plot is a .png file; name one")
+        raise UsageError(f"{out}: a plot is a .png file; give a name that ends in .png")
     stored, tell = open_run(folder, device_name), waiting()
     tell("rendering depth")
     cameras = stored.cameras()
@@ -128,14 +128,14 @@ def plot(folder: Path, out: Path | None, settings: PlotSettings, device_name: st
     if not len(points):
         raise DataError(f"{folder}: no Gaussian has an opacity of {MIN_OPACITY} or more; there is nothing to show")
     most = MAX_POINTS[settings.points]
-    notes = stored.notes() + ([] if len(points) <= most else [f"a sample of {most:,} of {len(points):,} is shown"])
+    notes = stored.notes() + ([] if len(points) <= most else [f"showing a random sample of {most:,} of {len(points):,}"])
     chosen = np.sort(np.random.default_rng(0).permutation(len(points))[:most])
     shown = (train, test) if settings.cameras else ([], [])
     legend = [(words, color) for _, words, color in CLASSES] if by_coverage else []
     axes = None if axes is None else axes[chosen]
     contents = ScenePlot(points[chosen], colors[chosen], axes, *shown, rig.up, _eye(rig), legend)
     with hold_file(out) as held:
-        tell("drawing the plot")
+        tell("rendering the plot")
         write_bytes(out, render_plot(contents, settings.size, settings.background))
     faint = f"Gaussians of opacity {MIN_OPACITY:g} or more"
     what = "points of the reconstruction" if settings.points == "start" else faint

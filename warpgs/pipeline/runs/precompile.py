@@ -50,9 +50,9 @@ CAMERA_MODEL = "pinhole"
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
-    """Return a kernel of each module that a fit on such a device launches, with the size of the blocks of its launches.
+    """Return a kernel of each module that a fit on such a device launches, with the block size of its launches.
 
-    On CUDA a module is compiled once for each size. Scores are computed on the CPU wherever the fit ran.
+    On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
     """
     real = wp.float32
     common = [
@@ -102,13 +102,13 @@ class Precompiled:
     device: str
     """cpu, or the name of the CUDA device."""
     kernel: str
-    """File and name of one of its kernels."""
+    """File and name of one kernel of the module."""
     block: int
-    """Threads of a block that it was compiled for."""
+    """Threads of a block that the module was compiled for."""
     compiled: bool
-    """False where the cache had it already."""
+    """False if the cache already had the module."""
     seconds: float
-    """Time to compile and load it [s]."""
+    """Time to compile and load the module [s]."""
 
 
 def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
@@ -121,7 +121,7 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Pr
     """Compile the modules that are not cached, and yield each when it is done.
 
     Args:
-        devices: Where; None for the CPU and every CUDA device that torch sees.
+        devices: Devices to compile for; None for the CPU and every CUDA device that torch sees.
 
     Raises:
         RuntimeError: A kernel does not compile.
@@ -139,7 +139,7 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Pr
 
 
 def print_warming(devices: list[torch.device] | None = None) -> None:
-    """Warm the cache, with a line for each module that was compiled and a sum at the end."""
+    """Warm the cache; returns a line for each compiled module, and a summary."""
     began, results = time.perf_counter(), []
     for w in precompile_kernels(devices):
         results.append(w)
@@ -149,6 +149,6 @@ def print_warming(devices: list[torch.device] | None = None) -> None:
     compiled, folder = [w for w in results if w.compiled], Path(wp.config.kernel_cache_dir)
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     say(
-        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were there, "
+        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were in the cache, "
         f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
     )

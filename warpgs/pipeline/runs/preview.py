@@ -1,4 +1,4 @@
-"""Images of the priors of a scene's training views, to look at before a fit relies on them."""
+"""Images of the priors of a scene's training views, to inspect before a fit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SOURCES = ("sweep", "flow")
 
 
 def prior_sheet(view: View, prior: Prior) -> np.ndarray:
-    """Return one sheet, [rows, columns, 3] in [0, 1]: image, the four maps, and the two scores that follow from them."""
+    """Return one sheet, [rows, columns, 3] in [0, 1]: image, the four maps, and the two scores computed from them."""
     curvature = ImportanceConfig().curvature
     disparity, *semantics = map(torch.from_numpy, (prior.disparity, prior.confidence, prior.boundary, prior.foreground))
     tiles = [
@@ -52,7 +52,7 @@ def show_priors(request: SceneRequest, config: PriorConfig, source: str, out: Pa
     Args:
         request: The scene and its split.
         config: Networks for the priors.
-        source: Method that finds depth in other views where no depth network is named: sweep or flow.
+        source: Method to find depth from other views if no depth network is given: sweep or flow.
         out: Folder for the sheets.
         threads: CPU threads of the networks; 0 for as many as there are cores.
 

@@ -45,7 +45,7 @@ def mean_psnr(gaussians: Gaussians, views: list[View], options: RasterizeOptions
 
 
 def _new_folder(folder: Path, out: Path | None) -> Path:
-    """Return the folder to write; UsageError where it exists already, or cannot be made."""
+    """Return the folder to write; UsageError if it exists already or cannot be made."""
     out = folder.resolve().with_name(f"{folder.resolve().name}-pruned") if out is None else out
     if os.path.exists(out):
         raise UsageError(f"{out} exists already; choose another --out")
@@ -55,7 +55,7 @@ def _new_folder(folder: Path, out: Path | None) -> Path:
 
 
 def _write(out: Path, record: dict[str, Any], made: compress.Pruned, step: int, normalization: Normalization) -> list[str]:
-    """Write the new run folder, whole or not at all; returns notes for the user."""
+    """Write the new run folder atomically; returns notes for the user."""
     tensors = {f"params.{n}": t for n, t in made.gaussians.tensors().items() if n != "sh"}
     tensors |= {"params.sh_packed": pack(made.gaussians.sh, made.degrees), "degrees": made.degrees}
     with hold_folder(out.parent) as notes:
@@ -74,8 +74,8 @@ def prune(
 ) -> list[str]:  # fmt: skip
     """Shrink a run's model so that the mean PSNR over its training views falls by no more than ``keep_psnr`` [dB].
 
-    The new folder holds config.json, a checkpoint that stores each Gaussian's real degree, and the PLY file; `warpgs eval`,
-    `render` and `export` take it as they take the run.
+    The new folder has config.json, a checkpoint with each Gaussian's own degree, and the PLY file; `warpgs eval`, `render` and
+    `export` accept it like the original run.
 
     Args:
         folder: The run folder, which is not changed.
@@ -94,7 +94,7 @@ def prune(
         UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
     """
     if not 0 < keep_psnr < math.inf:
-        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 is invisible")
+        raise UsageError(f"--keep-psnr must be above 0 dB, not {keep_psnr}; a loss of 0.1 dB is invisible")
     device, _ = choose_device(device_name)
     stored = open_run(folder, device)
     out = _new_folder(folder, out)
@@ -132,14 +132,12 @@ def prune(
 def _pruned(
     stored: StoredRun, train: list[View], options: RasterizeOptions, keep_psnr: float, tell: Callable[[str], object]
 ) -> compress.Pruned:
-    """Prune the model of a run; DataError where its PSNR on the training views is not finite."""
+    """Prune the model of a run; DataError if its PSNR on the training views is not finite."""
     before = stored.gaussians()
     device = before.means.device
     whole = mean_psnr(before, train, options)
     if not math.isfinite(whole):
-        raise DataError(
-            f"{stored.folder}: its PSNR on the training views is {whole} dB, so no loss of it can be kept small; fit again"
-        )
+        raise DataError(f"{stored.folder}: training PSNR is {whole} dB, so its loss cannot be limited; fit again")
     kinds = torch.zeros(len(before), dtype=torch.int64, device=device)
     view_set = compress.ViewSet([TrainingView.of(v, device).camera for v in train], options, stored.record["config"]["seed"])
     tried = itertools.count(1)

@@ -1,4 +1,4 @@
-"""Requests for a fit, and the scene and the device that they name."""
+"""Requests for a fit, with their scene and device."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Scene
 
 CPU_MAX_SIDE = 800
-"""Default of the longest side of an image [px] for a fit on a CPU: four times as many steps fit into its time, and held-out
-PSNR at full size rises (decision 018)."""
-NO_SCORES = "no scores: all photographs train; --split every:8 holds some out"
-"""Sentence on a fit without held-out views, with the way to scores."""
+"""Default of the longest side of an image [px] for a fit on a CPU: four times as many steps fit into the time limit, and
+held-out PSNR at full size rises (decision 018)."""
+NO_SCORES = "no scores: all photographs are training views; hold some out with --split every:8"
+"""Note on a fit without held-out views."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class SceneRequest:
     """Scene folder in a supported format; or a folder of photographs or a video, without cameras."""
     # empty where a scene was passed from Python
     split: str | None = None
-    """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (trains on all), or
-    train=NAMES;test=NAMES. None: all train; a study holds out every 8th view or the middle one."""
+    """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (all views train), or
+    train=NAMES;test=NAMES. None: a fit trains on all views; a study holds out every 8th view or the middle one."""
     downscale: int | None = None
     """Factor by which both image sides shrink; None for 1."""
     strict: bool = False
@@ -45,13 +45,13 @@ class SceneRequest:
     mask_keeps: str = "white"
     """Colour of a mask file that keeps a pixel: white or black."""
     black_is_empty: bool = True
-    """Make dark pixels around an object transparent, if every image shows an object on black."""
+    """Make dark pixels around the object transparent, if every image shows an object on a black background."""
     score_masks: str | None = None
     """Folder of object masks for scoring, matched by image id; None for the scene's own idrmasks, if any."""
     reader: str | None = None
     """Name of the scene's format, or your own reader as module:Class or path/to/file.py:Class; None to detect the format."""
     max_pixels: int = MAX_PIXELS
-    """Largest number of pixels that an image or a mask may have as stored."""
+    """Largest number of pixels of a stored image or mask."""
     max_side: int | None = None
     """Largest image side [px], 0 for no limit; None for no limit with --downscale, else for 1600, or 800 in a fit on a CPU."""
     lenses: str = "undistort"
@@ -59,7 +59,7 @@ class SceneRequest:
     lens). Fisheyes need native."""
     depths: str | None = None
     """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
-    Default: those named in transforms.json; none to ignore these."""
+    Default: the maps named in transforms.json; none ignores these."""
     normals: str | None = None
     """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, as for --depths."""
     depth_kind: str = "metric"
@@ -70,11 +70,10 @@ class SceneRequest:
     normal_axes: str = "opencv"
     """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
     matcher: str | None = None
-    """ONNX file of `warpgs priors export --model xfeat`, which is used if SIFT leaves photographs without a pose; None for SIFT
-    only."""
+    """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
     def with_scale(self, device: str) -> SceneRequest:
-        """Return this request with its size of images in numbers, as a run on ``device``, cpu or cuda, remembers it."""
+        """Return this request with default image sizes resolved for ``device``, cpu or cuda, to store it with a run."""
         side = CPU_MAX_SIDE if device == "cpu" and self.max_side is None and self.downscale is None else self.max_side
         downscale, max_side = image_scale(self.downscale, side)
         return replace(self, downscale=downscale, max_side=max_side)
@@ -99,21 +98,21 @@ class FitRequest:
     notes: tuple[str, ...] = ()
     """Choices made for the user while the request was read."""
     view_port: int | None = None
-    """Port at which the command line shows the model while it trains; None for no viewer."""
+    """Port of the viewer that the command line opens during the fit; None for no viewer."""
 
 
 def check_overrides(overrides: Mapping[str, object]) -> None:
     """Check that keywords of a fit are not options of `load_scene`.
 
     Raises:
-        UsageError: One is.
+        UsageError: A keyword is an option of `load_scene`.
     """
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
         raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to warpgs.load_scene and fit its result")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
-    """Return the device for auto, cpu, cuda or cuda:N, or a device itself, and a phrase that names it.
+    """Return the device for auto, cpu, cuda or cuda:N, or a given device itself, and a phrase for the user.
 
     Raises:
         ResourceError: CUDA was requested and is missing.
@@ -150,17 +149,19 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 
     Raises:
         DataError: A view that is named is missing.
-        UsageError: The split is not understood.
+        UsageError: The split is invalid.
     """
     split = split_views(scene, "all" if spec is None else spec)
     notes = [] if split.test else [NO_SCORES]
     if (spec or "").startswith("dtu:") and any(v.mask is not None for v in scene.views):
         notes.append(
-            "masks hide pixels from the fit, which the published DTU protocol does not do: object masks that only scores "
-            "should see belong into a folder idrmasks, or behind --score-masks"
+            "masks hide pixels from the fit, unlike in the published DTU protocol; put object masks for scoring only into a "
+            "folder idrmasks, or give them with --score-masks"
         )
     for test, train in coincident_views(scene, split):
-        notes.append(f"{test} is held out, but {train} was taken from the same place: its score does not measure new views")
+        notes.append(
+            f"{test} is held out, but training view {train} is at the same place, so the score is not that of a new view"
+        )
     return split, notes
 
 

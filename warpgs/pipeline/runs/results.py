@@ -64,7 +64,7 @@ def score_keys(metrics: dict[str, Any]) -> list[str]:
 
 
 def score_line(scores: dict[str, float]) -> str:
-    """Return mean scores as one line for people."""
+    """Return mean scores as one line for the user."""
     distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
     opacity = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("alpha")]
     if "psnr_foreground" in scores:
@@ -74,7 +74,7 @@ def score_line(scores: dict[str, float]) -> str:
 
 
 def summary_line(metrics: dict[str, Any]) -> str:
-    """Return scores, size and time of a run, from metrics.json, as one line for people."""
+    """Return scores, size and time of a run, from metrics.json, as one line for the user."""
     size = f"{metrics['gaussians']:,} Gaussians, {metrics['steps']:,} steps"
     return f"{score_line(metrics['test'])}; {size}, {duration(metrics['seconds']['total'])}"
 
@@ -96,11 +96,11 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
     else:
         lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no view is held out, so there are no scores)"]
     compiling = metrics["seconds"].get("compiling", 0.0)
-    once = f", {duration(compiling)} of it for kernels, once on this machine" if compiling >= 1 else ""
+    once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
     lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
     if out is None:
-        return [*lines, "nothing is written to disk, because no run folder (out) was given"]
+        return [*lines, "nothing was written to disk, because no run folder (out) was given"]
     run = shlex.quote(str(out))
     commands = {
         f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",
@@ -112,7 +112,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
 
 
 def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
-    """Return the conditions in which scores must agree before they may be compared, for result files and the page."""
+    """Return the conditions that must be equal for scores to be comparable, for result files and the page."""
     sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
     return {
         "split": spec or "all (no --split given)", "training_views": len(train), "held_out_views": len(test),
@@ -134,7 +134,7 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and a depth map of each held-out view.
 
-    Where no view is held out, the images are of the training views. LPIPS is measured only on held-out views.
+    If no view is held out, the images are those of training views. LPIPS is measured only on held-out views.
 
     Args:
         out: The run folder; None to write nothing.
@@ -147,7 +147,7 @@ def evaluate_run(
         tell: Called with a line for each view before it is rendered.
 
     Returns:
-        Means over held-out and over training views, a row per held-out view, scores of baselines, and what each score is.
+        Means over held-out and over training views, a row per held-out view, scores of baselines, and definitions of scores.
     """
     for folder in () if out is None else ("renders", "depth"):
         make_folder(out / folder)
@@ -187,7 +187,7 @@ def _write_images(out: Path, name: str, view: View, image: np.ndarray, depth: np
 def _images(
     views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
 ) -> list[ViewImages]:
-    """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode what the page shows of them."""
+    """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
     chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
     result = []
     with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
@@ -202,7 +202,7 @@ def _images(
 
 
 def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
-    """Return a function that draws the 3D overview, in a separate process: it may be called from another thread."""
+    """Return a function that plots the 3D overview in a separate process; the function may be called from another thread."""
     means = gaussians.means.detach().cpu().numpy()
     colors = np.clip(base_colors(gaussians.sh[:, :1].detach().cpu().numpy()), 0, 1)
     sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
@@ -212,7 +212,7 @@ def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Ca
 
 
 def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the headline figures of the page as pairs of label and value."""
+    """Return the main figures of the page as pairs of label and value."""
     held_out = []
     if metrics["test"]:
         best = max(metrics["baselines"].values(), default=float("nan"))
@@ -231,7 +231,7 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def _protocol(metrics: dict[str, Any]) -> dict[str, str]:
-    """Return the conditions of the scores, and what each score is, as the page words them."""
+    """Return the conditions and the definitions of the scores, as text of the page."""
     words = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
     words["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
     return words | {LABELS.get(k, k): v for k, v in metrics["variants"].items()}

@@ -1,4 +1,4 @@
-"""Cost of a fit's cut-offs on its own scene: error of training views against ``exact`` in float64, and time saved."""
+"""Effect of a fit's cut-offs on its own scene: error of training views against ``exact`` in float64, and saved time."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from warpgs.scene import Camera, Gaussians, View
 VIEWS = 3
 """Number of training views that are compared, sampled at random."""
 SIDE = 64
-"""Side of the part of each that is compared [px], a multiple of the tile's."""
+"""Side of the part of each view that is compared [px], a multiple of the tile size."""
 
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
@@ -37,7 +37,7 @@ def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, i
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute on one thread: on many small tensors, threads wait for each other longer than they compute."""
+    """Compute on one thread in the block: for many small tensors, threads wait for each other longer than they compute."""
     count = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -62,23 +62,23 @@ def _seconds(render: Callable[[], object], device: torch.device) -> float:
 def rule_report_of(
     gaussians: Gaussians, views: list[View], options: RasterizeOptions, *, seed: int, half_resolution: float = 0.0
 ) -> dict[str, Any]:
-    """Measure error and gain of a rule on a scene; takes some tenths of a second.
+    """Measure error and saved time of a rule on a scene; takes some tenths of a second.
 
-    Three random views are rendered with the rule, as in the fit, and 64 x 64 px of each are compared with the image that
-    rule `exact` defines, computed in float64 by other means than the kernels (`warpgs.render.reference`); by the kernels where
-    `warpgs.lenses` does not know the camera model.
+    Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule `exact`
+    in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if `warpgs.lenses`
+    does not have the camera model.
 
     Args:
-        gaussians: Of the finished fit, float32.
+        gaussians: Gaussians of the finished fit, float32.
         views: Training views, at least one.
         options: Options of the rasterizer, with the name of the fit's cut-offs and a background.
         seed: Seed of the choice of views and parts.
-        half_resolution: Fraction of the steps that saw views at half their size.
+        half_resolution: Fraction of the steps with views of half size.
 
     Returns:
-        ``max``, ``mean`` and ``psnr`` [dB] (None where infinite) of the error of colours in [0, 1] over all parts; ``views``
-        by name with their windows; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``;
-        and ``summary``, all of it in words.
+        ``max``, ``mean`` and ``psnr`` [dB] (None if infinite) of the error of colours in [0, 1] over all parts; ``views`` by
+        name with their windows; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``; and
+        ``summary``, the same as a sentence.
     """
     generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
@@ -130,5 +130,5 @@ def _summary(r: dict[str, Any]) -> str:
             f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
         )
     if r["half_resolution"] > 0:
-        words += f"; {r['half_resolution']:.0%} of the steps used views at half their size, a quarter of the pixels"
+        words += f"; {r['half_resolution']:.0%} of the steps used views of half size, with a quarter of the pixels"
     return words

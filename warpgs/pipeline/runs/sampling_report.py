@@ -29,11 +29,11 @@ FOLDER = "sampling"
 SHOWN = 3
 """Number of views in an image."""
 SHEET_WIDTH = 1600
-"""Largest width of an image on the report page [px], where it is shown as wide."""
+"""Largest width of an image on the report page [px]."""
 OPEN, CLOSED = (0.97, 0.97, 0.95), (0.17, 0.19, 0.22)
-"""Colours of the gate."""
+"""Colours of pixels that the gate lets pass, and of the others."""
 FADED = 0.45
-"""Contrast of the view's image under the dots."""
+"""Contrast of the view's image behind the dots."""
 
 
 def shown_steps(phases: Phases) -> set[int]:
@@ -44,7 +44,7 @@ def shown_steps(phases: Phases) -> set[int]:
 
 
 def _open_pixels(consistent: bool, quantile: float) -> str:
-    """Describe the pixels that a gate leaves open."""
+    """Describe the pixels that pass a gate."""
     parts = ["with a depth that other views confirm"] * consistent
     parts += [f"with S_geometry above its {quantile:g} quantile"] * (quantile > 0)
     return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
@@ -55,14 +55,14 @@ def view_sheet(
 ) -> np.ndarray:
     """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, gate, sampled pixels, scores.
 
-    Scores are shown where one of them has a weight, the disparity where the view has a prior.
+    Scores are shown if one of them has a weight above 0, the disparity if the view has a prior.
 
     Args:
         name: Name of the view.
         step: Steps done.
         view: The view.
-        disparity: Its relative inverse depth, shape [H, W]; None without a prior.
-        sampled: Maps of the event and the pixels it took.
+        disparity: Relative inverse depth of the view, shape [H, W]; None without a prior.
+        sampled: Maps and sampled pixels of the event.
         config: Switches and settings of the fit.
     """
     image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
@@ -84,12 +84,12 @@ def view_sheet(
     consistent = config.ra and config.sampler.depth == "consistent" and view.consistent is not None
     widened = f"; too few passed at the {config.asked_quantile:g} quantile" if sampled.quantile < config.asked_quantile else ""
     lines = [
-        f"{len(at):,} pixels sampled of the {gate.sum():,} that the gate leaves open, {gate.mean():.0%} of the view.",
+        f"{len(at):,} pixels sampled of the {gate.sum():,} that pass the gate, {gate.mean():.0%} of the view.",
         f"Gate: {_open_pixels(consistent, sampled.quantile)}{widened}.",
     ]
     if scored:
         mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
-        lines.append(f"Their mean importance is {mean:.2f}, the view's {score.mean():.2f}.")
+        lines.append(f"Mean importance: {mean:.2f} at the sampled pixels, {score.mean():.2f} over the view.")
     return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
 
 
@@ -110,9 +110,9 @@ def _on_host(sampled: SampledView) -> SampledView:
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
     """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
 
-    A separate thread writes them. The end of the block waits for them. So does the yielded function; call it before a
-    checkpoint, since a fit that continues from there does not write earlier images. If an image cannot be written, the fit
-    continues, with one message in ``fit.messages``.
+    A separate thread writes the images. The end of the block waits for them, and so does the yielded function. Call it before a
+    checkpoint, since a fit that continues from a checkpoint does not write earlier images. If an image cannot be written, the
+    fit continues, with one message in ``fit.messages``.
 
     Args:
         fit: The fit, before its first step.
@@ -139,7 +139,7 @@ def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[
             write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
         except ResourceError as e:
             if not lost:
-                fit.messages.append(f"the report lacks images of sampling events: {e}")
+                fit.messages.append(f"images of sampling events are missing from the report: {e}")
             lost.append(step)
 
     with ThreadPoolExecutor(1) as thread:
@@ -166,8 +166,8 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
     """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
 
     Returns:
-        ``events``: their number, the Gaussians added and evicted, the samplings (views over all events) and those for which the
-        gate was widened; ``layers``: Gaussians in the coarse and the fine one.
+        ``events``: number of events, of Gaussians added and evicted, of samplings (views over all events), and of samplings
+        with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
     """
     asked = fit.config.method.asked_quantile
     layered = isinstance(fit.strategy, ImportanceSampling)
@@ -195,10 +195,10 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
     consistent = method.sampler.depth == "consistent"
     gate = _open_pixels(consistent and method.ra, method.asked_quantile)
     words = (
-        f"Each dot is a pixel behind which a fine Gaussian was put at the {method.sampler.depth} depth, as far as the layer "
-        f"had capacity. These pixels are {how} among {gate} (the gate). "
-        + ("S_importance is the weighted sum of the three scores; each score stands below its source."
-           if weighted else "No score has a weight, so none was computed.")
+        f"Each dot is a pixel behind which a fine Gaussian was added at the {method.sampler.depth} depth, while the layer had "
+        f"capacity. These pixels are {how} among {gate} (the gate). "
+        + ("S_importance is the weighted sum of the three scores; each score is shown below its source."
+           if weighted else "All scores have weight 0, so none was computed.")
     )  # fmt: skip
     if events["widened"]:
         words += (

@@ -1,4 +1,4 @@
-"""Schemas of the JSON that a run folder holds: config.json, the values beside a checkpoint's tensors, metrics.json."""
+"""Schemas of the JSON of a run folder: config.json, the plain values of a checkpoint, metrics.json."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from warpgs.schema import (
 )
 
 MAX_SIDE = 2**16
-"""Largest width and height of a stored camera [px], far above what any image has."""
+"""Largest width and height of a stored camera [px], far above those of any image."""
 
 
 def _view_name(value: Any, place: str) -> None:
@@ -40,7 +40,7 @@ def _matrix(rows: int) -> Schema:
 
 
 def _intrinsics(value: Any, place: str) -> None:
-    """Allow intrinsics without skew, which `rasterize` takes."""
+    """Allow intrinsics without skew, as `rasterize` needs them."""
     _matrix(3)(value, place)
     fixed = ((0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1))
     if any(abs(value[i][j] - wanted) > K_TOLERANCE for i, j, wanted in fixed):
@@ -85,7 +85,7 @@ def check_record(record: Any) -> None:
     """Check the contents of config.json.
 
     Raises:
-        SchemaError: No fit writes such values.
+        SchemaError: A value is missing or invalid.
     """
     _RECORD(record, "")
     if not record["train"]:

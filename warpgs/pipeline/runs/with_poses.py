@@ -1,4 +1,4 @@
-"""Fits of photographs without cameras: their poses are found first, and kept as a scene in the run folder."""
+"""Fits of photographs without cameras: poses are found first, and stored with the photographs as a scene in the run folder."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
 
     Args:
         request: The request; its path may be a folder of images or a video.
-        out: Run folder, whose folder `scene` keeps the poses; a run that is continued, or begun again, finds them there.
+        out: Run folder, whose subfolder `scene` stores the poses; a run that is continued or restarted reads them from there.
         progress: Called with lines for the user.
 
     Returns:
         The request for the scene with poses, and notes for the user.
 
     Raises:
-        DataError: The photographs do not fit together, or are too few.
-        UsageError: There is no run folder to keep the poses in, pycolmap is not installed, a continued run has other
-            photographs, or a matcher is given for a scene with cameras.
+        DataError: The photographs cannot be registered, or are too few.
+        UsageError: There is no run folder for the poses, pycolmap is not installed, a continued run has other photographs, or a
+            matcher is given for a scene with cameras.
     """
     source = Path(request.path)
     if request.reader is not None or not request.path or not needs_poses(source):
         if request.matcher is not None:
-            raise UsageError(f"--matcher requires photographs without cameras, and {source} holds none; leave it out")
+            raise UsageError(f"--matcher requires a folder of photographs without cameras; leave it out for {source}")
         return request, []
     if out is None:
-        raise UsageError(f"{source}: has no cameras, and finding them needs a run folder; give out=")
+        raise UsageError(f"{source}: has no cameras, and finding poses needs a run folder; give out=")
     scene = out / POSED_SCENE
     if (scene / JSON).is_file():
         record = read_record(scene)
         if record["source_sha256"] != source_digest(source, request.allow_outside):
-            raise UsageError(f"{scene} holds the poses of other photographs than {source}; give another --out")
+            raise UsageError(f"{scene} holds poses of photographs other than those of {source}; give another --out")
     else:
-        progress(f"{source} has no cameras: finding the poses of its photographs; they are stored in {scene}")
+        progress(f"{source} has no cameras: finding the poses of its photographs, to store them in {scene}")
         threads = torch.get_num_threads()
         record = find_poses(
             source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,
@@ -66,14 +66,12 @@ def lost_lines(out: Path | None) -> list[str]:
     lost = sum(not p["registered"] for p in rows)
     why = out / POSED_SCENE / TEXT
     return (
-        [f"{lost} of {len(rows)} photographs have no pose and were not used: see {why} for reasons and remedies"]
-        if lost
-        else []
+        [f"{lost} of {len(rows)} photographs have no pose and were not used: {why} lists reasons and remedies"] if lost else []
     )
 
 
 def _notes(record: dict[str, Any]) -> list[str]:
-    """Return the report's text on found poses: how they were found, and which photographs have none."""
+    """Return the report's notes on found poses: the method, and photographs without a pose."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    where = [f"see {POSED_SCENE}/{TEXT} of the run for photographs to add"] if record["advice"] else []
+    where = [f"{POSED_SCENE}/{TEXT} in the run folder lists photographs to add"] if record["advice"] else []
     return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]

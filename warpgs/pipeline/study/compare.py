@@ -1,4 +1,4 @@
-"""Studies: several settings on the same scenes with the same seeds, their scores, and the certainty of the differences."""
+"""Studies: several settings on the same scenes with the same seeds, their scores, and intervals of the differences."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from warpgs.runtime.folder_lock import hold_folder
 from warpgs.runtime.terminal import say
 
 SCORES = ("s_render", "s_semantic", "s_geometry")
-"""Switches of the scores that the importance map is the sum of."""
+"""Switches of the scores whose weighted sum is the importance map."""
 PAPER = "paper-literal"
 """Preset with the paper's hyper-parameters, a row of each ablation."""
 ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
@@ -38,21 +38,21 @@ ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
     **{f"with {name}": {name: True} for name in SWITCHES},
     PAPER: None,
 }
-"""Switches of each row of the ablation: those of the preset; pixels sampled uniformly, by the residual, and by one score more
-at a time; each part that is on switched off alone, and each that is off switched on. None for preset `PAPER`. A row that equals
-an earlier one is left out."""
+"""Switches that each row of the ablation changes in the preset. The rows: no change; pixels sampled uniformly, by the residual,
+then by one more score at a time; each part that is on switched off alone, and each that is off switched on. `PAPER` is a preset
+of its own. A row that equals an earlier one is left out."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
     """Return presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
 
     Args:
-        names: Presets as `warpgs.fit` takes them; a file or an object has the last word of its name.
-        steps: Steps of each run; None for those of its preset.
+        names: Presets as `warpgs.fit` takes them; a file or an object is shown by the last part of its name.
+        steps: Steps of each run; None for the steps of its preset.
 
     Raises:
         DataError: The file of a preset cannot be read.
-        UsageError: A preset is unknown, or two are called the same.
+        UsageError: A preset is unknown, or two have the same name.
     """
     words = [preset_word(n) for n in names]
     for word in words:
@@ -65,7 +65,7 @@ def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]
 def ablation_variants(base: FitConfig) -> tuple[dict[str, FitConfig], dict[str, tuple[bool, ...]]]:
     """Return the rows of the ablation of a configuration, and their check marks in the order of `SWITCHES`.
 
-    All have its number of steps.
+    All rows have the configuration's number of steps.
 
     Raises:
         UsageError: The configuration has no sampling events, so there is nothing to ablate.
@@ -97,7 +97,7 @@ def _places(request: StudyRequest, device: str) -> list[Place]:
             say(f"{wanted.path}: {note}")
             wanted, split = dataclasses.replace(wanted, split=spec), split_views(scene, spec)
         if not split.test:
-            raise DataError(f"{wanted.path}: no view is held out, so there is nothing to compare; choose another --split")
+            raise DataError(f"{wanted.path}: no view is held out, so there are no scores to compare; choose another --split")
         places.append(
             Place(
                 scene_name(wanted),
@@ -115,7 +115,7 @@ Key = tuple[str, str, int]
 
 
 def _fits(request: StudyRequest, places: list[Place]) -> dict[Key, tuple[Place, FitRequest]]:
-    """Return all runs, seed by seed, so that an interrupted study holds whole pairs."""
+    """Return all runs, seed by seed, so that an interrupted study has complete pairs."""
     return {
         (place.name, name, seed): (
             place,
@@ -129,7 +129,7 @@ def _fits(request: StudyRequest, places: list[Place]) -> dict[Key, tuple[Place, 
 
 
 def _farmed(request: StudyRequest, fits: dict[Key, tuple[Place, FitRequest]]) -> dict[Key, JobRecord]:
-    """Run all fits on a farm where one is requested; return their records."""
+    """Run all fits on a farm, if one is requested; return their records."""
     if request.engine is None:
         return {}
     jobs = {}
@@ -142,7 +142,7 @@ def _farmed(request: StudyRequest, fits: dict[Key, tuple[Place, FitRequest]]) ->
 
 
 def _run_all(request: StudyRequest, places: list[Place], device: torch.device, lpips: dict[str, str]) -> Runs:
-    """Make all runs, and read what a farm has made of them."""
+    """Make all runs, or read the results of a farm."""
     runs: Runs = {}
     fits = _fits(request, places)
     farmed = _farmed(request, fits)
@@ -169,13 +169,15 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
 def run_study(request: StudyRequest) -> list[str]:
     """Fit every variant to every scene with every seed, and write the results into the study's folder.
 
-    Scenes and weights are read before the first fit. A run that fails is named in the notes and left out of its pairs.
+    Scenes and weights are read before the first fit. The notes name each failed run; its seed is excluded from paired
+    differences.
 
     Returns:
         Lines for the user: the table and the notes.
 
     Raises:
-        DataError: A scene cannot be read or holds out no view; the LPIPS weights are invalid; or every run of a variant failed.
+        DataError: A scene cannot be read or has no held-out view, the LPIPS weights are invalid, or every run of a variant
+            failed.
         ResourceError: The folder cannot be written, another process writes into it, or the device is missing.
     """
     device, where = choose_device(request.device)
@@ -189,11 +191,11 @@ def run_study(request: StudyRequest) -> list[str]:
         try:
             runs = _run_all(request, places, device, lpips)
         except KeyboardInterrupt:
-            say("repeat the command to continue: finished runs are kept, the interrupted one continues")
+            say("repeat the command to continue: finished runs are kept, and the interrupted run continues")
             raise
         for name in request.variants:
             failed = [o.note for (_, v, _), o in runs.items() if v == name and o.metrics is None]
             if len(failed) == len(places) * request.seeds:
-                raise DataError(f"every run of {name} failed, so nothing can be compared; the first: {failed[0]}")
+                raise DataError(f"every run of {name} failed, so nothing can be compared; first error: {failed[0]}")
         lines = write_study(request, runs, places, device, where.removeprefix("on "))
         return [*lines, f"in {request.out}: {', '.join(FILES)}"]

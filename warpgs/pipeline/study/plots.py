@@ -12,11 +12,11 @@ from warpgs.report.curve import ticks
 
 INK, SOFT, RULE, BAND = "#1b1d21", "#666c76", "#d9dce1", "#f6f6f3"
 BETTER, WORSE, UNDECIDED = "#0b6e6e", "#c2570c", "#7a808a"
-"""Colours of an interval on the good side of 0, on the bad side, and of one that holds 0: distinct for any colour vision."""
+"""Colours of an interval on the better side of 0, on the worse side, and across 0: distinct for any colour vision."""
 ROW, PANEL, VALUES, GAP, MARGIN = 38, 230, 184, 24, 24
 TOP, BOTTOM = 96, 78
 LETTER = 7.2
-"""Width of a letter of the row labels [px], by which their column is sized."""
+"""Assumed width of a letter of the row labels [px], to compute the width of their column."""
 
 
 @dataclass(frozen=True)
@@ -26,21 +26,21 @@ class Line:
     name: str
     """Name of the variant."""
     pairs: tuple[float, ...]
-    """Difference of each seed."""
+    """Difference to the base for each seed."""
     difference: Difference | None
-    """Their mean and interval; None for the base."""
+    """Mean of the differences, and its interval; None for the base."""
     exercised: bool = True
-    """False where its runs gave the same files as the base's."""
+    """False if the variant's runs gave the same files as the base's."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One metric; the lines stand in the same order in every panel."""
+    """One metric; the lines have the same order in every panel."""
 
     label: str
     """Name of the metric, with its unit."""
     upwards: bool
-    """True where more is better."""
+    """True if larger values are better."""
     digits: int
     """Digits after the point of the printed figures."""
     lines: tuple[Line, ...]
@@ -56,7 +56,7 @@ def _text(x: float, y: float, words: str, size: int = 12, anchor: str = "start",
 
 
 def _reach(panel: Panel) -> float:
-    """Return half the width of a panel's axis, which is centred on 0 so that sizes of both signs compare."""
+    """Return half the width of a panel's axis, which is centred on 0 so that both signs have the same scale."""
     values = [abs(v) for line in panel.lines for v in line.pairs]
     values += [abs(v) for line in panel.lines if line.difference for v in (line.difference.low, line.difference.high)]
     largest = max((v for v in values if math.isfinite(v)), default=0.0)
@@ -129,7 +129,7 @@ def forest(title: str, base: str, panels: Sequence[Panel]) -> str:
     words = f"large dot: mean; bar: {'joint ' if len(names) > 2 else ''}95 % t interval; small dots: seeds"
     out.append(_text(MARGIN, height - 18, words, 11, color=SOFT))
     x = MARGIN + 6.0 * len(words) + 8
-    for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval holds 0")):
+    for color, meaning in ((BETTER, "better"), (WORSE, "worse"), (UNDECIDED, "undecided: the interval contains 0")):
         out.append(f'<circle cx="{x:.1f}" cy="{height - 22:.1f}" r="4.5" fill="{color}"/>')
         out.append(_text(x + 9, height - 18, meaning, 11, color=SOFT))
         x += 6.0 * len(meaning) + 28

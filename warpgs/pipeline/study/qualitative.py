@@ -1,4 +1,4 @@
-"""Figure of a study: renders of held-out views by each variant beside the images, enlarged where they differ."""
+"""Figure of a study: renders of held-out views by each variant beside the images, with enlarged crops where they differ."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def strips(
         scene: Name of the scene, for titles.
         views: Its held-out views.
         folders: Run folder of each variant, in the order of the columns.
-        scores: PSNR [dB] by variant and view name; a view that is missing has no figure printed.
+        scores: PSNR [dB] by variant and view name; no PSNR is printed for missing views.
         count: Largest number of rows.
         device: Device to render on.
 
     Returns:
-        Rows with a cell per variant and the image of the view as the last.
+        Rows with a cell per variant; the last cell is the image of the view.
     """
     images = {name: _rendered(folder, views, device) for name, folder in folders.items()}
     maps = []

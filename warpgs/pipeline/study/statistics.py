@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 CONFIDENCE = 0.95
-"""Probability that an interval holds the true mean."""
+"""Probability that an interval contains the true mean."""
 
 
 def family_confidence(count: int, confidence: float = CONFIDENCE) -> float:
-    """Return the confidence of each of ``count`` intervals, so that all hold at once with ``confidence`` (Bonferroni 1936)."""
+    """Return the confidence of each of ``count`` intervals for a joint ``confidence`` of all (Bonferroni 1936)."""
     return 1 - (1 - confidence) / max(1, count)
 
 
@@ -57,15 +57,15 @@ def sample(values: Sequence[float]) -> Sample:
 def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
     """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n), n - 1 degrees.
 
-    Pairing takes out what both have in common (the same seed, the same scene), which is most of the spread between runs.
+    Pairing removes the common effect of seed and scene, which is most of the spread between runs.
 
     Args:
         ours: Measurements.
         base: Measurements of the base, in the same order.
-        confidence: Probability that the interval holds the true mean, in (0, 1).
+        confidence: Probability that the interval contains the true mean, in (0, 1).
 
     Raises:
-        ValueError: The two differ in length.
+        ValueError: ``ours`` and ``base`` differ in length.
     """
     from scipy.special import stdtrit
 

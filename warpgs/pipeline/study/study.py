@@ -33,9 +33,9 @@ SWITCHES = {
 }  # fmt: skip
 """Parts of the method that can be switched off, with the headings of the paper's ablation table."""
 MAX_SEEDS = 1000
-"""Most runs of a setting on a scene."""
+"""Largest number of runs of a setting on a scene."""
 FIGURE_ROWS = 3
-"""Rows of the figure for a single scene; two scenes get two rows each, more scenes one each."""
+"""Rows of the figure for a single scene; with two scenes each has two rows, with more scenes one."""
 FILES = ("table.md", "table.csv", "table.tex", "runs.csv", "plot.svg", "figure.png", "study.json")
 """Files of a study, beside its runs."""
 
@@ -47,7 +47,7 @@ class StudyRequest:
     scenes: tuple[SceneRequest, ...]
     """Scenes that every variant is fitted to."""
     variants: dict[str, FitConfig]
-    """Settings by name; the others are compared with the first. The seed is set by the study."""
+    """Settings by name; each is compared with the first one. The study sets the seed."""
     seeds: int
     """Number of runs of each variant on each scene, with seeds from 0 on."""
     out: Path
@@ -57,7 +57,7 @@ class StudyRequest:
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
     engine: EngineRequest | None = None
-    """Engine of the farm that the runs go to; None for one after another in this process."""
+    """Engine of a farm for the runs; None: one run after another in this process."""
     marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
 
@@ -71,12 +71,12 @@ class StudyRequest:
             raise UsageError("name at least one scene folder")
         if len(set(names)) < len(names):
             raise UsageError(
-                f"two scene folders have one name ({', '.join(names)}); results are stored under it, so rename one"
+                f"two scene folders have the same name ({', '.join(names)}), which names their results; rename one"
             )
 
 
 def scene_name(request: SceneRequest) -> str:
-    """Return the name of a scene in tables and folders: that of its folder."""
+    """Return the name of a scene in tables and folders, which is the name of its folder."""
     return Path(request.path).resolve().name
 
 
@@ -87,11 +87,11 @@ class Place:
     name: str
     """Name of its folder."""
     request: SceneRequest
-    """Folder and options it is read with."""
+    """Folder of the scene, and options for reading it."""
     fingerprint: str
     """Fingerprint of its data."""
     split: Split
-    """Views to fit and those held out."""
+    """Names of the views to fit, and of held-out views."""
     train: list[View]
     """Views to fit."""
     test: list[View]
@@ -108,19 +108,19 @@ def run_folder(request: StudyRequest, scene: str, variant: str, seed: int) -> Pa
 
 
 def _value(outcome: Outcome, key: str) -> float:
-    """Return a mean score of a run; NaN where it was not measured."""
+    """Return a mean score of a run; NaN if it was not measured."""
     value = (outcome.metrics or {}).get("test", {}).get(key)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
 def _by_seed(runs: Runs, scenes: list[str], variant: str, key: str, seeds: int) -> dict[int, float]:
-    """Return the mean over scenes by seed; seeds that lack a scene are left out."""
+    """Return the mean over scenes by seed; seeds without a result for every scene are left out."""
     means = {s: math.fsum(_value(runs[p, variant, s], key) for p in scenes) / len(scenes) for s in range(seeds)}
     return {s: v for s, v in means.items() if math.isfinite(v)}
 
 
 def _metrics(runs: Runs) -> tuple[Metric, ...]:
-    """Return PSNR, SSIM, and the LPIPS variant that papers print where one was measured."""
+    """Return PSNR, SSIM and, if LPIPS was measured, the variant that papers print."""
     keys = {k for o in runs.values() for k in (o.metrics or {}).get("test", {})}
     order = ("lpips_vgg_legacy", "lpips_alex_legacy")
     found = next((k for k in order if k in keys), "lpips")
@@ -177,7 +177,7 @@ def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torc
     """Return the figure (PNG) of the first seed with every run, or None, and a note."""
     whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
     if not whole:
-        return None, "no figure: no seed has a successful run for every row"
+        return None, "no figure: no seed succeeded in every row"
     seed, rows, each = whole[0], [], {1: FIGURE_ROWS, 2: 2}.get(len(places), 1)
     for place in places:
         folders = {v: run_folder(request, place.name, v, seed) for v in request.variants}
@@ -195,20 +195,20 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
         if lost:
             notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
     if request.seeds < 2:
-        notes.append("one seed: no deviations and no intervals; run more seeds before you claim a difference")
+        notes.append("one seed gives no deviations and no intervals; run more seeds before you claim a difference")
     last = metrics[-1].key
     lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o.metrics)
     if last == "lpips":
-        notes.append("LPIPS was not measured: no --lpips-weights were given")
+        notes.append("LPIPS was not measured, because --lpips-weights was not given")
     elif lacking:
-        notes.append(f"{lacking} runs lack {metrics[-1].label}: they are left out of its column")
+        notes.append(f"{lacking} runs have no {metrics[-1].label}; the column excludes them")
     if len(request.scenes) > 1:
-        notes.append("deviations and intervals are over seeds, for the mean over these scenes; they do not cover other scenes")
+        notes.append("deviations and intervals cover different seeds on these scenes, not other scenes")
     return notes
 
 
 def _protocols(runs: Runs) -> list[str]:
-    """Return how each scene was scored, and the definition of each score, as Markdown lines."""
+    """Return the protocol of each scene, and the definition of each score, as Markdown lines."""
     lines, seen = [], set()
     variants: dict[str, str] = {}
     for (scene, _, _), outcome in runs.items():

@@ -1,4 +1,4 @@
-"""Tables of a study as Markdown, CSV and LaTeX, laid out as papers print them."""
+"""Tables of a study as Markdown, CSV and LaTeX, in the layout of papers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from warpgs.pipeline.study.statistics import Difference, Sample
 
 NONE = "-"
-"""Sign for a figure that was not measured."""
+"""Sign for a value that was not measured."""
 NOT_EXERCISED = "not exercised"
-"""Words for a difference between runs that gave the same files."""
+"""Text in place of a difference if both variants gave the same files."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Metric:
     label: str
     """Name in tables."""
     upwards: bool
-    """True where more is better."""
+    """True if larger values are better."""
     digits: int
     """Digits after the point."""
 
@@ -47,7 +47,7 @@ class Row:
     marks: tuple[bool, ...] = ()
     """Check marks, one for each of the table's switches."""
     exercised: bool = True
-    """False where every run gave the same file as the base: its settings made no difference to test."""
+    """False if every run gave the same file as the base, so that the settings made no difference."""
 
 
 @dataclass(frozen=True)
@@ -61,23 +61,23 @@ class Table:
     metrics: tuple[Metric, ...]
     """Columns of figures."""
     rows: tuple[Row, ...]
-    """Variants, the base among them."""
+    """Variants, including the base."""
     switches: tuple[str, ...] = ()
     """Headings of the columns of check marks, in LaTeX without dollar signs; empty for a table of methods."""
 
     def __post_init__(self) -> None:
         if any(len(r.marks) != len(self.switches) for r in self.rows):
-            raise ValueError("every row needs a check mark for each switch, and none where there are no switches")
+            raise ValueError("every row needs one check mark per switch")
 
     def best(self, metric: Metric) -> float:
-        """Return the best mean of a column as printed; NaN where nothing was measured."""
+        """Return the best mean of a column as printed; NaN if nothing was measured."""
         means = [round(r.samples[metric.key].mean, metric.digits) for r in self.rows if metric.key in r.samples]
         means = [m for m in means if math.isfinite(m)]
         return (max if metric.upwards else min)(means, default=math.nan)
 
 
-INTERVALS = ("a 95 % t interval", "t intervals that hold together for a column with 95 % (Bonferroni)")
-"""Words on the intervals of a table with one difference, or with several."""
+INTERVALS = ("a 95 % t interval", "simultaneous 95 % t intervals per column (Bonferroni)")
+"""Description of the intervals of a table with one difference, or with several."""
 
 
 def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
@@ -89,7 +89,7 @@ def figure(sample: Sample | None, digits: int, plus_minus: str = " ± ") -> str:
 
 
 def interval(d: Difference | None, digits: int) -> str:
-    """Return a paired difference with its interval as text, signed; a dash for none."""
+    """Return a paired difference, signed, with its interval, as text; a dash if there is none."""
     if d is None or not math.isfinite(d.mean):
         return NONE
     ends = f" [{d.low:+.{digits}f}, {d.high:+.{digits}f}]" if math.isfinite(d.low) else ""
@@ -97,7 +97,7 @@ def interval(d: Difference | None, digits: int) -> str:
 
 
 def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
-    """Return the lines of a Markdown table; the first ``left`` columns are words, the rest figures."""
+    """Return the lines of a Markdown table; the first ``left`` columns are text, the others numbers."""
     rows = [[c.replace("|", "\\|") for c in r] for r in [head, *body]]
     widths = [max(len(r[i]) for r in rows) for i in range(len(head))]
     lines = [

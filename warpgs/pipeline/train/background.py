@@ -17,15 +17,15 @@ Color = tuple[float, float, float]
 """Red, green and blue in [0, 1]."""
 NAMED: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 CHOSEN = ("auto", "mean", "scene")
-"""Names of colours that follow from the scene."""
+"""Names of colours that depend on the scene."""
 BEHIND = 0x62616B67
-"""Key that sets random backgrounds apart from other random numbers of a fit."""
+"""Seed component that makes random backgrounds independent of other random numbers of a fit."""
 LEVELS = 2**16 - 1
 """Levels that colours are rounded to before they are added: sums of integers are exact in any order."""
 
 
 def color_of(text: str) -> Color | None:
-    """Return the colour that a word names; None for one that follows from the scene.
+    """Return the colour of a text; None for a colour that depends on the scene.
 
     Args:
         text: auto, mean, scene, black, white, ``#rrggbb``, or three numbers in [0, 1] as ``r,g,b``.
@@ -51,7 +51,7 @@ def color_of(text: str) -> Color | None:
 
 
 def mean_color(views: list[View]) -> Color:
-    """Return the mean colour of the pixels that the masks of views keep, over all of them; the same bits on every machine."""
+    """Return the mean colour of all unmasked pixels of views; it has the same bits on every machine."""
     total, count = np.zeros(3, np.int64), 0
     for v in views:
         pixels = v.image.reshape(-1, 3) if v.mask is None else v.image[v.mask]
@@ -62,7 +62,7 @@ def mean_color(views: list[View]) -> Color:
 
 
 def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color, str]:
-    """Return the colour behind a scene, and a note for the user; no note where opaque views stay before the scene's own.
+    """Return the colour behind a scene, and a note for the user; no note if opaque views keep the scene's own background.
 
     Args:
         wish: As `FitConfig.background`.
@@ -70,7 +70,7 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
         train: Its training views.
 
     Raises:
-        UsageError: The request is not a colour.
+        UsageError: ``wish`` is not a colour.
     """
     color = color_of(wish)
     if color is not None:
@@ -83,12 +83,12 @@ def choose_background(wish: str, scene: Scene, train: list[View]) -> tuple[Color
         color = mean_color(train)
         return color, f"background: the mean colour of the training views, {_words(color)}; change it with --background"
     if wish == "auto":
-        return scene.background, f"background: {_words(scene.background)}, since the views show an object cut out"
-    return scene.background, f"background: {_words(scene.background)}, that of the scene" if cut_out else ""
+        return scene.background, f"background: {_words(scene.background)}, since the views show a cut-out object"
+    return scene.background, f"background: {_words(scene.background)}, from the scene's files" if cut_out else ""
 
 
 def over_background(scene: Scene, color: Color) -> Scene:
-    """Return the scene over another background [3]: where views are transparent, their images change."""
+    """Return the scene over another background [3]; images change where views are transparent."""
     if color == scene.background:
         return scene
     shift = np.float32(color) - np.float32(scene.background)
@@ -107,7 +107,7 @@ def over(image: torch.Tensor, alpha: torch.Tensor, shift: torch.Tensor) -> torch
 
 
 def random_shift(seed: int, step: int, background: Sequence[float]) -> tuple[float, float, float]:
-    """Return the colour behind a step's view less the scene's background [3]: uniform in [0, 1], by seed and step alone."""
+    """Return a random colour, uniform in [0, 1], minus the scene's background [3]; it depends on seed and step only."""
     red, green, blue = (b - a for a, b in zip(background, np.random.default_rng([seed, step, BEHIND]).random(3).tolist()))
     return red, green, blue
 

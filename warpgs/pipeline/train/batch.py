@@ -1,7 +1,8 @@
 """Steps of several views: each view has a slot for its gradients; these are averaged in a fixed order, for one update.
 
-Slots are spread over the processes of a fit. Every process does the remaining work of a step, with the same bits. On CUDA
-several steps are taken before their results are read, so that Python prepares a step while the device works on the one before.
+Slots are distributed over the processes of a fit. Every process does the remaining work of a step, with the same bits. On CUDA
+several steps are taken before their results are read, so that Python prepares a step while the device works on the previous
+one.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
-"""Positions in the last summed tensor, after loss and squared error: the number of processes that were asked to stop; and the
-first of the slots' reasons to stop the step."""
+"""Positions in the last summed tensor, after loss and squared error: of the number of processes that were asked to stop, and of
+the first slot's reason to stop the step."""
 
 
 class SumUpdate:
@@ -41,16 +42,17 @@ class SumUpdate:
         self, learned: Learned, plan: StepPlan, buffers: StepBuffers, sums: SlotSums, names: Sequence[str], large: str,
         said: torch.Tensor,
     ):  # fmt: skip
-        """Keep what the update is made of.
+        """Keep the parts of the update.
 
         Args:
             learned: Tables and strategy that the step changes.
-            plan: Choices that the step is made of.
+            plan: Fixed choices of the step.
             buffers: Settings of the steps, and their results.
-            sums: Means of gradients, sums of statistics, and of what the slots say.
+            sums: Means of gradients, and sums of statistics and of the slots' losses and flags.
             names: Names of the statistics.
             large: Parameter whose rows the sums may divide among processes.
-            said: What the slots said in the last step, or in the one that a slot stopped, [`FLAGS` + B]; the update sets it.
+            said: Sums of losses and flags in the last step, or in the step that a slot stopped, [`FLAGS` + B]; the update sets
+                it.
         """
         self.learned, self.plan, self.buffers, self.sums, self.large, self.said = learned, plan, buffers, sums, large, said
         parts = sums.parts()
@@ -59,7 +61,7 @@ class SumUpdate:
         self.going = torch.zeros(1, dtype=torch.bool, device=buffers.device)
 
     def functions(self, captured: Callable[[Callable[[], object]], Callable[[], object]]) -> list[Callable[[], object]]:
-        """Return functions that update, to call in turn; ``captured`` returns a function in the form to call it in."""
+        """Return the functions of the update in their order; ``captured`` converts a function, such as to a graph."""
         names = list(self.learned.table.params)
         if not self.sums.divided:
             return [captured(functools.partial(self._whole, names))]
@@ -80,14 +82,14 @@ class SumUpdate:
 
     @torch.no_grad()
     def _common(self, names: list[str]) -> None:
-        """Update what every process updates: all rows of these parameters, and of the large one those that are not divided."""
+        """Update the rows that every process updates: all rows of these parameters, and undivided rows of the large one."""
         self._begin()
         self._descend(names)
         self._descend([self.large], slice(self.sums.divided, None))
 
     @torch.no_grad()
     def _begin(self) -> None:
-        """Look whether a slot stops the step, count the step if not, and load its settings."""
+        """Check whether a slot stops the step; if not, count the step; load its settings."""
         b = self.buffers
         self.said.copy_(torch.where(b.stop == 0, self.sums.parts()[-1], self.said))
         b.stop.copy_(torch.maximum(b.stop, self.said[FLAGS:].max().int()))
@@ -106,7 +108,7 @@ class SumUpdate:
         settle(self.learned, self.plan, ViewGradients(self.gradients, statistics, self.lrs, self.settings, self.going))
 
     def complete(self) -> None:
-        """Give all processes the moments of divided rows, which only the one that updates them has."""
+        """Send all processes the moments of divided rows, which only the updating process has."""
         if self.sums.divided:
             for moments in (self.learned.table.exp_avg, self.learned.table.exp_avg_sq):
                 self.sums.share(moments[self.large])
@@ -128,11 +130,11 @@ class BatchSteps:
         self.slots = StepBuffers(buffers.device, 1, steps_at_once(tree.batch) * len(tree.slots))
         """Settings and results of this process's slots, step by step."""
         self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device)
-        """Sums of what the slots said in the last step, or in the one that a slot stopped."""
+        """Sums of the slots' losses, errors and flags in the last step, or in the step that a slot stopped."""
         self.told_to_stop = False
-        """True if this process was asked to stop; the next step tells all others."""
+        """True if this process was asked to stop; the next step tells all other processes."""
         self.sums: SlotSums | None = None
-        """Sums over slots, of the sizes of the last step."""
+        """Sums over slots, with the shapes of the last step."""
         self._capacities = Capacities(learned, options)
         self._graphs = self._updates = None
         if buffers.device.type == "cuda":
@@ -189,7 +191,7 @@ class BatchSteps:
         self._update[0].complete()
 
     def _found(self, place: int, works: Sequence[Callable[[], ViewGradients]]) -> ViewGradients:
-        """Return what a view contributes: ``place`` counts the own slots of all steps."""
+        """Return the contribution of a view; ``place`` counts this process's slots of all steps."""
         self.slots.counter.fill_(place)
         self.slots.stop.zero_()
         return works[place]()
@@ -197,7 +199,7 @@ class BatchSteps:
     def _works(
         self, kinds: list[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, captured: bool
     ) -> list[Callable[[], ViewGradients]]:
-        """Return for each own slot, with a view of this kind, the function that finds its gradients."""
+        """Return for each slot of this process, with a view of this kind, the function that computes its gradients."""
         if captured and self._graphs is not None:
             return [_replayed(graph) for graph in self._graphs.capture_all(kinds, stacks, plan, max_instances)]
         render = eager_renderer(self.options, max_instances)
@@ -205,7 +207,7 @@ class BatchSteps:
 
     @torch.no_grad()
     def _add(self, slot: int, place: int, found: ViewGradients, parts: list[torch.Tensor], adds: bool) -> None:
-        """Add what a slot contributes to the parts of a sum, or overwrite them by it; ``place`` is that of `_found`."""
+        """Add the contribution of a slot to the parts of a sum, or overwrite them with it; ``place`` is as in `_found`."""
         said = parts[-1]
         if not adds:
             said.zero_()
@@ -237,7 +239,7 @@ class BatchSteps:
         return self._update[1]
 
     def result(self) -> tuple[int, bool]:
-        """Return the first slot that stopped the steps, 0 where none did, and whether a process was told to stop."""
+        """Return the first slot that stopped the steps (0 if none did), and whether a process was asked to stop."""
         said = self.said.tolist()
         return said.index(max(said[FLAGS:]), FLAGS) - FLAGS, said[STOP] > 0
 

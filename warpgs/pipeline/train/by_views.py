@@ -15,60 +15,60 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views: with an alpha channel, and with opaque views."""
+"""Steps of a fit of up to `FEW` views: of views with an alpha channel, and of opaque views."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
-"""Views from which steps grow beyond `MIN_STEPS`; the power of their number with which they do; and their bound."""
+"""Number of views above which steps exceed `MIN_STEPS`; exponent of this growth; and largest number of steps."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
-"""Learning rate of the log scales up to so many views, and the power of their number with which it falls beyond."""
+"""Learning rate of the log scales up to so many views, and exponent with which it falls for more views."""
 OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
-"""Learning rate of the opacities at 3 views, which rises with the square root of their number, and its bound."""
+"""Learning rate of the opacities for 3 views, which rises with the square root of their number, and its largest value."""
 HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
-"""Fraction of the steps at half size up to so many views; beyond it falls with their number."""
+"""Fraction of the steps at half size up to so many views; for more views it is inversely proportional to their number."""
 DEGREES = (5, 9, 12)
-"""Training views from which colours have spherical harmonics of degree 1, 2 and 3. With fewer they have none: four photographs
-cannot distinguish a view-dependent colour from an error of the shape."""
+"""Fewest training views for spherical harmonics of degree 1, 2 and 3. With fewer, colours do not depend on the view: four
+photographs cannot distinguish a view-dependent colour from an error of the shape."""
 OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
 """Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
 were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
 SMOOTH_WEIGHT, ALPHA_SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 0.5, 4, 3000
-"""Weight of the roughness of rendered depth for opaque views and for views with alpha, the largest number of views, and the
-least number of steps with this term: it lowers PSNR with 9 views, and does not help in 480 steps
+"""Weight of the roughness of rendered depth for opaque views and for views with alpha; and the largest number of views and the
+least number of steps with this term. The term lowers PSNR with 9 views, and does not help in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
-"""Opaque views up to which a fit of at least `SMOOTH_STEPS` steps starts with extrapolated points where no view looks, and the
-decay of opacities with them; neither was measured elsewhere (docs/decisions/026-extrapolated-points.md)."""
+"""Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
+of opacities with such points. Neither was measured in other fits (docs/decisions/026-extrapolated-points.md)."""
 MIN_GAIN_DB = 0.1
-"""Gain of held-out blocks below which a fit ends [dB]. Nothing is held out where the time of a CPU limits the steps: they are
-too few to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
+"""Gain of held-out blocks below which growth ends [dB]. Nothing is held out if a CPU's time limits the steps: these are too few
+to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
 CPU_PIXELS = 1.55e6
-"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians, up to three
-times as many."""
+"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; up to three times as many pixels
+with fewer Gaussians."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
-"""Time that a fit on a CPU may take by default [s]: at least, for each view, and at most."""
+"""Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
 ONE_LAYER = 1.1
-"""Time of a step on a CPU with one layer over that with two layers, which have fewer Gaussians."""
+"""Ratio of the times of a step on a CPU with one layer and with two layers, which have fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
-"""Learning rates of the means and of the constant colour, and the factor of both where the time of a CPU limits the steps of
+"""Learning rates of the means and of the constant colour; and the factor of both if a CPU's time limits the steps and there are
 more than so many views (docs/decisions/025-time-on-a-cpu.md)."""
 LOST_DB = 0.18
-"""Least PSNR that a fit on a CPU loses each time its steps are halved [dB]; with many views it loses more."""
+"""Least loss of PSNR for each halving of the steps of a fit on a CPU [dB]; with many views the loss is larger."""
 
 
 def steps_by_views(views: int, opaque: bool = True) -> int:
-    """Return the most steps of a fit of so many views: 4500 up to 4 opaque ones, 5511 for 9, 30,000 from 87 on."""
+    """Return the largest number of steps for a number of views: 4500 up to 4 opaque views, 5511 for 9, 30,000 from 87 on."""
     if opaque and views <= FEW:
         return OPAQUE_STEPS
     return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
 
 
 def cpu_seconds(views: int) -> float:
-    """Return the time that the steps of a fit on a CPU are limited to by default [s]."""
+    """Return the default time limit for the steps of a fit on a CPU [s]."""
     least, each, most = CPU_SECONDS
     return min(least + each * views, most)
 
 
 def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
-    """Return how many pixels so many steps render; views have ``pixels``, and a quarter of them in steps at half size."""
+    """Return the number of pixels that ``steps`` render; views have ``pixels``, or a quarter of them at half size."""
     return steps * pixels * (1 - 0.75 * half_resolution)
 
 
@@ -86,13 +86,13 @@ def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
     steps = max(1, int(wanted * most / seconds))
     lost = LOST_DB * math.log2(wanted / steps)
     return steps, (
-        f"on a CPU {steps:,} of the {wanted:,} steps are taken by default, about {most / 60:.1f} min on two cores; "
+        f"on a CPU the default is {steps:,} of {wanted:,} steps, about {most / 60:.1f} min on two cores; "
         f"--no-cpu-limit takes all steps, about {seconds / 60:.0f} min, and raises PSNR by at least {lost:.1f} dB"
     )
 
 
 def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
-    """Return the settings with every one chosen that is left open (None), and sentences on the choices.
+    """Return the settings with all automatic ones (None) chosen, and sentences on the choices.
 
     Args:
         config: Settings.
@@ -155,7 +155,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
 
 
 def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
-    """Return words for each setting of ``made`` that ``config`` leaves open; ``wanted`` are the steps without a limit."""
+    """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` are the steps without a limit."""
     optimizer, half = made.optimizer, made.half_resolution
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {

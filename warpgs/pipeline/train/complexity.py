@@ -19,7 +19,7 @@ def complexity_figures(trainer: Trainer) -> dict:
 
 
 def complexity_summary(figures: dict) -> str:
-    """Return one line for people from the figures of `complexity_figures`."""
+    """Return the values of `complexity_figures` as one line for the user."""
     f = figures["complexity"]
     text = f"{f['count']:,} Gaussians of mean SH degree {f['mean_degree']:.2f}, {format_bytes(f['bytes'])} uncompressed"
     if f["marginal_db"] is not None:

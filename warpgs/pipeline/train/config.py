@@ -39,12 +39,12 @@ class FitConfig:
     steps: int | None = 7000
     """Number of optimisation steps; early stopping may end the fit sooner. None: by the number of views."""
     max_steps: int = 30_000
-    """Largest number of steps that the number of views may set."""
+    """Largest number of steps that is chosen by the number of views."""
     batch: int = 1
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """Limit the steps on a CPU to the work of two cores in 1 to 20 minutes, if the number of views sets the steps."""
+    """Limit the steps on a CPU, if the number of views sets them, to the work of two cores in 1 to 20 minutes."""
     seed: int = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
@@ -54,8 +54,7 @@ class FitConfig:
     pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run
     are antialiased, too; other programs need their antialiased mode."""
     half_resolution: float | None = 0.0
-    """Fraction of the steps, from the start of the fit, with views of half size (docs/trade.md). None: by the number of
-    views."""
+    """Fraction of the steps, the first ones, that use views of half size (docs/trade.md). None: by the number of views."""
     sh_degree: int | None = 3
     """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: by the number of
     views."""
@@ -69,16 +68,16 @@ class FitConfig:
     checkpoint_every: int = 1000
     """Number of steps between checkpoints; one is always written at the end."""
     checkpoint_seconds: float = 20.0
-    """Least time between checkpoints [s], because writing takes time. It does not affect results."""
+    """Least time between checkpoints [s], because writing takes time. This setting does not affect results."""
     memory_limit: int | None = None
     """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
     a step would exceed the limit, and images are rendered in chunks if a whole image would exceed it."""
     cuda_graph: bool = True
-    """CUDA graphs: each step is captured once and replayed, which is faster and gives the same bytes."""
+    """CUDA graphs: steps are captured once and replayed, which is faster and gives the same bytes."""
     max_gaussians: int = 1_000_000
-    """Largest number of Gaussians, from the start on."""
+    """Largest number of Gaussians at any step, including the start."""
     background: str = "scene"
-    """Background colour, where no Gaussian is: mean (mean colour of the training views), scene (colour of the files: white for
+    """Background colour, behind all Gaussians: mean (mean colour of the training views), scene (colour of the files: white for
     Blender, else black), auto (mean if the training views are opaque and show no object on black, else scene), black, white,
     #rrggbb, or r,g,b in [0, 1]."""
     strategy: str = "clone_split"
@@ -94,7 +93,7 @@ class FitConfig:
     stopping: StoppingConfig = field(default_factory=StoppingConfig)
     """Early stopping by left-out blocks of the training views, with any strategy (docs/decisions/020)."""
     init: InitConfig = field(default_factory=InitConfig)
-    """Source and first values of the Gaussians."""
+    """Source and initial values of the Gaussians."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Weights of the built-in loss terms."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -175,7 +174,7 @@ class FitConfig:
             config: FitConfig = _compose(FitConfig, values | parts | {"strategy_config": own}, "config")
             return config
         except (TypeError, KeyError) as e:
-            raise UsageError(f"another version of warpgs stored the configuration ({e})") from e
+            raise UsageError(f"the configuration was stored by another version of warpgs ({e})") from e
 
     def fingerprint(self) -> str:
         """Return the first 12 hexadecimal digits of the SHA-256 of the settings."""

@@ -34,12 +34,12 @@ class Growth(NamedTuple):
     """Times at which a strategy adds Gaussians, in steps done."""
 
     begins: int
-    """Step before which none are added."""
+    """Step before which no Gaussians are added."""
     ends: int
-    """Step after which none are added."""
+    """Step after which no Gaussians are added."""
     events: tuple[int, ...] = ()
-    """Times, ascending, at which many are added at once. Early stopping measures the model right before them. Empty if any time
-    is equally good."""
+    """Steps, ascending, at which many Gaussians are added at once. Early stopping measures the model right before them. Empty
+    if it may measure at any step."""
 
 
 @dataclass
@@ -56,7 +56,7 @@ class StrategyContext:
     table: Table
     """The Gaussians, with the strategy's columns."""
     generator: torch.Generator
-    """Generator of the fit, on the CPU, so that the numbers are the same on every device."""
+    """Generator of the fit, on the CPU, so that random numbers are the same on every device."""
     seed: int
     """Seed of the fit."""
     phases: Phases

@@ -1,6 +1,6 @@
-"""Held-out blocks of pixels, and the gain on them with its noise, by which a fit ends (docs/decisions/020).
+"""Held-out blocks of pixels, and the gain on them with its noise, which end a fit early (docs/decisions/020).
 
-To leave views or pixels out to choose a size is VGNC's idea (arXiv 2504.14548), here without its generative model.
+VGNC (arXiv 2504.14548) chooses the size of a model by held-out views from a generative model; here pixels are held out instead.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 FLOOR = (2 / 255) ** 2
-"""Mean squared error that is added to that of every block, so that errors below two levels of an 8-bit photograph hardly
-count."""
+"""Constant that is added to the mean squared error of every block, so that errors below two levels of an 8-bit photograph have
+little effect."""
 SIDES = 16, 32
-"""Bounds of the side of a block [px]: a sixteenth of the image's shorter side, within these bounds, but never more than an
+"""Bounds of the side of a block [px]. The side is a sixteenth of the image's shorter side, within these bounds, and at most an
 eighth."""
 MIN_BLOCKS = 12
 """Smallest number of blocks over all views for a significant gain."""
 MAX_FRACTION = 0.1
-"""Largest fraction of the pixels that small images hold out to reach `MIN_BLOCKS`, where less was requested."""
+"""Largest fraction of the pixels that may be held out in small images to reach `MIN_BLOCKS`, even if less was requested."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Blocks:
     side: int
     """Width and height [px]."""
     corners: torch.Tensor
-    """Row and column of the first pixel of each, int64 on the CPU, shape [B, 2]; no two overlap."""
+    """Row and column of the first pixel of each block, int64 on the CPU, shape [B, 2]; no two blocks overlap."""
 
     def __len__(self) -> int:
         """Return the number of squares."""
@@ -49,7 +49,7 @@ class Blocks:
 
 
 def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
-    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; masks keep more than half of each.
+    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; more than half of each is unmasked.
 
     In small images the fraction is larger, see `MAX_FRACTION`.
     """
@@ -98,8 +98,8 @@ def block_errors(
 
     Args:
         gaussians: The model.
-        views: Views with their own masks, not those of `hide`.
-        blocks: Blocks of each.
+        views: Views without the masks of `hide`.
+        blocks: Blocks of each view.
         options: Settings of the rasterizer.
     """
     errors = []
@@ -123,15 +123,15 @@ class Gain:
     """Gain of a change on the left-out blocks."""
 
     mean: float
-    """Mean drop of the error of a block [dB]."""
+    """Mean decrease of the error of a block [dB]."""
     noise: float
-    """Standard error of that mean [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
+    """Standard error of ``mean`` [dB]; infinite with fewer than two blocks. Blocks of a view are not independent, so the true
     error may be larger."""
 
     def upper_bound_below(self, least: float, noises: float) -> bool:
-        """Return whether mean plus so many standard errors is below ``least`` [dB]; True for a gain that is NaN.
+        """Return whether the mean plus ``noises`` standard errors is below ``least`` [dB]; True for a gain that is NaN.
 
-        With few blocks the noise is large, so that a fit of unknown gain continues.
+        With few blocks the noise is large, so a fit whose gain is uncertain continues.
         """
         return not self.mean + noises * self.noise >= least
 
@@ -139,7 +139,7 @@ class Gain:
 def gain(before: torch.Tensor, after: torch.Tensor) -> Gain:
     """Compute the gain from the errors of blocks before and after a change, shape [B] each.
 
-    Paired over blocks: ten times the decimal logarithm of the ratio of the errors, the floor added to both.
+    The gain of a block is ten times the decimal logarithm of the ratio of its errors, with the floor added to both.
     """
     each = 10 * torch.log10((before + FLOOR) / (after + FLOOR))
     count = len(each)

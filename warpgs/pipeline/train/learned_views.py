@@ -1,4 +1,4 @@
-"""The view modules of a fit with their parameters, and the part of each training view in them."""
+"""The view modules of a fit with their parameters, and their values for each training view."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class LearnedView:
     modules: tuple[ViewModule, ...]
     """View modules of the fit."""
     given: Camera
-    """Given camera, from which modules start."""
+    """Given camera, which modules change."""
     values: Tensors
     """Current values, by name, [...], overwritten in place."""
 
@@ -45,7 +45,7 @@ class LearnedViews:
             count: Number V of training views.
 
         Raises:
-            UsageError: Two modules have a parameter of one name.
+            UsageError: Two modules have a parameter of the same name.
         """
         self.modules = tuple(modules)
         self._names: list[tuple[str, ...]] = []
@@ -63,7 +63,7 @@ class LearnedViews:
 
     @classmethod
     def first(cls, modules: Sequence[ViewModule], views: Sequence[View], device: torch.device) -> LearnedViews:
-        """Return the modules with the parameters that they begin with; arguments are those of the constructor."""
+        """Return the modules with their initial parameters for training views."""
         return cls(modules, [m.parameters(views) for m in modules], device, len(views))
 
     def params_of(self, module: ViewModule) -> dict[str, torch.Tensor]:
@@ -75,7 +75,7 @@ class LearnedViews:
         return {n: lr for m in self.modules for n, lr in m.lrs(progress, extent).items()}
 
     def values(self, numbers: torch.Tensor) -> dict[str, torch.Tensor]:
-        """Return the values of all modules for views of these numbers [B], by name, shape [B, ...]; differentiable."""
+        """Return the values of all modules for views with these indices [B], by name, shape [B, ...]; differentiable."""
         return {n: t for m in self.modules for n, t in m.values(self.params_of(m), numbers).items()}
 
     def before_render(self, camera: Camera, values: Tensors) -> Camera:
@@ -90,7 +90,7 @@ class LearnedViews:
         return {n: t for n, t in found.items() if t is not None}
 
     def cameras(self, given: Mapping[str, Camera], train: Sequence[str], test: Sequence[str]) -> Mapping[str, Camera]:
-        """Return the cameras of all views as they are now, by name; arguments are those of `ViewModule.cameras`."""
+        """Return the current cameras of all views, by name; arguments are those of `ViewModule.cameras`."""
         for module in self.modules:
             given = module.cameras(given, train, test, self.params_of(module))
         return given

@@ -1,4 +1,4 @@
-"""The loop around the training steps: reports, checkpoints, stops, and a second try where memory ran out."""
+"""The loop around the training steps: reports, checkpoints, stops, and a second try after out of memory."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ def run(
 ) -> None:
     """Take all remaining steps; report each, and save at intervals and at the end.
 
-    A step that runs out of memory is tried once more with less (`Trainer.spare_memory`), from the last saved state where the
-    set of Gaussians was being changed; not so in one of several processes, which would be alone in that step.
+    A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the set of Gaussians was
+    being changed, the fit continues from the last saved state. With several processes there is no second try, because one
+    process would be alone in that step.
 
     Args:
         trainer: The fit.
@@ -36,8 +37,8 @@ def run(
         restore: Loads the last saved state; returns False without one.
 
     Raises:
-        NotFiniteError: The loss or, when it is to be saved, a number of the state is not finite; nothing of it is saved.
-        OutOfMemoryError: A step ran out of memory twice; the state before it is saved where it is whole.
+        NotFiniteError: The loss, or the state to save, is not finite; the state is not saved.
+        OutOfMemoryError: A step ran out of memory twice; the state before the step is saved if it is complete.
         KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
     """
     every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1

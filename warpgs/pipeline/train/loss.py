@@ -20,7 +20,7 @@ OUTPUTS = ("rgb", "alpha", "depth")
 
 @dataclass(frozen=True)
 class Target:
-    """Image, mask and maps of a view, which a step compares its render with."""
+    """Image, mask and maps of a view, with which a step compares the render."""
 
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
@@ -34,14 +34,16 @@ class Target:
 
 
 class _Outputs(dict[str, torch.Tensor]):
-    """Images of a render that a term requested; an error says how to ask for others."""
+    """Images of a render that a term requested; reading another one raises an error."""
 
     def __init__(self, term: LossTerm, images: Mapping[str, torch.Tensor]):
         super().__init__({n: images[n] for n in term.needs_outputs})
         self.term = term
 
     def __missing__(self, name: str) -> torch.Tensor:
-        raise UsageError(f"the loss term {self.term.name!r} reads the output {name!r} without asking: name it in needs_outputs")
+        raise UsageError(
+            f"the loss term {self.term.name!r} reads the output {name!r}, but did not request it; add it to needs_outputs"
+        )
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,8 @@ class LossInputs:
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
     tensors. Where poses are refined, the pose is that of the step and differentiable."""
     step: torch.Tensor
-    """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed with
-    other numbers; `LossTerm.active` has the number on the host."""
+    """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
+    for later steps; `LossTerm.active` has the number on the host."""
 
     def of(self, term: LossTerm) -> LossInputs:
         """Return the inputs of one term, with only the outputs that it needs."""
@@ -77,7 +79,7 @@ class LossTerm:
     needs_outputs: ClassVar[tuple[str, ...]] = ("rgb",)
     """Images of the render that the term reads (`LossInputs.outputs`). Other images have no gradient."""
     needs_priors: ClassVar[bool] = False
-    """True if `needs` reads the priors of the views; they are then computed before the fit."""
+    """True if `needs` reads the priors of the views, which are then computed before the fit."""
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the maps of a view that the term reads, by name, each of shape [H, W] or [H, W, C].
@@ -105,7 +107,7 @@ class LossTerm:
             inputs: The render's outputs that the term needs, the view, the Gaussians, the camera and the number of the step.
 
         Raises:
-            TypeError: The class does not define it.
+            TypeError: The class does not define ``__call__``.
         """
         raise TypeError(f"{type(self).__name__} must define __call__(inputs)")
 
@@ -132,7 +134,7 @@ def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
 def total(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of values [H, ...], shape [], with the same bits for any number of CPU threads.
 
-    torch's sum of a whole tensor depends on it on a CPU, so rows are summed first.
+    On a CPU torch's sum of a whole tensor depends on that number, so rows are summed first.
     """
     return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
 
@@ -141,10 +143,10 @@ Part = TypeVar("Part")
 
 
 def check_terms(terms: Sequence[LossTerm]) -> None:
-    """Check that a run folder could name the class of each loss term, and that a render has what each needs.
+    """Check that a run folder can name the class of each loss term, and that a render has all outputs that they need.
 
     Raises:
-        UsageError: One is not a loss term, its class is not registered by its own name, or it needs an unknown output.
+        UsageError: An object is not a loss term, its class is not registered, or it needs an unknown output.
     """
     for term in terms:
         kind = type(term)
@@ -172,7 +174,7 @@ def collect(terms: Sequence[LossTerm], parts: Callable[[LossTerm], Mapping[str, 
         what: Word for a part, for the message.
 
     Raises:
-        UsageError: Two terms have a part of one name.
+        UsageError: Two terms have a part of the same name.
     """
     found: dict[str, Part] = {}
     owners: dict[str, LossTerm] = {}

@@ -1,9 +1,9 @@
-"""Memory that a fit needs, added up from what its parts declare, and the means to keep to a limit.
+"""Memory that a fit needs, as the sum of the needs that its parts declare, and the means to keep to a limit.
 
-A step holds parameters with their Adam moments throughout, plus the memory of its largest phase. Each part declares its
-bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The
-CUDA driver, Python and the compiled kernels need more on top. Not counted, since they are small: parameters of single views,
-and the buffers of learning rates and losses (`StepBuffers`).
+A step always holds parameters with their Adam moments, plus the memory of its heaviest moment. Each part declares its bytes
+beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The CUDA
+driver, Python and the compiled kernels need additional memory. Small parts are not counted: parameters of single views, and the
+buffers of learning rates and losses (`StepBuffers`).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
 RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views.step_bytes)
-"""Parts of every step: their bytes by moment."""
+"""Functions that return the bytes of a part of every step, by moment."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +41,23 @@ class Layout:
     sizes: StepSizes
     """Sizes of every step, without Gaussians and instances."""
     parts: tuple[Callable[[StepSizes], Needs], ...]
-    """Parts of a step: their bytes by moment."""
+    """Functions that return the bytes of a part of a step, by moment."""
     table: Table
     """The Gaussians with their columns."""
     view_bytes: int
     """Bytes of all views, including data kept beside them."""
     graphs: int = 0
-    """CUDA graphs that exist at a time, one for each size of view; 0 where steps are taken one by one."""
+    """CUDA graphs that exist at a time, one for each size of view; 0 if steps are not captured."""
     sums: int = 0
-    """Sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
+    """Number of sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
 
     def held(self, count: int) -> int:
-        """Return the bytes that last from step to step: parameters, two Adam moments, columns, sums over slots, and views."""
+        """Return the bytes that persist between steps: parameters, two Adam moments, columns, sums over slots, and views."""
         sums = self.sums * (self.table.row_bytes + SUMMED * FLOAT)
         return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
-        """Return the bytes on top of `held` at each moment of a step that may be its heaviest.
+        """Return the bytes in addition to `held` at each moment of a step that may be its heaviest.
 
         ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
         """
@@ -68,7 +68,7 @@ class Layout:
         return needs
 
     def event(self, before: int, after: int) -> int:
-        """Return the bytes on top of ``held(after)`` while Gaussians are added."""
+        """Return the bytes in addition to ``held(after)`` while Gaussians are added."""
         return self.table.growth_bytes(before, after)
 
     def step(self, count: int, instances: int, chunked: bool = False) -> int:
@@ -95,7 +95,7 @@ class Layout:
 
 
 def _largest(low: int, high: int, fits: Callable[[int], bool]) -> int:
-    """Return the largest number that fits, where all below it do; ``low`` if none does."""
+    """Return the largest number that fits, by bisection: all smaller numbers fit, too; ``low`` if none fits."""
     while low < high:
         middle = (low + high + 1) // 2
         low, high = (middle, high) if fits(middle) else (low, middle - 1)
@@ -111,7 +111,7 @@ class MemoryPlan:
     available: int
     """Bytes that the device had free."""
     gaussians: int
-    """Number at the start."""
+    """Number of Gaussians at the start."""
     instances: int
     """Most (Gaussian, tile) instances of a view at the start."""
     planned: int
@@ -121,13 +121,13 @@ class MemoryPlan:
     planned_at_cap: int
     """Bytes of steps at the cap, if each Gaussian then touches as many tiles as at the start."""
     lowered_from: int | None = None
-    """Cap that was requested, where the limit lowered it."""
+    """Requested cap, if the limit lowered it; else None."""
     chunked: bool = False
-    """True where the first steps render images in chunks."""
+    """True if the first steps render images in chunks."""
     chunked_at_cap: bool = False
-    """True where steps at the cap do."""
+    """True if steps at the cap render images in chunks."""
     graph_refused: bool = False
-    """True if captured steps would exceed the limit, so that steps are taken one by one."""
+    """True if captured steps would exceed the limit, so that steps are not captured."""
 
     def to_json(self) -> dict:
         """Return plain values for metrics.json."""
@@ -147,7 +147,7 @@ class MemoryPlan:
             if self.planned_at_cap > self.available:
                 fraction = (self.available - self.planned) / max(1, self.planned_at_cap - self.planned)
                 reached = int(self.gaussians + max(0.0, fraction) * (self.cap - self.gaussians))
-                text += f"; the free {format_bytes(self.available)} are used up at about {reached:,}; set --memory-limit"
+                text += f"; the free {format_bytes(self.available)} suffice for about {reached:,} Gaussians; set --memory-limit"
                 return text
             return text if self.chunked else Detail(text)
         text += f"; limit {format_bytes(self.limit)}"
@@ -166,7 +166,7 @@ def layout_of(
 
     Args:
         table: The Gaussians with their columns.
-        views: Training views, those at half their size included.
+        views: Training views, including those of half size.
         terms: Loss terms.
         strategy: Density strategy.
         modules: View modules.
@@ -206,10 +206,10 @@ def plan(
         capacity_factor: Capacity of a CUDA graph for instances, as a multiple of the present number.
 
     Returns:
-        The plan, and the layout of the steps to be taken: without graphs where those would not keep to the limit.
+        The plan, and the layout of the steps: without graphs if graphs would exceed the limit.
 
     Raises:
-        UsageError: The limit is below the need of the smallest step.
+        UsageError: The limit is below the memory of the smallest step.
     """
     cap, refused = max(most, count), False
     single = replace(layout, graphs=0)

@@ -1,6 +1,6 @@
 """Decay of opacities: each step lowers every opacity by a fraction, so that Gaussians without support in the photographs fade.
 
-The idea is that of Binocular3DGS (Han et al. 2024, arXiv 2410.18822); docs/decisions/023-opacity-decay.md has the measurements.
+The idea comes from Binocular3DGS (Han et al. 2024, arXiv 2410.18822); docs/decisions/023-opacity-decay.md has measurements.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import torch
 from warpgs.kernels.opacity_decay import opacity_decay
 
 LEAST_LOGIT = -15.0
-"""Logit below which no opacity decays further: the pruning threshold is far above it."""
+"""Logit below which no opacity decays further, far below the pruning threshold."""
 
 
 @torch.no_grad()
 def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, used: torch.Tensor | None = None) -> None:
-    """Take a fraction of every opacity, in place; it may be part of a captured step.
+    """Lower every opacity by a fraction, in place; the call may be part of a captured step.
 
     Args:
         logits: Logits of opacities, float32, shape [N].

@@ -20,17 +20,17 @@ from warpgs.schema import SchemaError, of_type
 from warpgs.suggestion import did_you_mean
 
 Path = tuple[str, ...]
-"""Names of fields from a `FitConfig` to a setting; a number among them is the place of a loss term or a view module."""
+"""Path from a `FitConfig` to a setting, as names of fields; a number is the index of a loss term or a view module."""
 WITHOUT_PREFIX = "priors"
 """Group without a prefix in its flags."""
 PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
 """Fields that hold parts of a registry, each with settings of its own."""
 OTHERS = ("preset", "strategy", "strategy_config", *PARTS)
-"""Fields with their own way of setting, such as a name to look up."""
+"""Fields whose values are converted in their own way, such as a name to look up."""
 
 
 def setting_names(config: FitConfig) -> list[str]:
-    """Return the names of all settings, such as ``init.opacity``, those of strategy, loss terms and view modules included."""
+    """Return the names of all settings, such as ``init.opacity``, including those of strategy, loss terms and view modules."""
     return ["strategy", *PARTS, *VIEW_MODULES.names(), *_leaves(config)]
 
 
@@ -40,7 +40,7 @@ def keyword(name: str) -> str:
 
 
 def flag(name: str) -> str:
-    """Return the flag of a setting without its dashes in front: ``init.random-count`` of ``init.random_count``."""
+    """Return the flag of a setting without its leading dashes: ``init.random-count`` of ``init.random_count``."""
     return name.replace("_", "-")
 
 
@@ -49,10 +49,10 @@ def with_settings(config: FitConfig, values: Mapping[str, Any], place: str, *, k
 
     Args:
         config: Settings to start from.
-        values: New values by name: that of the flag, with dots or groups as mappings, or with underscores all through.
-        place: Where they stand, for messages: a file, or what was called.
-        keywords: True for keywords of a call in Python: only there may ``strategy``, ``loss_terms`` and ``view_modules`` name
-            ``module:Class`` or ``file.py:Class``, which imports it.
+        values: New values by name: the name of the flag, with dots or with groups as mappings, or with underscores throughout.
+        place: Source of the values, for messages: a file, or the function that was called.
+        keywords: True for keywords of a call in Python. Only then may ``strategy``, ``loss_terms`` and ``view_modules`` name
+            ``module:Class`` or ``file.py:Class``, which is imported.
 
     Raises:
         UsageError: A name is unknown, or a value is of another type or out of range; the message names it.
@@ -110,7 +110,7 @@ def _flat(values: Mapping[str, Any], place: str, prefix: str = "") -> Iterator[t
 
 
 def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> FitConfig:
-    """Return settings with the strategy, loss terms and view modules that are named, with default settings of their own."""
+    """Return settings with the named strategy, loss terms and view modules, which have their default settings."""
     strategy = given.get("strategy")
     if strategy is not None and strategy != config.strategy:
         kind = _found(STRATEGIES, strategy, own_code)
@@ -131,11 +131,11 @@ def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> 
 
 
 def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> tuple[Any, ...]:
-    """Return the parts that are given: as they are, or by name with default settings."""
+    """Return the given parts: objects unchanged, names as parts with default settings."""
     if isinstance(names, str):
         names = [n.strip() for n in names.split(",") if n.strip() not in ("", "none")]
     if not isinstance(names, (list, tuple)):
-        raise UsageError(f"{field} must be names with commas between, not {names!r}")
+        raise UsageError(f"{field} must be names separated by commas, not {names!r}")
     return tuple(p if isinstance(p, registry.base) else _found(registry, p, own_code)() for p in names)
 
 
@@ -180,7 +180,7 @@ def _put(changes: dict[str, Any], path: Path, value: Any) -> None:
 
 
 def _replaced(part: Any, changes: dict[str, Any]) -> Any:
-    """Return a dataclass, or a tuple of them, with fields replaced; each is made once, with all that changes in it."""
+    """Return a dataclass, or a tuple of dataclasses, with fields replaced; each is built once, with all its changes."""
     if isinstance(part, tuple):
         return tuple(_replaced(p, changes.get(str(i), {})) for i, p in enumerate(part))
     new = {n: _replaced(getattr(part, n), v) if isinstance(v, dict) else v for n, v in changes.items()}
@@ -188,7 +188,7 @@ def _replaced(part: Any, changes: dict[str, Any]) -> Any:
 
 
 def _typed(value: Any, hint: Any, name: str) -> Any:
-    """Return a value as its field has it; SchemaError if its type differs."""
+    """Return a value converted to the type of its field; SchemaError if the type does not match."""
     if name == "memory_limit" and isinstance(value, str) and value.lower() != "none":
         return parse_bytes(value)
     parts = typing.get_args(hint)
@@ -209,11 +209,13 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
 
 
 def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
-    """Return the message on a name that no setting has, with the nearest one that there is, spelled as it was."""
+    """Return the message on an unknown setting, with the most similar name in the user's spelling."""
     known = {keyword(n) if keywords else n: n for n in setting_names(config)}
     last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # as in `opacity` for `init.opacity`
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
     if name in groups:
-        return f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or one of them by its name"
+        return (
+            f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
+        )
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"{place}: unknown setting {name[:60]!r}; {hint}"

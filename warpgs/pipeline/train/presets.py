@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent / "preset_files"
 """Folder of the presets of warpgs."""
 SUFFIX = ".toml"
-"""End of the names of files with a preset."""
+"""Suffix of preset files."""
 MAX_BYTES = 2**16
 """Size of the largest file that is read [bytes]."""
 MAX_DEPTH = 8
-"""Number of tables and lists that may lie in each other."""
+"""Largest depth of nested tables and lists."""
 MAX_DOTS = 100
-"""Number of dots in a line: the time of Python's TOML reader grows with the square of the parts of a key."""
+"""Largest number of dots in a line: the time of Python's TOML reader grows with the square of the number of parts of a key."""
 MAX_BASES = 8
-"""Number of presets that may start from each other."""
+"""Longest chain of preset files, each the base of the next one."""
 DEFAULT_PRESET = "default"
-"""Preset where the user names none."""
+"""Preset if the user gives none."""
 NO_BASE = "none"
-"""Base of a preset that starts from the defaults of `FitConfig`."""
+"""Name of the base for a preset that starts from the defaults of `FitConfig`."""
 OWN_KEYS = ("base", "about")
 """Keys of a preset that are not settings."""
 
@@ -59,10 +59,10 @@ class Presets(Mapping[str, "FitConfig"]):
             about: A line about it for the help.
 
         Raises:
-            UsageError: A built-in preset has that name, or no flag could name it.
+            UsageError: A built-in preset has that name, or the name is not possible in a flag.
         """
         if name in self._files or ":" in name or name.endswith(SUFFIX) or not name.strip():
-            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without colon that warpgs does not use")
+            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without a colon that is not built in")
         self._made[name], self._about[name] = config, about
 
     def described(self) -> dict[str, str]:
@@ -99,11 +99,11 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
     Args:
         preset: Name of a preset; path of a .toml file; ``module:NAME`` or ``path/to/file.py:NAME`` of a `FitConfig` or a
             mapping, which runs that code; the object itself; or None for the default preset. The keys of a mapping or a file
-            are the names of flags; ``base`` names the preset that it starts from, default where it is not given.
+            are the names of flags; the key ``base`` names the preset to start from, by default the default preset.
 
     Raises:
         DataError: The file cannot be read or is not TOML.
-        UsageError: There is no such preset, or one of its settings is unknown or of another type.
+        UsageError: The preset is unknown, or one of its settings is unknown or has the wrong type.
     """
     from warpgs.pipeline.train.config import FitConfig
 
@@ -129,11 +129,11 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
 def chosen_settings(
     preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: Mapping[str, object]
 ) -> tuple[FitConfig, list[str]]:
-    """Return the settings of a preset with some replaced, as `warpgs.fit` takes both, and notes on where they come from.
+    """Return the settings of a preset with some replaced, both as in `warpgs.fit`, and a note on their source.
 
     Raises:
         DataError: The file of a preset cannot be read or is not TOML.
-        UsageError: There is no such preset, or a setting is unknown or of another type.
+        UsageError: The preset is unknown, or a setting is unknown or has the wrong type.
     """
     from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.overrides import with_settings
@@ -152,7 +152,7 @@ def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
 
 
 def preset_word(preset: str) -> str:
-    """Return a short word for a preset that a user names, for folders and tables: the name, or that of its file or object."""
+    """Return a short name of a user's preset for folders and tables: its own name, or that of its file or object."""
     return Path(preset).stem if preset.endswith(SUFFIX) else preset.rpartition(":")[2]
 
 
@@ -169,7 +169,7 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
     """Return the values of a TOML file, and the first digits of its SHA-256.
 
     Raises:
-        DataError: It cannot be read, is too large or too deep, or is not TOML.
+        DataError: The file cannot be read, is too large or too deeply nested, or is not TOML.
     """
     remedy = "give a file of settings such as `steps = 300` (docs/presets.md)"
     try:
@@ -210,10 +210,10 @@ def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path |
     elif base.endswith(SUFFIX):
         path = (Path() if folder is None else folder) / base
         if above >= MAX_BASES:
-            raise UsageError(f"{place}: base {base!r} is circular, or a chain of over {MAX_BASES} files; name another")
+            raise UsageError(f"{place}: base {base!r} is circular, or a chain of over {MAX_BASES} files; give another base")
         start, origin = _config_of_file(path, path.name, above)
     elif ":" in base:
-        raise UsageError(f"{place}: base {base!r} is code, which is never imported because a file names it; name a preset")
+        raise UsageError(f"{place}: base {base!r} is code; a preset file never loads code; give the name of a preset")
     elif base not in PRESETS:
         raise UsageError(f"{place}: base {base!r} is not one of {', '.join(PRESETS)}; choose one, a {SUFFIX} file or {NO_BASE}")
     else:

@@ -20,16 +20,16 @@ def sh_degree(step: int, every: int, highest: int) -> int:
 
 
 MAX_LR = 1e6
-"""Largest learning rate: far above what trains, far below what overflows within a fit."""
+"""Largest learning rate: far above useful rates, and far below rates that overflow within a fit."""
 MAX_DECAY = 0.1
-"""Largest fraction by which a step may lower an opacity: with it nothing stays opaque."""
+"""Largest fraction by which a step may lower an opacity; at this value no Gaussian stays opaque."""
 
 
 def check_lrs(of: str, **rates: float | None) -> None:
-    """Check learning rates and factors of them by name, of which None is left to choose; ``of`` names their settings.
+    """Check learning rates, and factors of them, by name; None is allowed; ``of`` names the group of settings.
 
     Raises:
-        UsageError: One is not positive, or above `MAX_LR`.
+        UsageError: A value is not positive, or above `MAX_LR`.
     """
     for name, value in rates.items():
         if value is not None and not 0 < value <= MAX_LR:
@@ -38,29 +38,29 @@ def check_lrs(of: str, **rates: float | None) -> None:
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Learning rates of the reference implementation of Kerbl et al. 2023, but for the scales."""
+    """Learning rates, by default those of the reference implementation of Kerbl et al. 2023, except for the scales."""
 
     means_lr: float | None = 1.6e-4
-    """Learning rate of the means, times the scene's extent, at the start. None: 1.6e-4, or more where the time of a CPU limits
-    the steps."""
+    """Learning rate of the means at the start, in units of the scene's extent. None: 1.6e-4, or more if a CPU's time limits the
+    steps."""
     means_lr_final: float = 1.6e-6
-    """The same at the last step; log-linear between."""
+    """Learning rate of the means at the last step, in units of the scene's extent; log-linear between."""
     quats_lr: float = 1e-3
     """Learning rate of the rotations."""
     scales_lr: float | None = 0.01
     """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md). None: by the number of
     views."""
     scales_decay: float = 1.0
-    """Fraction of that learning rate which is left at the last step; log-linear from the beginning of phase 3, or of a fit
+    """Ratio of the last to the first learning rate of the log scales; log-linear from the beginning of phase 3, or of a fit
     without phases. 1 for a constant rate."""
     opacities_lr: float | None = 0.05
     """Learning rate of the opacity logits. None: by the number of views."""
     opacities_decay: float | None = 0.0
-    """Fraction of every opacity that each step takes, in [0, 0.1]; 0 for none. None: by the number of views."""
+    """Fraction by which each step lowers every opacity, in [0, 0.1]; 0 for no decay. None: by the number of views."""
     sh_lr: float | None = 2.5e-3
-    """Learning rate of the constant colour coefficient. None: 2.5e-3, or more where the time of a CPU limits the steps."""
+    """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if a CPU's time limits the steps."""
     sh_rest_factor: float = 0.05
-    """Fraction of that for the other coefficients."""
+    """Learning rate of the other colour coefficients, as a fraction of ``sh_lr``."""
 
     def __post_init__(self):
         if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
@@ -72,7 +72,7 @@ class OptimizerConfig:
 
         Args:
             progress: Fraction of the fit, in [0, 1].
-            extent: Size of the scene [u], which the rate of the means is multiplied by.
+            extent: Size of the scene [u], a factor of the rate of the means.
             stable_start: Fraction of the fit, in [0, 1), after which the rate of the scales falls.
         """
         assert self.scales_lr is not None and self.opacities_lr is not None  # `settings_by_views` has chosen
@@ -88,7 +88,7 @@ class OptimizerConfig:
 
     @property
     def head_lrs(self) -> dict[str, float]:
-        """Learning rate of the first 3 numbers of a row, where it differs from the others'."""
+        """Learning rate of the first 3 numbers of a row, for parameters in which it differs from that of the others."""
         assert self.sh_lr is not None  # `settings_by_views` has chosen
         return {"sh": self.sh_lr}
 
@@ -97,7 +97,7 @@ class OptimizerConfig:
 class PhaseConfig:
     """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in the second.
 
-    A fit shorter than twice phases 1 and 3 together has all of them, and the interval, shortened in proportion.
+    In a fit shorter than twice phases 1 and 3 together, these phases and the interval are shortened in proportion.
     """
 
     coarse: int = 0
@@ -107,13 +107,13 @@ class PhaseConfig:
     every: float = 100.0
     """Steps from the first sampling event to the second (T_base, which the paper leaves open)."""
     growth: float = 4.0
-    """Growth of that interval over phase 2 (gamma, with the time t from 0 to 1): T_sample(t) = T_base (1 + gamma t)."""
+    """Growth of the interval between events over phase 2, gamma: T_sample(t) = T_base (1 + gamma t), t from 0 to 1."""
     least: float = 1.0
-    """Least T_base [steps] to which a short fit shortens it: on a CPU an event takes as long as ten steps."""
+    """Lower bound of T_base [steps] in short fits, which shorten it: on a CPU an event takes as long as ten steps."""
 
     def __post_init__(self):
         if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
-            raise UsageError("phases: coarse, stable and growth must be at least 0, and growth finite")
+            raise UsageError("phases: coarse, stable and growth must be at least 0 and finite")
         if not 1 <= self.every < math.inf or not 1 <= self.least < math.inf:
             raise UsageError("phases: every and least must be at least 1 and finite")
 
@@ -127,9 +127,9 @@ class Phases:
     stable_start: int
     """Steps done when phase 3 begins."""
     events: tuple[int, ...]
-    """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 where that is 0."""
+    """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 if ``refine`` is 0."""
     planned: int
-    """Planned number of steps, which sets the decay of learning rates up to phase 3."""
+    """Planned number of steps; learning rates up to phase 3 decay by this number."""
     steps: int
     """Number of steps; fewer than planned if phase 3 begins early."""
 
@@ -142,7 +142,7 @@ class Phases:
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
     def stable_from(self, step: int, planned_start: int) -> Phases:
-        """Return the phases if the third begins after ``step`` instead of ``planned_start``, and is shortened in proportion."""
+        """Return the phases if the third begins after ``step`` instead of its planned start; it is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 

@@ -1,4 +1,4 @@
-"""Preparation of a fit: its first points, priors of its views, and the views on the device."""
+"""Preparation of a fit: its initial points, priors of its views, and the views on the device."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Preparation:
     """Points, priors and notes, found before the first step."""
 
     views: list[View]
-    """The views to fit, with depth by a network where that guides the fit."""
+    """The views to fit, with depth from a network if depth guides the fit."""
     start: Start
-    """The first points, and the depths that views confirm."""
+    """The initial points, and the depths that other views confirm."""
     priors: list[Prior] | None
-    """One for each view; None if not needed."""
+    """Prior of each view; None if not needed."""
     notes: list[str]
     """Notes on choices, assumptions and missing inputs."""
 
@@ -47,7 +47,7 @@ def prepare(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator, device: torch.device,
     priors: list[Prior] | None, ready: Callable[[], object], progress: Callable[[str], object] = lambda line: None,
 ) -> Preparation:  # fmt: skip
-    """Find the first points, and compute priors if sampling or a loss term needs them and they are not given.
+    """Find the initial points, and compute priors if sampling or a loss term needs them and they are not given.
 
     Args:
         train: The views to fit.
@@ -60,10 +60,9 @@ def prepare(
         progress: Called with a line for the user about the current work.
 
     Raises:
-        DataError: There is nothing to start from.
-        UsageError: A view's camera cannot be rendered: its model is missing, or it has other coefficients. A given map is of
-            another size or not finite. Also if the start or the strategy compares views, and a camera has no pinhole of the
-            same K.
+        DataError: The scene gives no initial points.
+        UsageError: A view's camera cannot be rendered: its model is missing, or has other coefficients. A given map has the
+            wrong size or is not finite. The start or the strategy compares views, and a camera has no pinhole of the same K.
     """
     for view in train:
         check_camera(view.camera)
@@ -78,7 +77,7 @@ def prepare(
 
     @functools.cache
     def start() -> Start:
-        progress("finding start points")
+        progress("finding initial points")
         return _start_of(train, points, config, generator, usable, progress)
 
     notes = []
@@ -106,7 +105,7 @@ def _start_of(
     train: list[View], points: PointCloud | None, config: FitConfig, generator: np.random.Generator,
     usable: Callable[[], torch.device], progress: Callable[[str], object],
 ) -> Start:  # fmt: skip
-    """Return the first points and the depths that come with them; arguments are those of `prepare` and `initial_points`."""
+    """Return the initial points and the depths found with them; arguments are those of `prepare` and `initial_points`."""
     # searches along lines need pinhole images; given points need no search
     views = train if config.init.source == "points" else [pinhole_view(v) for v in train]
     found = initial_points(views, points, config.init, generator, usable, progress)
@@ -119,10 +118,10 @@ def _start_of(
 
 
 def _unused_networks(config: FitConfig) -> list[str]:
-    """Return notes on the networks that are named although nothing in the fit reads priors."""
+    """Return notes on networks that are given although the fit reads no priors."""
     switches = {"depth": "--depth-guides or --method.s-geometry", "segmentation": "--method.s-semantic"}
     named = [kind for kind in switches if getattr(config.priors, f"{kind}_model") is not None]
-    return [f"--{kind}-model is not used: this fit needs no such map; to use it, add {switches[kind]}" for kind in named]
+    return [f"--{kind}-model is not used by this fit; to use it, add {switches[kind]}" for kind in named]
 
 
 def _check_models(train: list[View], config: FitConfig) -> None:
@@ -130,7 +129,7 @@ def _check_models(train: list[View], config: FitConfig) -> None:
     others = sorted({v.camera.model for v in train} - {*CENTRAL})
     if others and (config.init.source != "points" or samples(config)):
         raise UsageError(
-            f"camera model {others[0]}: this start or strategy compares views, which needs one of {', '.join(CENTRAL)}; fit "
+            f"camera model {others[0]}: this start or strategy compares views, which requires {' or '.join(CENTRAL)}; fit "
             "with --preset 3dgs --init.source points, or undistort the images"
         )
 
@@ -141,7 +140,7 @@ def samples(config: FitConfig) -> bool:
 
 
 def needs_priors(config: FitConfig) -> bool:
-    """Return whether the strategy, a loss term or a network's depth instead of a given one needs the priors of the views."""
+    """Return whether the strategy, a loss term or depth guidance by a network needs the priors of the views."""
     by_strategy = find_strategy(config.strategy).needs_priors(config.groups())
     return by_strategy or config.priors.depth_guides or any(t.needs_priors for t in terms_of(config))
 

@@ -1,8 +1,8 @@
 """Sums over the views of a step, its slots, in one order for any number of processes.
 
-Numbers of float32 are added in a fixed binary tree over the slots 0 to B - 1: slots ``first`` to ``end`` are those up to the
-largest power of two below their number, plus the others. Each process sums the largest subtrees of its own slots. From the
-subtrees of all processes, each then finishes the same tree, with the same bits as a single process.
+float32 values are added in a fixed binary tree over the slots 0 to B - 1. The sum of n slots is the sum of the first p slots
+plus the sum of the others, with p the largest power of two below n. Each process sums the largest subtrees of its own slots.
+From the subtrees of all processes, each process then completes the same tree, with the same bits as a single process.
 """
 
 from __future__ import annotations
@@ -17,38 +17,39 @@ from warpgs.errors import UsageError
 from warpgs.runtime.ranks import Ranks
 
 SUMMED = 2
-"""Statistics of each Gaussian that are summed with the gradients of several views: sum of its gradients, number of renders."""
+"""Number of statistics of a Gaussian that are summed with the gradients of several views: sum of its gradients, and number of
+renders."""
 Node = tuple[int, int]
-"""Slots of a subtree: the first, and the one behind the last."""
+"""Slots of a subtree: the first, and the one after the last."""
 ALIGNMENT = 16
 """Alignment of the parts of a sum, in floats: Adam reads four at a time."""
 FLOAT_BYTES = 4
-"""Bytes of a number."""
+"""Size of a float [bytes]."""
 DIVIDED_BYTES = 2**26
-"""Size of a tensor from which its rows are divided among processes: smaller ones are updated faster than two more exchanges
-begin."""
+"""Least size of a tensor whose rows are divided among processes [bytes]: updating a smaller tensor takes less time than
+two more exchanges need to begin."""
 MAX_RENDERS = 2**24
-"""Number of renders that a fit must stay below: it is a float32, from which each takes its random numbers."""
+"""Upper bound of the number of renders of a fit: each render takes its random numbers from its number, a float32."""
 
 
 def check_ranks(batch: int, ranks: Ranks) -> None:
     """Check that every process has a view in each step of ``batch`` views.
 
     Raises:
-        UsageError: There are fewer views than processes.
+        UsageError: A step has fewer views than processes.
     """
     if batch < ranks.count:
         raise UsageError(
-            f"--batch {batch} gives a step fewer views than the {ranks.count} ranks that share them; give --batch "
-            f"{ranks.count} or a multiple of it, or start fewer ranks"
+            f"--batch {batch} is less than the number of ranks, {ranks.count}; give --batch {ranks.count} or a multiple "
+            "of it, or start fewer ranks"
         )
 
 
 def check_renders(batch: int, steps: int) -> None:
-    """Check that the views of all ``steps``, each of ``batch`` views, can be numbered.
+    """Check that the number of renders in ``steps`` of ``batch`` views is below `MAX_RENDERS`.
 
     Raises:
-        UsageError: There are too many.
+        UsageError: The number is too large.
     """
     if batch > 1 and steps * batch >= MAX_RENDERS:
         raise UsageError(f"{steps:,} steps of {batch} views are more than {MAX_RENDERS:,} renders; lower --steps or --batch")
@@ -62,12 +63,12 @@ def children(node: Node) -> tuple[Node, Node]:
 
 
 def own_slots(batch: int, ranks: int, rank: int) -> range:
-    """Return the slots of one of several ranks: equally many each, or one more."""
+    """Return the slots of a rank; the numbers of slots of any two ranks differ by at most one."""
     return range(rank * batch // ranks, (rank + 1) * batch // ranks)
 
 
 def subtrees(slots: range, node: Node) -> list[Node]:
-    """Return the largest nodes below a node that hold none but these slots, from the first slot to the last."""
+    """Return the largest nodes below a node that contain only these slots, from the first slot to the last."""
     first, end = node
     if slots.start <= first and end <= slots.stop:
         return [node]
@@ -86,7 +87,7 @@ def depth(node: Node) -> int:
 
 
 def finished(node: Node, known: Mapping[Node, torch.Tensor]) -> torch.Tensor:
-    """Return the sum of a node from those that are known, shape [...]; they are overwritten."""
+    """Return the sum of a node from known sums of its subtrees, shape [...]; these are overwritten."""
     if node in known:
         return known[node]
     left, right = (finished(child, known) for child in children(node))
@@ -115,18 +116,18 @@ class Tree:
 
     @property
     def width(self) -> int:
-        """Most subtrees that a process sums."""
+        """Largest number of subtrees that a process sums."""
         return max(map(len, self.nodes))
 
     @property
     def rows(self) -> int:
-        """Sums that a process keeps side by side: those that it adds up, one at least for each that is exchanged."""
+        """Number of sums that a process keeps side by side: partial sums, and at least one for each exchanged sum."""
         own = self.nodes[self.ranks.rank]
         return max(self.width, *(k + depth(node) for k, node in enumerate(own)))
 
     @property
     def buffers(self) -> int:
-        """Sums that a process keeps in all, with copies for the exchange."""
+        """Total number of sums that a process keeps, including copies for the exchange."""
         exchanged = 0 if self.ranks.count == 1 else self.width + (self.width if self.width > 1 else 0)
         return self.rows + exchanged
 
@@ -134,8 +135,8 @@ class Tree:
 class SlotSums:
     """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum.
 
-    The rows of a large tensor may be divided among processes: each gets the sums of its own rows, updates by these, and sends
-    what it has updated instead of sums.
+    The rows of a large tensor may be divided among processes. Each process gets the sums of its own rows, updates these rows,
+    and sends the updated rows instead of sums.
     """
 
     def __init__(
@@ -148,7 +149,7 @@ class SlotSums:
             shapes: Shape of each tensor.
             device: Where sums are kept.
             means: Number of tensors, the first ones, whose sums become means over the slots.
-            large: Number of the tensor whose rows are divided if it has at least `DIVIDED_BYTES`; None for no such tensor.
+            large: Index of the tensor whose rows are divided if it has at least `DIVIDED_BYTES`; None for no such tensor.
         """
         self.tree, self.shapes = tree, [tuple(s) for s in shapes]
         counts, unit = [torch.Size(s).numel() for s in self.shapes], ALIGNMENT * tree.ranks.count
@@ -156,9 +157,9 @@ class SlotSums:
         ends = list(accumulate(-(-counts[k] // ALIGNMENT) * ALIGNMENT for k in order))
         starts = dict(zip(order, [0, *ends[:-1]], strict=True))
         self.starts = [starts[k] for k in range(len(counts))]
-        """Start of each tensor in a sum; the large one is the first."""
+        """Offset of each tensor in a sum; the large tensor comes first."""
         self.divided = 0
-        """Rows of the large tensor that are divided, from the first; the few others are treated as all other tensors."""
+        """Number of rows of the large tensor, the first ones, that are divided; the last few are treated like other tensors."""
         self._width = 1
         if large is not None and tree.ranks.count > 1 and FLOAT_BYTES * counts[large] >= DIVIDED_BYTES:
             rows = self.shapes[large][0]
@@ -166,7 +167,7 @@ class SlotSums:
         self.rows = torch.zeros(tree.rows, -(-ends[-1] // unit) * unit, device=device)
         """The sums, shape [R, L]."""
         self.means = [(self.starts[k], self.starts[k] + counts[k]) for k in range(means)]
-        """Numbers of a sum that become means: the first of each tensor, and the one behind the last."""
+        """Ranges of a sum that become means: for each tensor, the first entry and the one after the last."""
 
     @property
     def own_rows(self) -> slice:
@@ -182,13 +183,13 @@ class SlotSums:
     def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
 
-        Divided rows hold the sum of this process's slots then, until `sum_own_rows`.
+        Divided rows then hold the sum of this process's slots, until `sum_own_rows`.
 
         Args:
-            slot: Function of a slot, the tensors of a sum, and whether it adds to them; else it overwrites them.
+            slot: Function of a slot, the tensors of a sum, and whether to add to them; else the function overwrites them.
 
         Raises:
-            ResourceError: Another process is gone.
+            ResourceError: Another process was lost.
         """
         own = self.tree.nodes[self.tree.ranks.rank]
         for row, node in enumerate(own):
@@ -212,7 +213,7 @@ class SlotSums:
         self.tree.ranks.gather(tensor[self.own_rows].view(-1), divided)
 
     def _add_node(self, node: Node, row: int, slot: Callable[[int, list[torch.Tensor], bool], None]) -> None:
-        """Add the slots of a node into a row, with those behind it as scratch."""
+        """Add the slots of a node into a row; the following rows are scratch memory."""
         if node[1] - node[0] == 1:
             slot(node[0], self.parts(row), False)
             return
@@ -235,6 +236,6 @@ class SlotSums:
         return own
 
     def _average(self, start: int, sums: torch.Tensor) -> None:
-        """Divide by the number of slots what becomes a mean among sums [S], which begin at ``start`` in a sum."""
+        """Divide the means among sums [S] by the number of slots; these sums begin at ``start`` in a sum."""
         for first, end in self.means:
             sums[max(0, first - start) : max(0, end - start)].mul_(1 / self.tree.batch)

@@ -1,8 +1,8 @@
 """One training step, called eagerly on a CPU and captured as a CUDA graph on a GPU.
 
-At sparse-view sizes a step keeps a GPU busy for less time than Python needs to launch it. There one step is captured, from the
-choice of the view to Adam, and replayed; learning rates and views of several steps are uploaded at once, losses read at their
-end. On a CPU the same function is called for each step.
+With few views and small images, a GPU needs less time for a step than Python needs to launch it. So on a GPU a step is
+captured, from the choice of the view to Adam, and replayed. Learning rates and views of several steps are uploaded at once;
+losses are read at the end of these steps. On a CPU the same function is called for each step.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, Render
 
 MAX_STEPS = 100
-"""Largest number of steps after which results are read back from the device."""
+"""Largest number of steps between two reads of results from the device."""
 MAX_VIEWS = 200
-"""The same as a number of rendered views, for steps of several views: a request to stop waits for them."""
+"""Largest number of rendered views between two such reads, for steps of several views: a request to stop waits for the next
+read."""
 
 
 def steps_at_once(batch: int) -> int:
-    """Return how many steps of ``batch`` views are taken at most before results are read back."""
+    """Return the largest number of steps of ``batch`` views before results are read back."""
     return min(MAX_STEPS, max(1, MAX_VIEWS // batch))
 
 
@@ -55,7 +56,7 @@ class StepPlan:
     limits: Limits = NO_LIMITS
     """Limits that the step holds every Gaussian to."""
     opacity_decay: float = 0.0
-    """Fraction of every opacity that the step takes."""
+    """Fraction by which the step lowers every opacity."""
     spares_unused: bool = False
     """True to keep the opacity of Gaussians that the step does not use."""
 
@@ -75,7 +76,7 @@ class StepBuffers:
         self.setting_rows = torch.zeros(rows, len(Setting), device=device)
         """Settings of each step, by `Setting`."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
-        """Number of the current step in its series. It stays once a step stops, and so do all Gaussians."""
+        """Number of the current step in its series. After a step stops, neither this number nor any Gaussian changes."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
         """0 while steps continue, else the reason why they stopped."""
         self.history = torch.zeros(rows, 2, device=device)
@@ -92,7 +93,7 @@ class StepBuffers:
         self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
-        """Return steps taken, the stop flag, and loss and squared error of each step, the one that was not finite included."""
+        """Return the number of steps taken, the stop flag, and losses and squared errors, including non-finite ones."""
         done, stop = int(self.counter), int(self.stop)
         return done, stop, self.history[: done + 1].tolist()
 
@@ -118,7 +119,7 @@ Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tenso
 
 
 def eager_renderer(options: RasterizeOptions, max_instances: int | None) -> Renderer:
-    """Return a renderer that allocates what each render needs, in chunks of at most ``max_instances``."""
+    """Return a renderer that allocates memory for each render, in chunks of at most ``max_instances``."""
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
@@ -166,7 +167,7 @@ class Learned:
     dropout_seed: int | None
     """Seed of the opacity dropout; None for none."""
     cameras: TrainingCameras
-    """Training cameras, which limits of sizes refer to."""
+    """Training cameras, to which limits of sizes refer."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,7 @@ class ViewGradients:
     settings: torch.Tensor
     """Settings of the step, shape [7]."""
     going: torch.Tensor
-    """True where nothing stops the step, bool, shape [1]."""
+    """True if nothing stops the step, bool, shape [1]."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,7 @@ class Forward:
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
     """Take one training step: render the next view, compute the loss, update all parameters.
 
-    Nothing changes where the render overflows or the loss is not finite: ``buffers.stop`` is set then.
+    If the render overflows or the loss is not finite, nothing changes except ``buffers.stop``, which is set.
 
     Args:
         learned: Tables and strategy that the step changes.
@@ -284,7 +285,7 @@ def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views:
 
 @torch.no_grad()
 def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor) -> None:
-    """Update all parameters and columns; nothing changes where ``stop`` [1] is not 0, int32."""
+    """Update all parameters and columns; nothing changes if ``stop`` [1] is not 0, int32."""
     descend(learned, plan, found, stop, list(learned.table.params))
     settle(learned, plan, found)
 
@@ -293,14 +294,14 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
 def descend(
     learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor, names: list[str], rows: slice = slice(None)
 ) -> None:
-    """Update parameters by Adam; nothing changes where ``stop`` [1] is not 0, int32.
+    """Update parameters by Adam; nothing changes if ``stop`` [1] is not 0, int32.
 
     Args:
         learned: Tables that the step changes.
         plan: Choices that the step is made of.
         found: Gradients and learning rates.
         stop: Not 0 to change nothing, int32, shape [1].
-        names: Parameters of the Gaussians. With the means come the parameters of view modules.
+        names: Parameters of the Gaussians. The parameters of view modules are updated together with the means.
         rows: Gaussians to update.
     """
     table, views = learned.table, learned.views.table
@@ -314,7 +315,7 @@ def descend(
 
 @torch.no_grad()
 def settle(learned: Learned, plan: StepPlan, found: ViewGradients) -> None:
-    """Apply what follows Adam: opacity decay, the strategy's own changes, limits, statistics."""
+    """Apply the changes after Adam: opacity decay, the strategy's own changes, limits, statistics."""
     table, strategy = learned.table, learned.strategy
     gradient = found.gradients[list(table.params).index("logit_opacities")]
     used = gradient != 0 if plan.spares_unused else None

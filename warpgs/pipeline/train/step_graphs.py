@@ -19,9 +19,9 @@ from warpgs.runtime.device_memory import available_bytes
 from warpgs.scene import Gaussians
 
 CAPACITY_FACTOR = 1.3
-"""Capacity of a captured step for instances, as a multiple of the most that any view has when it is captured."""
+"""Capacity of a captured step for instances, as a multiple of the largest number of any view at the time of capture."""
 DEAD_BYTES = 2**30
-"""Bytes of unused graphs that are kept. Freeing them takes milliseconds, in which the device waits."""
+"""Largest memory of unused graphs that is kept [bytes]. Freeing it takes milliseconds, in which the device waits."""
 
 
 class OverLimitError(ResourceError):
@@ -74,13 +74,13 @@ class Capacities:
 
 
 class StepGraphs:
-    """Captured steps, one for each plan and kind of view; captured at first use."""
+    """Captured steps, one for each plan and kind of view, captured at first use."""
 
     def __init__(
         self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions,
         work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
     ):  # fmt: skip
-        """Capture nothing yet.
+        """Begin without captured steps.
 
         Args:
             learned: Tables and strategy that steps change.
@@ -116,7 +116,7 @@ class StepGraphs:
             max_instances: Largest capacity for instances; None for no limit.
 
         Raises:
-            OverLimitError: The capacity of one would be above ``max_instances``.
+            OverLimitError: The capacity of a graph would be above ``max_instances``.
             ResourceError: The instances would not fit into memory.
         """
         self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
@@ -131,7 +131,7 @@ class StepGraphs:
         return [self._graphs[kind, plan] for kind in kinds]
 
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
-        """Return the graph of a function that changes nothing where the stop flag is set."""
+        """Return the graph of a function that changes nothing if the stop flag is set."""
         buffers = self.buffers
         here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
         self.stream.wait_stream(here)
@@ -153,14 +153,14 @@ def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, optio
     """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
 
     Raises:
-        ResourceError: They would not fit into memory.
+        ResourceError: The instances would not fit into memory.
     """
     counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in views.cameras()]
     wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
     budget = available_bytes(gaussians.means.device) * 4 // 5
     if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
         raise ResourceError(
-            f"a step would touch {wanted:,} tiles, which needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB; "
-            f"{budget / 2**30:.2f} GiB may be used. Fit smaller images with --downscale, or limit --max-gaussians."
+            f"a step needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB for {wanted:,} (Gaussian, tile) instances, but "
+            f"{budget / 2**30:.2f} GiB may be used; fit smaller images with --downscale, or lower --max-gaussians"
         )
     return wanted

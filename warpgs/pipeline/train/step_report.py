@@ -1,11 +1,11 @@
-"""Figures of a step, for callbacks and displays."""
+"""Results of a step, for callbacks and displays."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """Figures of one step."""
+    """Results of one step."""
 
     step: int
     """Steps done, from 1."""

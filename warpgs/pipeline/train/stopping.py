@@ -29,7 +29,7 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""Factor by which the steps grow while less than `StoppingConfig.min_gain_db` is gained, for a fit to end."""
+"""The gain is measured since the last measurement at which the number of steps was smaller by at least this factor."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class StoppingConfig:
     min_gain_db: float | None = 0.0
     """Growth ends when the gain of the left-out blocks over the last third of the steps, plus its noise, is below this [dB].
     The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor while views have half size.
-    0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 where a CPU's time limits the steps."""
+    0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if a CPU's time limits the steps."""
     fraction: float = 0.03
-    """Fraction of the pixels that is left out until growth ends."""
+    """Fraction of the pixels in blocks that are left out until growth ends."""
     measurements: int = 12
-    """Number of equal intervals of the time of growth; the blocks are measured after each."""
+    """Number of equal intervals of the growth phase; the blocks are measured after each interval."""
     noise: float = 1.0
-    """Noise of the gain, in standard errors of its mean over the blocks."""
+    """Factor of the noise, which is the standard error of the mean gain over the blocks."""
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
@@ -67,9 +67,9 @@ class Measurement:
     count: int
     """Gaussians at that step."""
     held_out_psnr: float
-    """PSNR of the left-out blocks, the error floor included [dB]."""
+    """PSNR of the left-out blocks, including the error floor [dB]."""
     gain: float
-    """Mean fall of the blocks' error since the measurement before, by growth and training together [dB]."""
+    """Mean decrease of the blocks' error since the previous measurement, by growth and training together [dB]."""
     noise: float
     """Standard error of ``gain`` over the blocks [dB]."""
 
@@ -86,8 +86,8 @@ STATE = schema.fields({
 class Stopping:
     """Held-out blocks of the training views, and the decision to end growth by their error.
 
-    Until growth ends, blocks of every view are held out of the loss and of sampling; from then on whole views are trained on.
-    The start uses whole images: the blocks measure growth, not the start.
+    Until growth ends, blocks of every view are held out of the loss and of sampling; afterwards all pixels are used. The start
+    uses whole images: the blocks measure growth, not the start.
     """
 
     def __init__(self, config: StoppingConfig):
@@ -100,17 +100,17 @@ class Stopping:
         self.why = ""
         """Reason why growth ended, for the user."""
         self.measurements: list[Measurement] = []
-        """Measurements but the first, which has no gain."""
+        """All measurements except the first, which has no gain."""
         self.whole: list[TrainingView] = []
-        """Views without hidden blocks; none where nothing is held out."""
+        """Views without hidden blocks; empty if nothing is held out."""
         self.blocks: list[Blocks] = []
         """Held-out blocks of each view."""
         self.marks: list[int] = []
         """Steps done when the blocks are measured: when growth begins, and after each interval."""
         self.earliest = 0.0
-        """Steps, from the first, in which views are half their size and growth does not end."""
+        """Number of steps, the first ones, in which views have half size and growth does not end."""
         self.measured: list[tuple[int, torch.Tensor]] = []
-        """Steps done, and errors of the blocks [B], of every measurement."""
+        """For every measurement, the steps done and the errors of the blocks [B]."""
 
     def begin(self, context: StrategyContext, strategy: Strategy, half_resolution: float) -> list[str]:
         """Choose the blocks and the times of measurements, and return notes for the user.
@@ -118,7 +118,7 @@ class Stopping:
         Args:
             context: Parts of the fit, with its views.
             strategy: Density strategy.
-            half_resolution: Fraction of the planned steps, from the first, in which views are half their size.
+            half_resolution: Fraction of the planned steps, the first ones, in which views have half size.
         """
         assert self.config.min_gain_db is not None  # `settings_by_views` has chosen
         if self.config.min_gain_db == 0:
@@ -133,11 +133,15 @@ class Stopping:
         held = sum(map(len, self.blocks))
         self.active = held >= MIN_BLOCKS and ends < planned and len(marks) > 1
         if not self.active:
-            few = f"the images hold only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
+            few = f"the images have only {held} blocks" if held < MIN_BLOCKS else "growth lasts to the end of the fit"
             return [Detail(f"early stopping is off, because {few}; the fit takes all its steps")]
         self.whole = context.views
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
-        return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are held out until growth ends, by step {ends}")]
+        return [
+            Detail(
+                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} or before"
+            )
+        ]
 
     @property
     def held_pixels(self) -> int:
@@ -149,7 +153,7 @@ class Stopping:
         return [hide(v, b) for v, b in zip(self.whole, self.blocks)]
 
     def sh_every(self, every: int, highest: int) -> int:
-        """Return the steps after which the degree in use rises, at most ``every``: ``highest`` is in use when growth begins."""
+        """Return the steps between rises of the degree, at most ``every``, so that ``highest`` is in use when growth begins."""
         if not self.active or highest == 0:
             return every
         return max(1, min(every, self.marks[0] // highest))
@@ -159,12 +163,12 @@ class Stopping:
         return self.active and self.ended is None and step in self.marks
 
     def changes(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> Iterator[DensityUpdate]:
-        """Yield the changes of the set of Gaussians after a step: those of the strategy, or the last ones, when growth ends.
+        """Yield the changes of the set of Gaussians after a step: those of the strategy, and the last changes when growth ends.
 
         Args:
             step: Steps done.
             strategy: Density strategy.
-            context: Parts of the fit; where growth ends, its third phase begins.
+            context: Parts of the fit; when growth ends, its third phase begins.
             degree: Degree of the harmonics in use.
         """
         if self.due(step) and self._measured(step, strategy, context, degree):
@@ -176,7 +180,7 @@ class Stopping:
             yield from strategy.update(step)
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
-        """Measure the blocks, where the set has changed since they were measured last; return whether growth ends."""
+        """Measure the blocks if the set has changed since the last measurement; return whether growth ends."""
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
             return False
@@ -201,7 +205,7 @@ class Stopping:
                 f"{lately.noise:.3f} dB)"
             )
         if step == self.marks[-1]:
-            return f"its planned steps are done ({self.measurements[-1].gain:+.3f} dB since the last measurement)"
+            return f"all its planned steps are done ({self.measurements[-1].gain:+.3f} dB since the previous measurement)"
         return ""
 
     def _is_early(self, step: int) -> bool:
@@ -220,7 +224,7 @@ class Stopping:
         """Load what `state` returned, ``tensors`` of shape [...] by name.
 
         Raises:
-            DataError: The errors of the blocks are not of these blocks.
+            DataError: The errors do not belong to these blocks.
         """
         shape = (len(plain["measured"]), sum(map(len, self.blocks)) if self.active else 0)
         measured = tensors.get("stopping.measured", torch.zeros(0, shape[1]))
@@ -233,7 +237,7 @@ class Stopping:
         self.measured = list(zip(plain["measured"], measured))
 
     def figures(self) -> dict[str, Any]:
-        """Return for metrics.json why growth ended, and the measurements; nothing where nothing was held out."""
+        """Return the reason why growth ended and the measurements, for metrics.json; empty if nothing was held out."""
         if not self.active:
             return {}
         return {

@@ -35,11 +35,11 @@ def check_state(
         state(plain, "")
         strategy(plain["strategy"], "strategy")
     except SchemaError as e:
-        raise DataError(f"the stored state is incomplete or damaged: {e}; restore it, or fit the scene again") from e
+        raise DataError(f"the stored state is incomplete or damaged: {e}; restore the file, or fit the scene again") from e
     try:
         torch.Generator().set_state(tensors["generator"])
     except (KeyError, TypeError, RuntimeError) as e:
         raise DataError(
-            "the stored state is incomplete: generator, the state of the random numbers, is missing or damaged; restore it, or "
-            "fit the scene again"
+            "the stored state is incomplete: generator (the state of the random numbers) is missing or damaged; restore the "
+            "file, or fit the scene again"
         ) from e

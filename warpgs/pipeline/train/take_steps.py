@@ -1,4 +1,4 @@
-"""Steps of a fit as its device takes them: one by one, replayed as graphs, or of several views spread over processes."""
+"""Steps of a fit: one by one, replayed as CUDA graphs, or with several views distributed over processes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class StepTaker:
     def __init__(
         self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions, batch: int, ranks: Ranks
     ):  # fmt: skip
-        """Capture nothing yet.
+        """Begin without captured steps.
 
         Args:
             learned: Tables and strategy that steps change.
             buffers: Settings and results of steps.
             options: Rule, background [3] and antialiasing of the fit.
             batch: Views of a step.
-            ranks: Processes that share them.
+            ranks: Processes that share the views of a step.
         """
         self.learned, self.buffers, self.options, self.ranks = learned, buffers, options, ranks
         own = (learned, buffers, options)
@@ -40,7 +40,7 @@ class StepTaker:
 
     @property
     def stopped_slot(self) -> int:
-        """First slot that stopped the last steps; 0 where none did, and in steps of one view."""
+        """First slot that stopped the last steps; 0 if none did, or in steps of one view."""
         return 0 if self.batched is None else self.batched.result()[0]
 
     def clear(self) -> None:

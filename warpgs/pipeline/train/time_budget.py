@@ -17,19 +17,19 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, View
 
 PIXELS_PER_GAUSSIAN = 4
-"""Pixels of the probe's render for each of its Gaussians, about the mean over a fit of preset `quick`."""
+"""Ratio of pixels to Gaussians in the probe's render, about the mean over a fit of preset `quick`."""
 REPEATS = 5
-"""Timed renders of a probe, after a first that compiles and loads kernels."""
+"""Timed renders of a probe, after a first render that compiles and loads kernels."""
 STEP, SETUP = 1.6, 11.0
-"""Mean time of a step of a fit, and time before the first step for each training view, in probes (`probe_seconds`). Measured on
-a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px. On CUDA, where
-steps are captured and probes are not, a step takes less, so that the prediction is an upper limit."""
+"""Mean time of a step of a fit, and set-up time for each training view, in units of a probe's time (`probe_seconds`). Measured
+on a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px. On CUDA, where
+steps are captured but probes are not, a step takes less, so the prediction is an upper limit."""
 MIN_STEPS = 100
-"""Fewest steps chosen: fewer give no usable scene. The most are `steps_by_views`."""
+"""Fewest steps chosen: fewer give no usable scene. `steps_by_views` returns the most."""
 
 
 def probe_seconds(width: int, height: int, device: torch.device) -> float:
-    """Measure the time of a render, its loss and gradients on this machine for a cloud that is always the same [s].
+    """Measure the time of a render, its loss and gradients on this machine, for a fixed set of Gaussians [s].
 
     Returns the median of `REPEATS`; takes some hundred milliseconds.
     """
@@ -81,15 +81,15 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
     steps = min(int((seconds - setup) / step), most)
     if steps < MIN_STEPS:
         raise UsageError(
-            f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s here, "
-            f"where an image with gradients takes {1000 * probe:.0f} ms; give more time, or smaller images with --downscale"
+            f"time-budget {seconds:g} s is too short: {MIN_STEPS} steps would take {setup + MIN_STEPS * step:.0f} s on this "
+            f"machine ({1000 * probe:.0f} ms for an image with gradients); give more time, or smaller images with --downscale"
         )
     needed = setup + steps * step
     return dataclasses.replace(config, steps=steps), (
-        f"time-budget {seconds:g} s: chose --steps {steps} of preset {config.preset}, predicted to take {needed:.0f} s "
-        f"here, where an image with gradients takes {1000 * probe:.0f} ms"
-        + (f"; {len(views)} views need no more" if steps == most else "")
-        + "; poses, start, scores and report come on top"
+        f"time-budget {seconds:g} s: chose --steps {steps} for preset {config.preset}, predicted to take {needed:.0f} s "
+        f"({1000 * probe:.0f} ms for an image with gradients)"
+        + (f"; {len(views)} views need no more steps" if steps == most else "")
+        + "; poses, start, scores and report take additional time"
     )
 
 
@@ -97,7 +97,7 @@ def check_budget(seconds: float) -> None:
     """Check a time budget [s].
 
     Raises:
-        UsageError: It is not a positive, finite number.
+        UsageError: The budget is not a positive, finite number.
     """
     if not 0 < seconds < float("inf"):
         raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

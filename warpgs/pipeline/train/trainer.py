@@ -1,4 +1,4 @@
-"""The training loop: from views and points to Gaussians, one view or several a step."""
+"""The training loop: from views and points to Gaussians, with one or several views per step."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Trainer:
     """The state of one fit: everything that changes from step to step, and nothing else."""
 
     chosen: list[int] | None = None
-    """Numbers of the views of the steps in progress; None between steps."""
+    """Indices of the views of the steps in progress; None between steps."""
 
     def __init__(
         self, train: list[View], points: PointCloud | None, config: FitConfig, device: torch.device,
@@ -51,27 +51,27 @@ class Trainer:
         ready: Callable[[], object] = lambda: None, *, progress: Callable[[str], object] = lambda line: None,
         ranks: Ranks = ALONE,
     ):  # fmt: skip
-        """Set up the first Gaussians.
+        """Set up the initial Gaussians.
 
         Args:
             train: The views to fit, at least one.
             points: The reconstruction's points, or None.
-            config: Settings, of which none is left open: `warpgs.pipeline.train.by_views.settings_by_views` chooses those.
+            config: Settings without automatic ones (None): `warpgs.pipeline.train.by_views.settings_by_views` chooses those.
             device: Device of the fit.
             background: Colour behind the scene.
-            priors: Prior of each view; None to compute them where sampling or a loss term needs them.
+            priors: Prior of each view; None to compute them if sampling or a loss term needs them.
             ready: Called before the device is used.
-            progress: Called with a line for the user on what is done before the first step.
-            ranks: Processes that share the views of a step; the fit is the same to the bit for any number of them.
+            progress: Called with a line for the user about the work before the first step.
+            ranks: Processes that share the views of a step; the fit has the same bits for any number of them.
 
         Raises:
-            DataError: There is nothing to start from.
-            UsageError: A camera cannot be rendered, the memory limit is below what the smallest step needs, a plug-in is not
-                there, two loss terms share the name of a map, two view modules that of a parameter, or the views cannot have
-                what a view module learns.
+            DataError: There is no training view, or the scene gives no initial points.
+            UsageError: A camera cannot be rendered, the memory limit is below the smallest step, a plug-in is missing, two loss
+                terms have a map of the same name, two view modules have a parameter of the same name, or a view module does
+                not support the views.
         """
         if not train:
-            raise DataError("there is no training view; name at least one in --split")
+            raise DataError("there is no training view; leave at least one in --split")
         for module in config.view_modules:
             module.check(train)
         self.config, self.device, self.ranks, self.batch = config, device, ranks, config.batch
@@ -79,16 +79,16 @@ class Trainer:
         made = prepare(train, points, config, np.random.default_rng(config.seed), device, priors, ready, progress)
         train = made.views
         self.notes: list[str] = made.notes
-        """Sentences on what was chosen for the user before the first step."""
+        """Notes on choices made before the first step, for the user."""
         self.messages: list[str] = []
-        """Sentences for the user that were not shown yet."""
+        """Messages for the user that were not shown yet."""
         cloud, cameras = made.start.cloud, [v.camera for v in train]
         self.radius = scene_radius(cameras, cloud)
         """Radius of the scene [u], as `scene_radius` measures it."""
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
         assert config.half_resolution is not None  # `settings_by_views` has chosen
         self.half_resolution = config.half_resolution
-        """Fraction of the planned steps, from the first, in which views are half their size."""
+        """Fraction of the planned steps, the first ones, in which views have half size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one
@@ -96,9 +96,9 @@ class Trainer:
         self.terms = terms_of(config, self.cutout, **given)
         self.step = 0  # taken
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
-        """Bytes that steps may take, None for no limit; and whether they may be captured (`spare_memory`)."""
+        """Memory limit of steps [bytes], None for no limit; and whether steps may be captured (`spare_memory`)."""
         self.order: list[int] = []
-        """Views that are still to come before any comes again, the next one last."""
+        """Views that are still to come in the current pass over all views, the next one last."""
         self.extrapolated = made.start.extrapolated > 0
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
         self._make_parts(train, made.start, scene_extent(cameras, cloud))
@@ -107,7 +107,7 @@ class Trainer:
         self._begin(with_learned(views, self.learned.views))
 
     def _make_parts(self, train: list[View], start: Start, extent: float) -> None:
-        """Make the Gaussians, the strategy, the parameters of view modules, and the taker of steps; extent in scene units."""
+        """Make the Gaussians, the strategy, the parameters of view modules, and the `StepTaker`; ``extent`` is in [u]."""
         c, device = self.config, self.device
         assert c.steps is not None and c.sh_degree is not None  # `settings_by_views` has chosen
         first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
@@ -151,7 +151,7 @@ class Trainer:
 
     @property
     def steps(self) -> int:
-        """Steps of the fit: those of the settings, or fewer once phase 3 began early."""
+        """Steps of the fit: those of the settings, or fewer if phase 3 begins early."""
         return self.phases.steps
 
     def progress(self, step: int) -> float:
@@ -165,7 +165,7 @@ class Trainer:
         return sh_degree(step, self.stopping.sh_every(self.config.sh_every, highest), highest)
 
     def plan_of(self, step: int) -> StepPlan:
-        """Return the choices that step number ``step``, from 1, is made with."""
+        """Return the plan of step number ``step``, from 1."""
         c = self.config
         terms = tuple(t for t in self.terms if t.active(step, self.phases.planned))
         strategy, half = self.strategy, step <= self.half_resolution * self.phases.planned
@@ -175,20 +175,20 @@ class Trainer:
         return StepPlan(self.degree(step), half, terms, strategy.phase(step), limits, decay, self.extrapolated)
 
     def next_view(self) -> int:
-        """Return the number of the next view. The order is random; each view comes once before any comes again."""
+        """Return the index of the next view. The order is random; each view comes once before any view comes again."""
         if not self.order:
             self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.order.pop()
 
     def advance(self, limit: int = 1) -> list[StepReport]:
-        """Take up to ``limit`` steps, and have the strategy change the set of Gaussians after the last when that is due.
+        """Take up to ``limit`` steps, and let the strategy change the set of Gaussians after the last step if a change is due.
 
-        On CUDA steps are replayed as graphs, several at a time, and end before anything that needs the host; elsewhere, and
-        where a memory limit leaves no capacity for graphs, one step is taken.
+        On CUDA steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU, or
+        if a memory limit does not allow graphs, one step is taken.
 
         Raises:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.
-            OutOfMemoryError: No memory was left for a step, or for a change of the set of Gaussians.
+            OutOfMemoryError: A step, or a change of the set of Gaussians, ran out of memory.
             ResourceError: The instances would not fit into memory.
         """
         try:
@@ -199,7 +199,7 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that found no memory. Where no step of its series was taken, its views are put back."""
+        """Return the error for a step that ran out of memory. If no step of its series was taken, its views are put back."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
@@ -207,7 +207,7 @@ class Trainer:
         return OutOfMemoryError(no_memory_message(error, f" for step {self.step + 1}"), intact)
 
     def spare_memory(self) -> None:
-        """Free unused memory, and run steps without graphs from here on, in chunks that fit into the free memory.
+        """Free unused memory, and run all further steps without graphs, in chunks that fit into the free memory.
 
         Raises:
             ResourceError: Not even the smallest step fits.
@@ -228,7 +228,7 @@ class Trainer:
                 raise
             raise self._no_memory(e) from e
         self.messages.append(
-            f"memory: step {self.step + 1} ran out of memory; steps run without CUDA graphs from here on, within "
+            f"memory: step {self.step + 1} ran out of memory; from now on, steps run without CUDA graphs, within "
             f"{format_bytes(self.memory_limit)}"
         )
 
@@ -272,7 +272,7 @@ class Trainer:
         ]
 
     def _take(self, places: list[tuple[Kind, int]], steps: range, plan: StepPlan) -> bool:
-        """Take steps with views at these places; return False, and take none, where graphs would need too much memory."""
+        """Take steps with views at these places; return False, and take none, if graphs would need too much memory."""
         try:
             self.taker.take(
                 places, lambda: [self.settings(step, slot) for step in steps for slot in range(self.batch)],
@@ -282,7 +282,7 @@ class Trainer:
             self.taker.clear()
             self.layout = dataclasses.replace(self.layout, graphs=0)
             self.count_changed()
-            self.messages.append(f"memory: steps run without CUDA graphs from here on, because {e}")
+            self.messages.append(f"memory: from now on, steps run without CUDA graphs, because {e}")
             return False
         return True
 
@@ -299,7 +299,7 @@ class Trainer:
         return c.optimizer.lrs(self.progress(step), self.context.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
-        """Return the settings of a step (`Setting`), or of one of its slots, which has its own number and random numbers."""
+        """Return the settings of a step (`Setting`), or of a slot, which has its own number for random numbers."""
         number = step if slot is None else (step - 1) * self.batch + slot + 1
         shifted = self.cutout and self.config.loss.random_background
         shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)
@@ -311,7 +311,7 @@ class Trainer:
         return self.stopping.due(step) or (self.stopping.ended is None and self.strategy.due(step))
 
     def _update(self) -> None:
-        """Change the set of Gaussians after the step that was just taken, where that is due."""
+        """Change the set of Gaussians after the last step, if a change is due."""
         if not self.is_due(self.step):
             return
         self.taker.clear()
@@ -330,11 +330,11 @@ class Trainer:
         self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
 
     def show_learned(self) -> None:
-        """Let the views show what view modules have learned by now."""
+        """Write the current values of view modules into the views."""
         show_learned(self.views, self.stacks, self.places, self.learned.views)
 
     def set_views(self, views: list[TrainingView]) -> None:
-        """Train on these views from here on, and plan the memory that steps need."""
+        """Set the training views, and plan the memory of steps."""
         c = self.config
         self.taker.clear()
         shown = [*views, *(half_size(v) for v in views if self.half_resolution > 0)]
@@ -373,7 +373,7 @@ class Trainer:
         """Load what `state` returned, ``tensors`` of shape [...] by name.
 
         Raises:
-            DataError: They are not what `state` returns.
+            DataError: The values are not a result of `state`.
         """
         check_state(
             tensors, plain, views=len(self.views), steps=self.phases.planned, strategy=self.strategy.STATE, stopping=STATE

@@ -34,7 +34,7 @@ class TrainingView:
     geometry: torch.Tensor | None = None
     """S_geometry in [0, 1], shape [H, W]; None if the strategy does not use it."""
     consistent: torch.Tensor | None = None
-    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None without any."""
+    """Geometrically consistent z-depth [u], 0 where no other view confirms it, shape [H, W]; None if not computed."""
     maps: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Maps for loss terms (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
@@ -97,10 +97,10 @@ def step_bytes(sizes: StepSizes) -> Needs:
 
 
 def view_bytes(views: Iterable[TrainingView]) -> int:
-    """Return the bytes of views: images, masks, opacities, maps and scores, memory that several share counted once.
+    """Return the bytes of views: images, masks, opacities, maps and scores; shared memory is counted once.
 
-    Stacks are not counted: on CUDA images, masks, opacities and maps of the views are parts of them (`stack_views`), elsewhere
-    there are none.
+    Stacks are not counted: on CUDA images, masks, opacities and maps of the views are parts of the stacks (`stack_views`), and
+    on a CPU stacks have no memory of their own.
     """
     tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.semantic, v.geometry, v.consistent, *v.maps.values()))
     storages = (t.untyped_storage() for t in tensors if t is not None)
@@ -124,7 +124,7 @@ def half_size_camera(c: Camera) -> Camera:
 def half_size(view: TrainingView) -> TrainingView:
     """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
 
-    Colours, opacities and maps are means over the covered pixels, and a pixel counts if all of those count.
+    Colours, opacities and maps are means over the covered pixels; a pixel counts if all covered pixels count.
     """
     camera = half_size_camera(view.camera)
     width, height = camera.width, camera.height
@@ -142,12 +142,12 @@ def half_size(view: TrainingView) -> TrainingView:
 
 
 Rows = torch.Tensor | tuple[torch.Tensor, ...]
-"""One entry for each view: a tensor [V, ...], or on a CPU a tensor for each."""
+"""One entry for each view: a tensor [V, ...], or on a CPU one tensor per view."""
 
 
 @dataclass(frozen=True)
 class ViewStack:
-    """Training views of one kind, stacked, from which a step takes its own."""
+    """Training views of one kind, stacked, from which a step takes its view."""
 
     viewmats: torch.Tensor
     """camera_from_world as given, shape [V, 4, 4]."""
@@ -164,7 +164,7 @@ class ViewStack:
     maps: Mapping[str, Rows]
     """Maps that loss terms requested, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
-    """Number of each view among all training views, int64, shape [V]."""
+    """Index of each view among all training views, int64, shape [V]."""
     alphas: Rows | None = None
     """Opacity of the subject, shape [V, H, W]; None if no training view has one."""
 
@@ -175,7 +175,7 @@ class ViewStack:
         return width, height
 
     def camera(self, viewmat: torch.Tensor, K: torch.Tensor, distortion: torch.Tensor | None) -> Camera:
-        """Return the camera of views of this stack; all that renders them takes their camera model from here.
+        """Return the camera of views of this stack, with their camera model.
 
         Args:
             viewmat: camera_from_world, shape [..., 4, 4].
@@ -190,9 +190,9 @@ class ViewStack:
 
 
 def stacked(tensors: Sequence[torch.Tensor]) -> Rows:
-    """Return tensors of one shape as one, [V, ...]; on a CPU, where a step takes them one by one, as they are.
+    """Return tensors of one shape as one, [V, ...]; on a CPU, where a step reads one at a time, return them unchanged.
 
-    Tensors that lie behind each other in memory already, as those of an earlier stack do, are not copied.
+    Tensors that already are consecutive in memory, as in an earlier stack, are not copied.
     """
     first = tensors[0]
     if first.device.type == "cpu":
@@ -218,12 +218,12 @@ def stack_views(
     """Stack views by size, by whether they have a mask, and by camera model.
 
     Args:
-        views: Views in the order of their numbers; those beyond ``count`` are the same views again at another size.
+        views: Views in the order of their indices; views after the first ``count`` are the same views at another size.
         count: Number of training views.
 
     Returns:
-        The views, whose pixels are parts of the stacks, so that nothing is held twice; the stacks by kind; and for each view
-        its kind and row there.
+        The views, whose pixels are parts of the stacks, without copies; the stacks by kind; and the kind and the row of each
+        view in its stack.
     """
     kinds = [v.kind for v in views]
     stacks, shared = {}, list(views)
@@ -267,7 +267,7 @@ def with_learned(views: list[TrainingView], learned: LearnedViews) -> list[Train
 
 @torch.no_grad()
 def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
-    """Return a stack with the cameras that its views have now."""
+    """Return a stack with the current cameras of its views."""
     if not learned.modules:
         return stack
     camera = stack.camera(stack.viewmats, stack.Ks, stack.distortions if stack.distortions.numel() else None)

@@ -1,7 +1,7 @@
-"""Warmup: a tiny fit beside the preparations of the real one, so that a CUDA device has loaded what the real one uses.
+"""Warmup: a tiny fit during the preparation of the real fit, to load everything that the real fit uses on a CUDA device.
 
-Contexts, kernels, libraries and modules of Python are loaded one by one as they are first used, which took two to three seconds
-of a fit on an H200. Semantics and matches are found on the CPU meanwhile.
+Contexts, kernels, libraries and modules of Python are loaded at their first use, which took two to three seconds of a fit on an
+H200. Semantics and matches are found on the CPU at the same time.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import Camera, PointCloud, Prior, View
 
 STEPS = 3
-"""Steps of the tiny fit: one for each phase."""
+"""Number of steps of the tiny fit, one for each phase."""
 SIDE, POINTS, PLANES = 48, 200, 8
-"""Sides of the tiny fit's views [px]; its number of points, and of planes."""
+"""Sides of the tiny fit's views [px]; its numbers of points and of sweep planes."""
 
 
 def _views(generator: np.random.Generator) -> list[View]:
@@ -41,10 +41,10 @@ def _views(generator: np.random.Generator) -> list[View]:
 
 
 def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Trainer:
-    """Fit noise in two small views with the same settings, refinement and sampling included, and score one view.
+    """Fit noise in two small views with the same settings, including refinement and sampling, and score one view.
 
     Args:
-        config: Settings of the real fit. Where that sweeps on the device, these views are swept, too.
+        config: Settings of the real fit. If that fit sweeps on the device, these views are swept, too.
         device: Device to work on.
         stopped: Returns, after each step, whether to stop.
 
@@ -78,10 +78,10 @@ def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool]
 
 @contextlib.contextmanager
 def background_warmup(config: FitConfig, device: torch.device) -> Iterator[Callable[[], object]]:
-    """Run `warm_up` in a thread within the block, where the device is a GPU that networks for priors do not use.
+    """Run `warm_up` in a thread within the block, if the device is a GPU that networks for priors do not use.
 
-    Yields a function that waits for the end of the warmup and raises its errors; until it has returned nothing else may use the
-    device, since steps may be being captured. The thread has ended when the block has, also after an error.
+    Yields a function that waits for the end of the warmup and raises its errors. Until the function returns, nothing else may
+    use the device, since steps may be captured at that time. The thread ends before the block does, also after an error.
     """
     if device.type != "cuda" or config.priors.onnx_provider == "cuda":
         yield lambda: None

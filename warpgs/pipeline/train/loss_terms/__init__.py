@@ -1,1 +1,1 @@
-"""Built-in loss terms, one purpose a module."""
+"""Built-in loss terms, one purpose per module."""

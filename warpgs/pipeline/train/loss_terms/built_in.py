@@ -1,4 +1,4 @@
-"""The loss that every fit has: its weights, and the terms that follow from them."""
+"""The loss of every fit: its weights, and its terms."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class LossConfig:
     ssim_weight: float = 0.2
     """Fraction lambda of the structural term, in [0, 1]."""
     random_background: bool = True
-    """True to change the background of views with an alpha channel, and of their renders, at each step. Otherwise Gaussians of
-    the background colour could cover empty areas. It has no effect on opaque views."""
+    """Put views with an alpha channel, and their renders, on a random background at each step. Without this, Gaussians of the
+    background colour could cover empty areas. No effect on opaque views."""
     alpha_weight: float = 1.0
     """Weight of the mean absolute difference of opacities, for views with an alpha channel, in [0, 1000]; 0 to disable."""
 
@@ -34,7 +34,7 @@ class LossConfig:
     1000]; 0 to disable."""
 
     exposure_weight: float = 0.01
-    """Weight of the sum of squares of each view's exposure less the identity, where exposures are learned, in [0, 1000]."""
+    """Weight of the squared difference between each learned exposure and the identity, in [0, 1000]."""
 
     def __post_init__(self) -> None:
         for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
@@ -47,7 +47,7 @@ class LossConfig:
 def built_in_terms(
     config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False
 ) -> tuple[LossTerm, ...]:
-    """Return the terms that every fit has by its settings and its views.
+    """Return the built-in terms of a fit, by its settings and its views.
 
     Args:
         config: Weights.

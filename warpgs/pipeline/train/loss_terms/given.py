@@ -1,8 +1,9 @@
-"""Loss terms on given depth and normals, for views that have them.
+"""Loss terms for given depth and normals, for views that have them.
 
-The depth term is the mean of |q / z - q / d|, rendered depth z and given depth d, with q the median given depth of the view: a
-difference of inverse depths without a unit, in which a far surface counts less than a near one and an outlier no more than any
-other. The normal term is the mean of 1 - cos of the angle between given normals and those of rendered depth.
+The depth term is the mean of |q / z - q / d|, with rendered depth z, given depth d, and the view's median given depth q. This
+difference of inverse depths has no unit. A far surface has less weight than a near one, and an outlier has no
+larger gradient than other pixels. The normal term is the mean of 1 - cos of the angle between given normals and those of
+rendered depth.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.scene import Prior
 
 MIN_ALPHA = 0.5
-"""Opacity above which a pixel shows a surface, whose depth counts."""
+"""Opacity above which a pixel shows a surface, so that its depth counts."""
 DEPTH_MAPS = 8
-"""Maps of one float a pixel that the depth term holds at the loss, with its gradient."""
+"""Number of maps with one float per pixel that the depth term and its gradient hold at the loss."""
 NORMAL_MAPS = 26
-"""The same of the normal term, whose points, differences and normals have three numbers each."""
+"""Number of such maps for the normal term; points, differences and normals count as three each."""
 
 
 def inverse_depth_difference(
@@ -86,7 +87,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
 
     Args:
         normals: Unit normals, 0 for missing values, shape [H, W, 3].
-        target: Given normals, 0 for missing values, shape [H, W, 3]; shorter ones, means of several, count less.
+        target: Given normals, 0 for missing values, shape [H, W, 3]; normals averaged over pixels are shorter, and count less.
         mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
@@ -101,7 +102,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
 @register("given_normals")
 @dataclass(frozen=True)
 class GivenNormalsDifference(LossTerm):
-    """The weighted 1 - cos of the angle between given normals and those of rendered depth, 0 in views without; for pinholes."""
+    """The weighted 1 - cos of the angle between given and rendered normals, 0 in views without; for pinholes."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
     weight: float = 0.03

@@ -22,13 +22,13 @@ from warpgs.scene import Prior
 MIN_ALPHA = 0.3
 """Opacity above which depth counts."""
 EDGE = 0.1
-"""Difference of colour between both neighbours, mean of the channels, at which the weight falls to 1/e."""
+"""Difference of colour between the two neighbours, as mean over the channels, at which the weight falls to 1/e."""
 BOUND = 0.1
-"""Largest value of a pixel: beyond it the gradient is 0."""
+"""Largest value of the term at a pixel; above it the gradient is 0."""
 CONFIRMED = 0.2
 """Weight of pixels with consistent depth."""
 MAPS = 12
-"""Maps of one float a pixel that the term holds at the loss, with its gradient."""
+"""Number of maps with one float per pixel that the term and its gradient hold at the loss."""
 
 
 def depth_roughness(

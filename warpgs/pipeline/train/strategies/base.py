@@ -32,8 +32,7 @@ class Strategy:
     Config: ClassVar[type | None] = None
     """Frozen dataclass of the strategy's settings; None for none. They become flags, grouped under the strategy's name."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
-    """Schema (`warpgs.schema`) of the plain values that `state` returns; values from files are checked against it before
-    `load`."""
+    """Schema (`warpgs.schema`) of the plain values that `state` returns; stored values are checked against it before `load`."""
 
     def __init__(self, context: StrategyContext):
         """Keep the context, which the strategy works with; nothing is trained yet.
@@ -47,17 +46,17 @@ class Strategy:
 
     @classmethod
     def samples(cls, settings: Settings) -> bool:
-        """Return whether it places Gaussians at pixels, which needs consistent depth; ``settings`` are those of the fit."""
+        """Return whether the strategy places Gaussians at pixels, which needs consistent depth; ``settings`` are the fit's."""
         return False
 
     @classmethod
     def needs_priors(cls, settings: Settings) -> bool:
-        """Return whether it reads scores from the priors of the views; ``settings`` are those of the fit."""
+        """Return whether the strategy reads scores from the priors of the views; ``settings`` are those of the fit."""
         return False
 
     @classmethod
     def warmup_config(cls, own: Any) -> Any:
-        """Return the strategy's settings for a warm-up of three steps, which should run each part of a fit once."""
+        """Return the strategy's settings for a warmup of three steps, which should run each part of a fit once."""
         return own
 
     def bytes(self, sizes: StepSizes) -> Needs:

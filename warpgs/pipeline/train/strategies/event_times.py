@@ -7,18 +7,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EventTimes:
-    """Events at equal distances, in steps done."""
+    """Events at equal intervals, in steps done."""
 
     after: int
-    """Steps after which the first event comes."""
+    """Step after which the first event comes."""
     every: int
-    """Steps between two events, which are at multiples of this."""
+    """Steps between two events; events are at multiples of this number."""
     until: int
     """Last step with an event."""
 
     @staticmethod
     def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:
-        """Return the times for a fit of that many steps; a short one starts after a quarter of its length."""
+        """Return the times for a fit of that many steps; in a short fit events start after a quarter of its length."""
         return EventTimes(min(start, steps // 4), every, int(stop_fraction * steps))
 
     def due(self, step: int) -> bool:

@@ -1,4 +1,4 @@
-"""Gain of a fine Gaussian: how fast it would lower the squared error of all views, before it is placed (docs/method.md)."""
+"""Estimated gain of a fine Gaussian: the rate at which it would lower the squared error of all views (docs/method.md)."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Camera
 
 EVERY = 2
-"""Distance of the pixels for which gains are computed [px]; those between repeat them, since a footprint is wider."""
+"""Distance between pixels for which gains are computed [px]; pixels between repeat them, since a footprint is wider."""
 HIDDEN = 1.05
-"""Depth, as a multiple of the rendered one, beyond which a point is hidden in a view."""
+"""A point is hidden in a view if its depth exceeds the rendered depth by this factor."""
 
 
 class Residual(NamedTuple):
-    """Residual of one view as Gaussians of one footprint see it."""
+    """Residual of one view, averaged over the footprint of a Gaussian."""
 
     camera: Camera
     """Camera of the view, tensors."""
     blurred: torch.Tensor
-    """The footprint over I - C (three channels) and over (I - C) . C, of image I and render C, shape [H, W, 4]."""
+    """I - C (three channels) and (I - C) . C of image I and render C, blurred by the footprint, shape [H, W, 4]."""
     depth: torch.Tensor
     """Rendered z-depth [u], shape [H, W]."""
 
 
 def residual_of(view: TrainingView, rgb: torch.Tensor, depth: torch.Tensor, footprint: float) -> Residual:
-    """Return the residual of a view; pixels that do not count have none.
+    """Return the residual of a view; it is 0 at pixels that do not count.
 
     Args:
         view: The view.
@@ -49,8 +49,8 @@ def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residu
     """Return the gain of Gaussians: half the slope at which their opacity lowers the squared error of all views, shape [S].
 
     A Gaussian of colour c, opacity o and footprint w in front of a colour C changes it to C + o w (c - C). The squared error to
-    I falls by 2 o sum w (I - C) . (c - C) to first order: c times the blurred residual, less the blurred (I - C) . C. It
-    counts in every view in which the point is not hidden.
+    I falls by 2 o sum w (I - C) . (c - C) to first order. The sum is c times the blurred residual, minus the blurred
+    (I - C) . C. It is added over all views in which the point is not hidden.
 
     Args:
         points: World points [u], shape [S, 3].
@@ -70,10 +70,10 @@ def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residu
 
 
 def gain_map(view: TrainingView, depth: torch.Tensor, valid: torch.Tensor, residuals: Sequence[Residual]) -> torch.Tensor:
-    """Return the gain of a Gaussian behind each pixel, in its colour, 0 where it is not above 0, shape [H, W].
+    """Return the gain of a Gaussian behind each pixel, in the pixel's colour, negative gains as 0, shape [H, W].
 
     Args:
-        view: The view whose pixels they are.
+        view: The view with the pixels.
         depth: Depth that Gaussians are placed at [u], shape [H, W].
         valid: Pixels with a depth, bool, shape [H, W].
         residuals: Residual of each view.

@@ -1,4 +1,4 @@
-"""Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), for strategies to be composed of."""
+"""Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), as a part of strategies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from warpgs.pipeline.train.strategies.event_times import EventTimes
 from warpgs.scene import Gaussians
 
 RESET_FREE_STEPS = 500
-"""Steps before the last event without opacity resets: transparent Gaussians would stay transparent."""
+"""Number of steps before the last event in which opacities are not reset: transparent Gaussians would stay transparent."""
 
 
 @dataclass(frozen=True)
@@ -26,23 +26,23 @@ class DensityConfig:
     """Thresholds and times of densification."""
 
     start: int = 500
-    """Steps before Gaussians are added and removed; a quarter of the fit if that is less."""
+    """Steps before Gaussians are first added and removed; at most a quarter of the fit."""
     every: int = 100
-    """Steps between these events."""
+    """Steps between events that add and remove Gaussians."""
     stop_fraction: float = 0.5
     """Fraction of the fit after which no Gaussians are added or removed."""
     gradient: float = 2e-4
-    """Mean gradient of the projected mean, in half image widths and heights, above which a Gaussian is densified."""
+    """Mean gradient of a projected mean, in half image widths and heights, above which the Gaussian is densified."""
     clone_size: float = 0.01
     """Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split."""
     prune_opacity: float = 0.005
     """Gaussians below this opacity are removed."""
     prune_size: float = 0.1
-    """Size above which Gaussians are removed after the first opacity reset, as a fraction of the extent, unless these are more
-    than half of all; 0 to disable."""
+    """Size above which Gaussians are removed after the first opacity reset, as a fraction of the scene's extent; none are
+    removed if more than half are larger. 0 to disable."""
     reset_every: int = 0
-    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for none. With few views the fit does not recover from a reset
-    (docs/decisions/002-no-opacity-reset.md)."""
+    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for no resets. With few views the fit does not recover from a
+    reset (docs/decisions/002-no-opacity-reset.md)."""
     reset_opacity: float = 0.01
     """Largest opacity after a reset."""
     morton_order: bool = True
@@ -156,12 +156,12 @@ class GradientGrowth:
 
     @staticmethod
     def columns() -> dict[str, Column]:
-        """Return the sum of the gradient norms of each projected mean, and the number of renders that it was seen in."""
+        """Return the columns for the sum of gradient norms of a projected mean, and for the number of renders that saw it."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
     @property
     def times(self) -> EventTimes:
-        """Times of refinement as the phases are now: to the third, in a fit that has phases."""
+        """Times of refinement by the current phases: until the third phase, in a fit with phases."""
         phases, planned = self.context.phases, self.context.settings[PhaseConfig]
         times = self.config.times(phases.planned)
         until = phases.stable_start if planned.coarse + planned.stable > 0 else min(times.until, phases.stable_start)

@@ -1,7 +1,7 @@
 """Importance of the pixels of a training view: the paper's three scores, and their weighted sum.
 
-Paper, section "Multi-Modal Importance Assessment". What it leaves open (the scale of each score, the unit of depth, the
-weight of curvature) is decided here and in docs/decisions/008-method.md.
+Paper, section "Multi-Modal Importance Assessment". The paper does not specify the scale of each score, the unit of depth and
+the weight of curvature; see docs/decisions/008-method.md for our choices.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from warpgs.errors import UsageError
 from warpgs.pipeline.metrics.quantiles import quantiles
 
 PERCENTILES = (0.02, 0.98)
-"""Quantiles of a view's score that map to 0 and 1, so that a few extreme pixels do not flatten the rest."""
+"""Quantiles of a view's score that map to 0 and 1, so that a few extreme pixels do not compress the range of the rest."""
 BLUR = 1.0
 """Standard deviation [px] of the blur of residuals and disparities, so that single noisy pixels attract no samples."""
 
@@ -31,8 +31,8 @@ class ImportanceConfig:
     geometry: float = 0.4
     """Weight of the geometric score (paper, w3)."""
     residual: str = "length"
-    """Rendering residual: length (the paper) of the colour difference in the view; or gain, the estimated drop of the squared
-    error of all training views by a fine Gaussian at the pixel."""
+    """Rendering residual: length (the paper), that of the colour difference in the view; or gain, the estimated decrease of the
+    squared error over all training views by a fine Gaussian at the pixel."""
     curvature: float = 0.5
     """Weight of the second derivatives in the geometric score (lambda_curv; the paper gives no value)."""
 
@@ -82,7 +82,7 @@ def _slopes(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tensor | None = None) -> torch.Tensor:
     """Compute S_geometry: length of the disparity's gradient plus ``curvature`` times the norm of its second derivatives.
 
-    Both are brought to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
+    Both are scaled to [0, 1] before they are added, and so is the sum, since relative disparity has no unit.
 
     Args:
         disparity: Relative inverse depth, shape [H, W].
@@ -121,7 +121,7 @@ def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry:
 def importance(scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor], by: tuple[float, float, float]) -> torch.Tensor:
     """Compute S_importance = w . s of the render, semantic and geometric score, each [H, W] in [0, 1].
 
-    It is 1 everywhere where no weight is above 0, so that sampling without a score is uniform.
+    If all weights are 0, S_importance is 1 everywhere, so that sampling is uniform.
     """
     if sum(by) == 0:
         return torch.ones_like(scores[0])

@@ -1,4 +1,4 @@
-"""Importance sampling: growth by gradient, and fine Gaussians behind sampled pixels, protected for a while.
+"""Importance sampling: growth by gradient, and fine Gaussians behind sampled pixels, protected for some steps.
 
 Paper, sections "Hierarchical Gaussian Representation" and "Training Strategy"; events are those of `sampling_event`.
 """
@@ -29,9 +29,9 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 
 COARSE = 0
-"""Layer of the Gaussians that were not sampled; that of the others is `FINE`."""
+"""Layer of the Gaussians that were not sampled; sampled Gaussians have `FINE`."""
 NOT_SAMPLED = -(2**30)
-"""``created_step`` of Gaussians that were not sampled: the coarse layer."""
+"""``created_step`` of the coarse layer, whose Gaussians were not sampled."""
 _COUNT = schema.whole(0)
 EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
 """Schema of a stored event."""
@@ -41,8 +41,8 @@ EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quan
 class ImportanceSampling(Strategy):
     """The method: a coarse layer, fine Gaussians sampled by importance, protection, three phases.
 
-    Its settings are `FitConfig.density`, `FitConfig.method` and `FitConfig.phases`; with ``method.events`` off it is clone and
-    split.
+    Its settings are `FitConfig.density`, `FitConfig.method` and `FitConfig.phases`. With ``method.events`` off the strategy is
+    clone_split.
     """
 
     STATE = staticmethod(schema.fields({**GradientGrowth.STATE, "events": schema.items(EVENT)}))
@@ -59,11 +59,11 @@ class ImportanceSampling(Strategy):
         """Function that is called with the step and the event after each event."""
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes of image, three scores and their sum, which an event keeps of each view."""
+        """Return the bytes that an event keeps for each view: image, three scores and their sum."""
         return {SAMPLING: 7 * FLOAT * sizes.pixels * min(sizes.views, MAX_VIEWS)} if self.method.events else {}
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the gradients' columns, the layer of each Gaussian, and the step at which it was sampled."""
+        """Return the columns of gradients, of the layer of each Gaussian, and of the step at which it was sampled."""
         own = {"level": Column(COARSE, torch.int32), "created_step": Column(NOT_SAMPLED, torch.int32)}
         return {**self.gradients.columns(), **own}
 
@@ -85,7 +85,7 @@ class ImportanceSampling(Strategy):
 
     @property
     def protects(self) -> bool:
-        """True where fine Gaussians are protected."""
+        """True if fine Gaussians are protected."""
         return self.method.events and self.method.pm
 
     def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
@@ -93,7 +93,7 @@ class ImportanceSampling(Strategy):
         return step - self.context.table.columns["created_step"] <= self.method.protect.steps
 
     def is_layered(self, step: int) -> bool:
-        """Return whether only the fine layer grows, and the coarse one moves slowly: from phase 2 on."""
+        """Return whether only the fine layer grows and the coarse layer moves slowly: from phase 2 on."""
         return bool(self.method.hier) and self.method.events and step > self.context.phases.refine
 
     def growth(self) -> Growth:
@@ -131,17 +131,17 @@ class ImportanceSampling(Strategy):
         return self.gradients.due(step) or self.samples_after(step) or self.shrinks_after(step)
 
     def shrinks_after(self, step: int) -> bool:
-        """Return whether Gaussians that contribute least are removed after a step: the last of phase 2."""
+        """Return whether the Gaussians that contribute least are removed after a step, which is the last of phase 2."""
         return self.method.events and self.method.keep < 1 and step == self.context.phases.stable_start
 
     def shrink(self, views: list[TrainingView]) -> DensityUpdate:
-        """Return the change that leaves ``method.keep`` of the Gaussians."""
+        """Return the change that keeps the fraction ``method.keep`` of the Gaussians."""
         t = self.context
         count = max(1, round(self.method.keep * len(t.table)))
         return keep_contributors(t.gaussians, count, views, t.render_options())
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Refine, then sample, where it is time for either.
+        """Refine, then sample, if either is due.
 
         From phase 2 on only the fine layer grows, and protected Gaussians are not pruned.
         """
@@ -172,7 +172,7 @@ class ImportanceSampling(Strategy):
         )  # fmt: skip
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Sample as many fine Gaussians per pixel in the blocks, where none were sampled so far, as there are elsewhere."""
+        """Sample fine Gaussians in the blocks that were held out so far, as many per pixel as in the other pixels."""
         if self.method.events and self.method.keep < 1:
             yield self.shrink(self.context.views)
         pixels = sum(v.image[..., 0].numel() for v in views)

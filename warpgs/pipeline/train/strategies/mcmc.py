@@ -24,11 +24,11 @@ from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
 MAX_COPIES = 51
-"""Largest number of Gaussians that one may become at a time, as in the authors' program."""
+"""Largest number of Gaussians that replace one at an event, as in the authors' program."""
 MAX_OPACITY = 1 - 2**-24
-"""Largest opacity in relocation: below 1 the logit is finite."""
+"""Largest opacity in relocation; it is below 1, so that the logit is finite."""
 NOISE_STREAM = 0x6D636D63
-"""Mixed into the seed, so that noise and opacity dropout do not take the same random numbers."""
+"""Constant mixed into the seed, so that noise and opacity dropout use different random numbers."""
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
 """Perturbation fades above this opacity: sigmoid(-slope (opacity - this)), eq. 8 with k = 100 and t = 0.995 of 1 - opacity."""
 
@@ -38,9 +38,9 @@ class MCMCConfig:
     """Settings of strategy mcmc; the defaults are the paper's."""
 
     start: int = 500
-    """Steps before Gaussians are relocated and added; a quarter of the fit if that is less."""
+    """Steps before Gaussians are first relocated and added; at most a quarter of the fit."""
     every: int = 100
-    """Steps between these events."""
+    """Steps between events that relocate and add Gaussians."""
     stop_fraction: float = 0.83
     """Fraction of the fit after which no Gaussians are added or relocated; 25,000 of 30,000 steps in the paper."""
     growth: float = 0.05
@@ -48,7 +48,7 @@ class MCMCConfig:
     min_opacity: float = 0.005
     """Largest opacity of a dead Gaussian, in [0, 0.5]."""
     noise_lr: float = 5e5
-    """Size of the perturbation, times the learning rate of the means."""
+    """Size of the perturbation, as a multiple of the learning rate of the means."""
     opacity_weight: float = 0.01
     """Weight of the mean opacity in the loss."""
     scale_weight: float = 0.01
@@ -67,10 +67,10 @@ class MCMCConfig:
 
 @torch.no_grad()
 def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return opacity and scale factor of each of N Gaussians that stand in one place for one Gaussian (eq. 9).
+    """Return opacity and scale factor of each of N Gaussians that replace one Gaussian in one place (eq. 9).
 
-    The new opacity is 1 - (1 - o)^(1/N), so that together they are as opaque at the centre; the scales shrink such that the
-    integral over a line through the centre stays. In float64, since the sum alternates.
+    The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians are together as opaque at the centre. The scales shrink such
+    that the integral over a line through the centre is unchanged. It is computed in float64, since the sum alternates.
 
     Args:
         opacities: o of the one Gaussian, in (0, 1), shape [M].
@@ -121,14 +121,14 @@ def make_kernel() -> wp.Kernel:
 def perturb(
     gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float
 ) -> None:  # fmt: skip
-    """Add noise of each Gaussian's own covariance to its mean, in place; the less the more opaque it is (eq. 8).
+    """Add noise with each Gaussian's own covariance to its mean, in place; more opaque Gaussians get less noise (eq. 8).
 
     The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit.
 
     Args:
         gaussians: N Gaussians, float32.
-        settings: Settings of the step (`Setting`), of which number and learning rate are read, float32, shape [7].
-        going: Nothing changes where this is False, bool, shape [1].
+        settings: Settings of the step (`Setting`), float32, shape [7]; step number and learning rate are read.
+        going: False to change nothing, bool, shape [1].
         seed: Any 32-bit integer.
         noise_lr: Factor of the learning rate.
     """
@@ -163,14 +163,14 @@ class MCMC(Strategy):
         return Growth(self.times.after, self.times.until)
 
     def regularisation(self, phase, gaussians):
-        """Return the weighted mean opacity plus the weighted mean axis length, shape [], by which unneeded Gaussians die."""
+        """Return the weighted mean opacity plus the weighted mean axis length, shape []; it makes unneeded Gaussians die."""
         c = self.config
         # in float64, since the rounding of float32's functions depends on the processor
         opacity, scale = gaussians.logit_opacities.double().sigmoid().mean(), gaussians.log_scales.double().exp().mean()
         return (c.opacity_weight * opacity + c.scale_weight * scale).to(gaussians.log_scales.dtype)
 
     def after_step(self, phase, settings, going):
-        """Perturb the means; nothing changes where ``going`` [1] is False. ``settings`` has shape [7]."""
+        """Perturb the means; nothing changes if ``going`` [1] is False. ``settings`` has shape [7]."""
         t = self.context
         perturb(t.table.gaussians, settings, going, seed=t.seed ^ NOISE_STREAM, noise_lr=self.config.noise_lr)
 

@@ -1,4 +1,4 @@
-"""Sampling of the pixels that get a fine Gaussian, and its first values (paper, section "Geometric-Aware Sampling")."""
+"""Sampling of pixels for fine Gaussians, and initial values of these (paper, section "Geometric-Aware Sampling")."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warpgs.pipeline.metrics.quantiles import quantiles
 from warpgs.scene import Camera
 
 SUPPORT = 4
-"""Fewest pixels that a gate leaves, as a multiple of those to be sampled; with fewer its quantile is lowered."""
+"""Fewest pixels that must pass a gate, as a multiple of those to be sampled; with fewer, the gate's quantile is lowered."""
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class SamplerConfig:
     """Placement of fine Gaussians at one event."""
 
     depth: str = "rendered"
-    """Depth of new Gaussians: rendered (the paper), or consistent, the depth of the start where other views confirm it. With
-    consistent, only pixels with such depth are reliable, in views that have some."""
+    """Depth of new Gaussians: rendered (the paper), or consistent, the initial depth that other views confirm. With consistent,
+    the gate lets only pixels with such depth pass, in views that have some."""
     fraction: float = 0.005
     """Gaussians per event and view, as a fraction of the view's pixels."""
     gate_quantile: float = 0.6
@@ -33,9 +33,9 @@ class SamplerConfig:
     border: int = 2
     """Width of the image border in which no pixel is sampled [px]."""
     opacity: float = 0.1
-    """First opacity of a fine Gaussian, in (0, 1)."""
+    """Initial opacity of a fine Gaussian, in (0, 1)."""
     footprint: float = 1.0
-    """First standard deviation of a fine Gaussian [px], in the view of its pixel."""
+    """Initial standard deviation of a fine Gaussian [px], in the view of its pixel."""
     max_fraction: float = 0.5
     """Largest number of fine Gaussians, as a fraction of the coarse ones."""
 
@@ -71,10 +71,10 @@ def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, 
         geometry: S_geometry, shape [H, W].
         valid: Pixels that may be sampled at all, bool, shape [H, W].
         quantile: tau_geometry as a quantile, in [0, 1).
-        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times as many pass, or all valid ones.
+        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times as many or all valid pixels pass.
 
     Returns:
-        The gate, bool, shape [H, W], and the quantile that was used; where the score is constant all valid pixels pass.
+        The gate, bool, shape [H, W], and the quantile that was used; if the score is constant, all valid pixels pass.
     """
     values = geometry[valid]
     while quantile > 0 and len(values) > 0:

@@ -1,4 +1,4 @@
-"""One sampling event: score the training views, sample pixels, put fine Gaussians behind them; and its settings.
+"""A sampling event: score the training views, sample pixels, add fine Gaussians behind them. And the settings of events.
 
 Paper, sections "Multi-Modal Importance Assessment" and "Geometric-Aware Sampling".
 """
@@ -34,9 +34,9 @@ from warpgs.scene import Gaussians, Prior, ViewDepth
 FINE = 1
 """Layer of sampled Gaussians."""
 MAX_VIEWS = 8
-"""Largest number of views that one event samples in; chosen at random where there are more."""
+"""Largest number of views in which one event samples; of more views, a random choice."""
 MAX_WEIGHED = 32
-"""Largest number of views over which blending weights are summed for an eviction."""
+"""Largest number of views over which blending weights are summed to choose Gaussians for eviction."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,10 @@ class ProtectConfig:
     """Protection of new Gaussians."""
 
     steps: int = 500
-    """Age up to which a sampled Gaussian is protected [steps] (T_protect; the paper gives no value): five refinements."""
+    """Age up to which a sampled Gaussian is protected [steps] (T_protect; the paper gives no value). The default is five
+    densification intervals."""
     opacity: float = 0.05
-    """Smallest opacity of a protected Gaussian, in (0, 1) (alpha_minimum): ten times the pruning threshold."""
+    """Smallest opacity of a protected Gaussian, in (0, 1) (alpha_minimum). The default is ten times the pruning threshold."""
 
     def __post_init__(self):
         if self.steps < 0 or not 0 < self.opacity < 1:
@@ -60,10 +61,10 @@ class ProtectConfig:
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Switches of the paper's parts (its Table 2), and their settings. With all off it is plain 3D Gaussian splatting."""
+    """Switches of the paper's parts (its Table 2), and their settings. With all off, the method is 3D Gaussian splatting."""
 
     events: bool = False
-    """Sampling events: fine Gaussians are added in phase 2."""
+    """Sampling events, which add fine Gaussians in phase 2."""
     hier: bool | None = False
     """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: by the number
     of views."""
@@ -78,14 +79,14 @@ class MethodConfig:
     """Reliability gate: sample only pixels above gate_quantile of the geometric score and, with sampler.depth consistent, only
     pixels with consistent depth, in views that have some."""
     agp: bool = True
-    """Adaptive Gaussian placement: sample pixels at random in proportion to importance; off takes those of highest
+    """Adaptive Gaussian placement: sample pixels at random in proportion to importance. If off, take the pixels of highest
     importance."""
     pm: bool = True
     """Protection mechanism: new fine Gaussians keep a minimum opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
     """Factor of the learning rate of the means of the coarse layer from phase 2 on, in [0, 1]."""
     keep: float = 1.0
-    """Fraction of the Gaussians that are kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
+    """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
     over the training views."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -107,18 +108,18 @@ class MethodConfig:
 
     @property
     def asked_quantile(self) -> float:
-        """Quantile of the geometric score that the gate starts from; 0 for no such gate."""
+        """Requested quantile of the geometric score for the gate; 0 for no such gate."""
         return self.sampler.gate_quantile if self.ra else 0.0
 
     @property
     def needs_priors(self) -> bool:
-        """True where an event reads the semantic or the geometric score, which are made from priors."""
+        """True if an event reads the semantic or the geometric score, which are computed from priors."""
         _, semantic, geometry = self.weights()
         return semantic > 0 or geometry > 0 or self.asked_quantile > 0
 
 
 def scored(view: TrainingView, prior: Prior | None, depth: ViewDepth | None, config: MethodConfig) -> TrainingView:
-    """Return the view with its geometrically consistent depth and, where it has a prior, the scores of that."""
+    """Return the view with its geometrically consistent depth and, if it has a prior, with the scores of the prior."""
     if depth is not None and depth.valid.any():
         consistent = torch.as_tensor(np.where(depth.valid, depth.depth, 0), dtype=torch.float32, device=view.image.device)
         view = dataclasses.replace(view, consistent=consistent)
@@ -137,17 +138,17 @@ class SampledView:
     """Maps and samples of an event in one view, on the device of the fit."""
 
     view: int
-    """Number of the training view."""
+    """Index of the training view."""
     rendered: torch.Tensor
     """Colours before the event, shape [H, W, 3]."""
     scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-    """Render, semantic and geometric score, each [H, W] in [0, 1]; 0 everywhere where nothing was computed."""
+    """Residual, semantic and geometric score, each [H, W] in [0, 1]; all 0 if the score was not computed."""
     score: torch.Tensor
-    """Their weighted sum, shape [H, W]."""
+    """Importance, the weighted sum of ``scores``, shape [H, W]."""
     gate: torch.Tensor
     """Pixels that could be sampled, bool, shape [H, W]."""
     quantile: float
-    """Quantile of the geometric score that the gate used; lower than requested where too few pixels passed."""
+    """Quantile of the geometric score that the gate used; lower than requested if too few pixels passed."""
     at: torch.Tensor
     """Rows and columns of the sampled pixels, int64, shape [S, 2]."""
 
@@ -178,7 +179,7 @@ class Rendered(NamedTuple):
 
 
 def render_before(gaussians: Gaussians, view: TrainingView, config: MethodConfig, options: RasterizeOptions) -> Rendered:
-    """Render a view for an event, and find the depths at which its pixels are placed."""
+    """Render a view for an event, and find the depths for Gaussians at its pixels."""
     render = rasterize(gaussians, view.camera, options)
     depth, alpha = render.depth, render.alpha
     if config.sampler.depth == "consistent" and view.consistent is not None:
@@ -196,9 +197,9 @@ def sample_view(
 
     Args:
         view: The view.
-        number: Its number.
+        number: Index of the view.
         rendered: The view before the event.
-        residuals: Residuals of all views of the event, by which gains are computed; empty where the residual is a length.
+        residuals: Residuals of all views of the event, to compute gains; empty if the residual is a length.
         config: Switches and settings.
         coefficients: Spherical-harmonics coefficients a channel.
         generator: CPU generator, the same numbers on every device.
@@ -227,7 +228,7 @@ def least_contributing(
 ) -> torch.Tensor:
     """Return the rows of the ``count`` candidates (bool [N]) with the least sums of blending weights, int64 [count].
 
-    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half their size, because they only rank the Gaussians.
+    The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half size, which suffices to rank the Gaussians.
     """
     total = torch.zeros(len(gaussians), device=gaussians.means.device)
     for view in views[:: -(-len(views) // MAX_WEIGHED)]:
@@ -238,7 +239,7 @@ def least_contributing(
 
 @torch.no_grad()
 def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView], options: RasterizeOptions) -> DensityUpdate:
-    """Return the change that leaves the ``count`` Gaussians with the largest sums of blending weights over the views.
+    """Return the change that keeps the ``count`` Gaussians with the largest sums of blending weights over the views.
 
     At most `MAX_WEIGHED` views are rendered, evenly spaced.
     """
@@ -253,7 +254,7 @@ def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView
 def _sampled(
     gaussians: Gaussians, views: list[TrainingView], config: MethodConfig, options: RasterizeOptions, generator: torch.Generator
 ) -> tuple[dict[str, torch.Tensor], tuple[SampledView, ...]]:
-    """Return the Gaussians that are sampled in the views, by name of the tensor, and the maps that led to them."""
+    """Return the Gaussians that are sampled in the views, by name of the tensor, and the maps used."""
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
         numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
@@ -284,8 +285,8 @@ def sampling_event(
 ) -> Event:
     """Sample fine Gaussians by the importance of the pixels of the training views.
 
-    Where the fine layer is as large as it may be (``sampler.max_fraction`` of the coarse one), those of its Gaussians that
-    contribute least to the training views are evicted, the protected ones excepted; new ones beyond the limit are not added.
+    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer), its unprotected Gaussians that
+    contribute least to the training views are evicted. New Gaussians beyond the limit are not added.
 
     Args:
         gaussians: The current set, N rows.
@@ -299,7 +300,7 @@ def sampling_event(
         generator: CPU generator, the same numbers on every device.
 
     Returns:
-        The change, and the maps that led to it.
+        The change, and the maps used.
     """
     added, sampled = _sampled(gaussians, views, config, options, generator)
     count = len(added["means"])

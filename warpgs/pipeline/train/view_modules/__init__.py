@@ -1,1 +1,1 @@
-"""View modules, one in each file: what a fit learns of each training view beside the Gaussians."""
+"""View modules, one per file: they learn parameters of each training view together with the Gaussians."""

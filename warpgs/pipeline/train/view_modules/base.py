@@ -1,4 +1,4 @@
-"""Base class of view modules, which learn parameters of each training view: of its camera, or of the colours that it shows."""
+"""Base class of view modules, which learn parameters of each training view: of its camera, or of its colours."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 
 CAMERA_BYTES = 4 * (16 + 9)
-"""Bytes for each Gaussian where cameras are learned: the gradient of view matrix and intrinsics, until it is summed."""
+"""Bytes per Gaussian if cameras are learned: its gradient of view matrix and intrinsics, until these are summed."""
 Tensors = Mapping[str, torch.Tensor]
-"""Parameters of views, or values made of them, by name."""
+"""Parameters of views, or values computed from them, by name."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class ViewModule:
         return rgb
 
     def regularisation(self, values: Tensors) -> torch.Tensor | None:
-        """Return a term of the loss for the step's view, shape []; None for none. ``values`` are of that view, [...]."""
+        """Return a loss term for the step's view, shape []; None for no term. ``values`` [...] are those of the view."""
         return None
 
     def bytes(self, sizes: StepSizes) -> Needs:
@@ -144,10 +144,10 @@ register = VIEW_MODULES.register
 
 
 def check_modules(modules: Sequence[ViewModule]) -> None:
-    """Check that a run folder could name the class of each view module.
+    """Check that a run folder can name the class of each view module.
 
     Raises:
-        UsageError: One is not a view module, its class is not registered under its own name, or two are of one class.
+        UsageError: An object is not a view module, its class is not registered, or two have the same class.
     """
     for i, module in enumerate(modules):
         kind = type(module)
@@ -161,4 +161,4 @@ def check_modules(modules: Sequence[ViewModule]) -> None:
                 'with @register("name") of warpgs.pipeline.train.view_modules.base above the class, or name it as module:Class'
             )
         if any(type(m) is kind for m in modules[:i]):
-            raise UsageError(f"the view module {module.name!r} is given twice; leave one out")
+            raise UsageError(f"the view module {module.name!r} is given twice; remove one")

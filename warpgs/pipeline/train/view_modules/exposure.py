@@ -34,7 +34,7 @@ GRAY = 0.5
 def exposure_of(rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
     """Return the exposure [..., 12] of views with parameters ``own`` [..., 12], among those of all views ``rows`` [V, 12].
 
-    No gradient flows into the mean: only the rows of ``own`` are learned from.
+    No gradient flows through the mean: only the rows of ``own`` get one.
     """
     # in float64, so that the float32 result is the same for any number of threads
     return own - rows.detach().mean(0, dtype=torch.float64).to(own.dtype)
@@ -81,7 +81,7 @@ class Exposure(ViewModule):
     lr: float = 5e-3
     """Learning rate of the exposures at the start."""
     decay: float = 0.1
-    """Fraction of the learning rate at the last step; log-linear between."""
+    """Ratio of the last to the first learning rate; log-linear between."""
     weight: float = 0.01
     """Weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
 
@@ -94,12 +94,12 @@ class Exposure(ViewModule):
         """Check that no view has an alpha channel: an exposure would change the background with the object.
 
         Raises:
-            UsageError: One does.
+            UsageError: A view has an alpha channel.
         """
         for v in views:
             if v.alpha is not None:
                 raise UsageError(
-                    f"--exposure does not support images with an alpha channel, as {v.name} has; leave --exposure out"
+                    f"--exposure does not support images with an alpha channel, such as {v.name}; leave out --exposure"
                 )
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
@@ -120,7 +120,7 @@ class Exposure(ViewModule):
         return exposed(rgb, values[EXPOSURE])
 
     def regularisation(self, values: Tensors) -> torch.Tensor:
-        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it holds an exposure to the identity."""
+        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it draws an exposure towards the identity."""
         square = values[EXPOSURE].double().square().sum()
         return (self.weight * square).to(values[EXPOSURE].dtype)
 
@@ -129,7 +129,7 @@ class Exposure(ViewModule):
         return {LOSS: FLOAT * CHANNELS * sizes.pixels}
 
     def figures(self, fitted: FittedViews) -> dict[str, Any]:
-        """Return what exposures were learned.
+        """Return the learned exposures and their effect.
 
         Returns:
             ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of a middle gray
@@ -144,7 +144,7 @@ class Exposure(ViewModule):
         views = [{"name": n, "affine": m.tolist(), "gain": float(g)} for n, m, g in each]
         summary = (
             f"exposures learned: the training views are {gains.min():.2f} to {gains.max():.2f} times as bright as the model, "
-            "which has their mean exposure; all scores use renders without a learned exposure"
+            "which has their mean exposure; scores use renders without learned exposures"
         )
         renders = ((v, render_view(fitted.gaussians, v, fitted.options)[0]) for v in fitted.test)
         scores = [s for v, image in renders if np.isfinite(s := matched_psnr(v, image))]

@@ -1,6 +1,6 @@
 """Refinement of training poses: an increment of each camera, learned with the Gaussians.
 
-A training view i > 0 is rendered from T_i viewmat_i, where T_i turns by a rotation w_i about the camera's centre and moves by
+A training view i > 0 is rendered from T_i viewmat_i, where T_i rotates by w_i about the camera's centre and moves by
 t_i in the camera's axes. The first camera stays fixed, so that the scene as a whole cannot rotate or drift. Its scale remains
 free, but does not change any image. The rotation is Cayley's map of w / 2, of angle 2 atan(|w| / 2): for small w that of
 exp(w), without a case for w = 0, and with the same bits on every processor.
@@ -30,11 +30,11 @@ from warpgs.scene import Camera, View
 ROTATION, TRANSLATION = "pose_rotation", "pose_translation"
 """Names of the parameters: w [rad] and t [u], shape [V, 3] each."""
 FOCAL, CAMERA_NUMBER = "pose_focal", "pose_camera"
-"""Names of the parameters of a learned focal length: z, and the number of the view's camera, which stays; shape [V, 1] each."""
+"""Names of the parameters of a learned focal length: z, and the index of the view's camera, a constant; shape [V, 1] each."""
 SHOWN_LENSES = 3
-"""Cameras whose focal length the summary names."""
+"""Largest number of cameras whose focal length is in the summary."""
 RULE = (
-    "held-out views are moved by the similarity that best maps the given training cameras to the refined ones; their own "
+    "held-out cameras are moved by the similarity that best maps the given training cameras to the refined ones; held-out "
     "images are not used"
 )
 """Rule for the poses of held-out views, as text for the user."""
@@ -75,7 +75,7 @@ def camera_numbers(cameras: Sequence[Camera]) -> list[int]:
 
 
 def focal_factors(params: Tensors, numbers: torch.Tensor) -> torch.Tensor:
-    """Return the factor s of the focal length of views of these numbers [B], shape [B]; differentiable."""
+    """Return the factor s of the focal length of views with these indices [B], shape [B]; differentiable."""
     camera = params[CAMERA_NUMBER][:, 0]
     same = (camera.index_select(0, numbers)[:, None] == camera).to(camera.dtype)
     z = (same * params[FOCAL][:, 0]).sum(1) / same.sum(1)
@@ -91,8 +91,8 @@ def zoomed(K: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.ndarray, float, np.ndarray]:
     """Return rotation [3, 3], scale and translation [3] from the world of given cameras to that of refined ones.
 
-    The rotation is the mean of the cameras' own; scale and translation are least squares over their centres. Where all centres
-    are one, the scale is 1.
+    The rotation is the mean of the cameras' rotations. Scale and translation are least squares over the camera centres. If all
+    centres coincide, the scale is 1.
     """
     turned = sum(matmul(r.viewmat[:3, :3].T, g.viewmat[:3, :3]) for g, r in zip(given, refined))
     R = nearest_rotation(np.asarray(turned) / len(given))
@@ -106,7 +106,7 @@ def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.n
 def similar_cameras(
     cameras: Mapping[str, Camera], given: Sequence[Camera], refined: Sequence[Camera], names: Sequence[str]
 ) -> dict[str, Camera]:
-    """Return the named cameras after the similarity that takes given cameras to refined ones best, by name.
+    """Return the named cameras after the similarity that best maps given cameras to refined ones, by name.
 
     Args:
         cameras: Cameras by name, in the world of the given ones.
@@ -129,8 +129,8 @@ def refined_cameras(
 ) -> dict[str, Camera]:
     """Return the cameras of all views after refinement: training ones by their own increments, held-out ones by `RULE`.
 
-    Where focal lengths are learned, a held-out view has that of the training views of its camera, or the mean factor of all
-    training views if no training view has its intrinsics.
+    If focal lengths are learned, a held-out view has the focal length of the training views of its camera. If no training view
+    has its intrinsics, the mean factor over all training views is used.
 
     Args:
         given: Cameras as given, in scene units, by name.
@@ -204,15 +204,15 @@ class RefinePoses(ViewModule):
     """Learn a small correction of each training camera except the first, for inexact poses (docs/your-photos.md)."""
 
     start: float = 0.2
-    """Fraction of the steps before poses are refined, in [0, 1), because the first Gaussians are inaccurate."""
+    """Fraction of the steps before poses are refined, in [0, 1), because the initial Gaussians are inaccurate."""
     rotation_lr: float = 2e-4
     """Learning rate of the rotations of the training cameras [rad], when refinement starts."""
     translation_lr: float = 2e-4
-    """Learning rate of their translations, times the scene's extent."""
+    """Learning rate of the translations of the training cameras, in units of the scene's extent."""
     focal_lr: float | None = None
     """Learning rate of the logarithm of each camera's focal length, shared by all its views; None to keep it fixed."""
     decay: float = 0.1
-    """Fraction of these learning rates at the last step; log-linear between."""
+    """Ratio of the last to the first of these learning rates; log-linear between."""
 
     def __post_init__(self) -> None:
         lrs = {"rotation_lr": self.rotation_lr, "translation_lr": self.translation_lr, "focal_lr": self.focal_lr}
