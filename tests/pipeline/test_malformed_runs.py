@@ -185,6 +185,16 @@ def test_any_value_in_the_place_of_any_other(made, run):
     assert refused > 300
 
 
+def test_a_stored_pose_with_a_scale_is_refused(made, run):
+    """A camera that `rasterize` would refuse, in words that name its place."""
+    name = next(iter(made[1]["cameras"]))
+    for value in (-1.0, 2.0, 1e300):
+        changed = replaced(made[1], ("cameras", name, "viewmat", 0, 0), value)
+        (run / "config.json").write_text(json.dumps(changed))
+        with pytest.raises(DataError, match="viewmat must be a rotation and a translation"):
+            read_record(run)
+
+
 @pytest.mark.fault
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
 def test_no_command_fails_on_what_the_schema_allows(made, run, tmp_path, capsys):

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import PurePosixPath
 from typing import Any
 
-from warpgs.constants import K_TOLERANCE, RULES
+import numpy as np
+
+from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
 from warpgs.io.map_files import AXES
 from warpgs.scene import DEPTH_KINDS
 from warpgs.schema import (
@@ -47,8 +49,18 @@ def _intrinsics(value: Any, place: str) -> None:
         raise SchemaError(f"{place} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
 
 
+def _pose(value: Any, place: str) -> None:
+    """Allow rigid poses, as `rasterize` needs them."""
+    _matrix(4)(value, place)
+    pose = np.array(value, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = [pose[:3, :3] @ pose[:3, :3].T - np.eye(3), pose[3:] - (0, 0, 0, 1)]
+    if not all(np.abs(e).max() <= POSE_TOLERANCE for e in errors):  # also where products overflow
+        raise SchemaError(f"{place} must be a rotation and a translation, without scale, above the row 0, 0, 0, 1")
+
+
 _CAMERA = fields(
-    {"viewmat": _matrix(4), "K": _intrinsics, "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
+    {"viewmat": _pose, "K": _intrinsics, "width": whole(1, MAX_SIDE), "height": whole(1, MAX_SIDE)},
     {"model": text, "distortion": items(number())},
     others=False,
 )
