@@ -27,6 +27,10 @@ from warpgs.schema import (
 
 MAX_SIDE = 2**16
 """Largest width and height of a stored camera [px], far above those of any image."""
+FOCAL_LENGTHS = 1e-9, 1e12
+"""Least and largest focal length of a stored camera [px], or pixels per unit of an orthographic one."""
+MAX_TRANSLATION = 1e12
+"""Largest entry of the translation of a stored camera [u]: squares of distances stay finite in float32."""
 
 
 def _view_name(value: Any, place: str) -> None:
@@ -47,6 +51,9 @@ def _intrinsics(value: Any, place: str) -> None:
     fixed = ((0, 1, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 2, 1))
     if any(abs(value[i][j] - wanted) > K_TOLERANCE for i, j, wanted in fixed):
         raise SchemaError(f"{place} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    least, most = FOCAL_LENGTHS
+    if not all(least <= abs(value[i][i]) <= most for i in (0, 1)):
+        raise SchemaError(f"{place} must have focal lengths from {least:g} to {most:g} px")
 
 
 def _pose(value: Any, place: str) -> None:
@@ -55,8 +62,11 @@ def _pose(value: Any, place: str) -> None:
     pose = np.array(value, np.float64)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = [pose[:3, :3] @ pose[:3, :3].T - np.eye(3), pose[3:] - (0, 0, 0, 1)]
-    if not all(np.abs(e).max() <= POSE_TOLERANCE for e in errors):  # also where products overflow
-        raise SchemaError(f"{place} must be a rotation and a translation, without scale, above the row 0, 0, 0, 1")
+    near = np.abs(pose[:3, 3]).max() <= MAX_TRANSLATION
+    if not (near and all(np.abs(e).max() <= POSE_TOLERANCE for e in errors)):  # also where products overflow
+        raise SchemaError(
+            f"{place} must be a rotation and a translation within {MAX_TRANSLATION:g}, without scale, above the row 0, 0, 0, 1"
+        )
 
 
 _CAMERA = fields(
