@@ -34,7 +34,7 @@ COMMANDS = {
     "prune": "shrink a finished model within a PSNR budget",
     "eval": "score a run again on its held-out views",
     "compare": "fit presets to scenes with several seeds; tables and plots",
-    "ablate": "fit a preset with one part off at a time; tables and plots",
+    "ablate": "fit a preset with one part changed at a time; tables and plots",
     "convert-lpips": "convert LPIPS weights for --lpips-weights",
     "farm": "fit many scenes, on all GPUs, with Ray or on Slurm",
     "doctor": "check this machine: devices, packages, fixes",
