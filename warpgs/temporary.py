@@ -153,7 +153,7 @@ def sweep_temporary_files() -> None:
 
 
 def system_folder() -> Path:
-    """Return the folder of temporary files by TMPDIR, TEMP or TMP, else the system's; Python's tempfile takes it, too."""
+    """Return the folder that TMPDIR, TEMP or TMP names, else the system's temporary folder; also set it for `tempfile`."""
     if tempfile.tempdir is None and sys.platform != "win32":
         # Python would write a file to try each of these, which a command that is killed then leaves behind
         named = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]

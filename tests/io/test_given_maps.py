@@ -206,7 +206,7 @@ def test_maps_that_transforms_json_names(tmp_path):
     found = load_scene(root)
     assert np.allclose(found.views[1].depth.values, RAMP * 0.001 * found.normalization.scale)
     assert np.allclose(found.views[1].normals, facing(), atol=1e-6)
-    assert any("named by the scene" in n for n in found.notes)
+    assert any("listed in the scene's file" in n for n in found.notes)
     tenth = load_scene(write_named(tmp_path / "b", 0.0001))
     assert np.allclose(tenth.views[1].depth.values, RAMP * 0.0001 * tenth.normalization.scale)
     assert np.allclose(load_scene(tmp_path / "b", depth_unit=0.002).views[1].depth.values, 20 * tenth.views[1].depth.values)

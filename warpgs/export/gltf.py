@@ -291,7 +291,7 @@ class BinaryGltf(Format):
     """Binary glTF."""
 
     suffix = ".glb"
-    description = "glTF 2.0 with KHR_gaussian_splatting, binary, float32; Cesium, engines"
+    description = "glTF 2.0 with KHR_gaussian_splatting, binary, float32; Cesium, 3D engines"
     encode = staticmethod(encode_glb)
     decode = staticmethod(decode)
 

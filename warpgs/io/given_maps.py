@@ -126,7 +126,7 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
             raise MapFolder(path, flag, allow_outside).unmatched()
         if not having:
             continue
-        where = f"from {path}" if path is not None else f"named by the scene ({flag} none leaves them out)"
+        where = f"from {path}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
         what = "normals" if name == "normals" else "depth maps"
         notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)}, {where}")
     return notes

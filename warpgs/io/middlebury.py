@@ -50,8 +50,8 @@ def read_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     except (OSError, ValueError) as e:
         why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(
-            f"{path}: cannot be understood ({why}); its first line is a count, then come a name and 21 numbers a line. "
-            "Copy it again"
+            f"{path}: cannot be understood ({why}); expected a count of images in the first line, then a line with a name "
+            "and 21 numbers for each image. Copy the file again"
         ) from e
     if count != len(rows):
         raise DataError(f"{path}: announces {count or 0} images and lists {len(rows)}; it is truncated. Copy it again")

@@ -18,7 +18,10 @@ def _of_sum(native: bool) -> tuple[int, int]:
 
 
 def sum_entries(count: int, native: bool) -> tuple[int, int]:
-    """Return the entries of the running sums of ``count`` items, and the threads to launch, on CUDA in whole blocks."""
+    """Return the number of running sums for ``count`` items, and the number of threads to launch.
+
+    On CUDA, the number of threads is a multiple of 256, the block size.
+    """
     width, each = _of_sum(native)
     entries = -(-count // (width * each))
     return entries, -(-entries * width // 256) * 256 if native else entries

@@ -75,7 +75,7 @@ class FusedMesh:
 
 
 def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap], like: torch.Tensor) -> DistanceGrid:
-    """Return the grid after all views, in the order of the cameras.
+    """Return the grid into which the depth of all views was fused, in the order of the cameras.
 
     Args:
         views: Surface that each camera sees.

@@ -118,7 +118,7 @@ class View(NamedTuple):
 
 
 def view(tensor: torch.Tensor, dtype) -> View:
-    """Return a contiguous tensor of any shape as a kernel argument of that element type."""
+    """Return a contiguous tensor of any shape as a kernel argument with elements of Warp type ``dtype``."""
     return View(tensor, dtype)
 
 

@@ -85,7 +85,7 @@ class Maps:
         view = self.content.views.get(name or "")
         if view is None:
             why = "the photographs cannot be read" if name else "step into a camera, by a click or by its name"
-            return self._render(camera, gaussians, options)[0], f"no error here: {why}"
+            return self._render(camera, gaussians, options)[0], f"the error map cannot be shown: {why}"
         render = rasterize(gaussians, view.camera, options).rgb.cpu().numpy()
         return placed(error_map(render, view.image), view.camera, camera), f"{name}: {MAPS[ERROR]}"
 

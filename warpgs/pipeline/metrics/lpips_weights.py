@@ -24,7 +24,7 @@ MAX_PICKLE = 2**20
 
 @dataclass(frozen=True)
 class Net:
-    """The convolutional half of a classifier, as torchvision numbers its layers (`features.N`)."""
+    """The convolutional layers of a classifier, with the numbers of torchvision (`features.N`)."""
 
     name: str
     """vgg or alex."""

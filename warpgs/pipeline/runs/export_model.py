@@ -83,7 +83,7 @@ def export(
     Raises:
         DataError: The folder is not a run, or no Gaussian is left.
         ResourceError: Another process writes into the target's folder, or the target cannot be written.
-        UsageError: The suffix has no format or does not fit the given one, or a filter is invalid.
+        UsageError: No format has the suffix, ``format`` has another suffix, or a filter is invalid.
     """
     if holds_cameras(target):
         _check_for_cameras(filters, () if format is None else (format,))

@@ -146,7 +146,7 @@ def markdown(table: Table) -> str:
 
 
 def csv_text(table: Table) -> str:
-    """Return CSV: a line per row and metric, every digit, empty for missing numbers."""
+    """Return CSV with one line for each row and metric. Numbers have full precision; missing numbers are empty fields."""
     out = io.StringIO()
     names = [_plain(s) for s in table.switches]
     writer = csv.writer(out, lineterminator="\n")

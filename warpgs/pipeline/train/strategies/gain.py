@@ -34,7 +34,7 @@ def residual_of(view: TrainingView, rgb: torch.Tensor, depth: torch.Tensor, foot
 
     Args:
         view: The view.
-        rgb: Its render as the view shows it, shape [H, W, 3].
+        rgb: Rendered colours after the view modules of the fit, shape [H, W, 3].
         depth: Rendered depth [u], shape [H, W].
         footprint: Standard deviation of a Gaussian in the image [px].
     """
