@@ -139,6 +139,7 @@ class BatchSteps:
         self._graphs = self._updates = None
         if buffers.device.type == "cuda":
             self._graphs = StepGraphs(learned, self.slots, options, view_gradients)
+            self._graphs.capacities = self._capacities  # a kind that is captured later keeps the capacity that all agreed on
             self._updates = StepGraphs(learned, buffers, options)
         self._update: tuple[SumUpdate, list[Callable[[], object]]] | None = None
 

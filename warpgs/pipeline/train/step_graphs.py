@@ -60,6 +60,7 @@ class Capacities:
             OverLimitError: A capacity would be above ``max_instances``.
             ResourceError: The instances would not fit into memory.
         """
+        self._known = {k: c for k, c in self._known.items() if k[1] == plan}
         found = {}
         for kind in dict.fromkeys(kinds):
             if (kind, plan) not in self._known:
