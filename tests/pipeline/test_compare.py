@@ -163,7 +163,7 @@ def test_runs_of_another_kind_are_moved_aside_and_said(finished, tmp_path):
     run_study(changed)
     assert states(changed) == ["redone", "redone", "kept", "redone"]
     text = (changed.out / "table.md").read_text()
-    assert "had another configuration; moved to 0.old1" in text and "could not be continued" in text
+    assert "the old run differs in configuration; moved to 0.old1" in text and "could not be continued" in text
     assert (broken.parent / "0.old1" / TENSORS).read_bytes() == b"nothing"
     assert metrics_of(changed, "b b", 0)["steps"] == 12
 

@@ -150,7 +150,7 @@ def test_a_run_with_one_of_ones_own(own, tmp_path, capsys):
     assert json.loads((tmp_path / "run" / "eval.json").read_text())["train"] == metrics["train"]
     capsys.readouterr()
     assert main([*words, "--exposure", "--resume"]) == 2
-    assert f"give --view-modules {own}:Vignetting again" in capsys.readouterr().err
+    assert f"give --view-modules {own}:Vignetting,{own}:Zoom again" in capsys.readouterr().err
     assert main([*words, *named, "--resume"]) == 0
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["view_modules"] == metrics["view_modules"]
 
