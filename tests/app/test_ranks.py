@@ -90,7 +90,7 @@ def test_variables_that_are_no_numbers_are_named(monkeypatch, name, value):
     for key, usual in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("MASTER_PORT", "29500")):
         monkeypatch.setenv(key, usual)
     monkeypatch.setenv(name, value)
-    with pytest.raises(UsageError, match=f"the environment variable {name} is"):
+    with pytest.raises(UsageError, match=f"the environment variable {name} must be"):
         ranks.join("cpu")
 
 

@@ -150,9 +150,9 @@ def test_lists_without_slots_are_the_same(device):
     backgrounds = torch.rand(2, 3, device=device)
     for one, other in zip(blend(projected, bare, backgrounds, **size), blend(projected, tiles, backgrounds, **size)):
         assert torch.equal(one, other)
-    with pytest.raises(ValueError, match="no slots"):
+    with pytest.raises(ValueError, match="tiles with slots"):
         blend(projected.requires_grad_(), bare, backgrounds, **size)
-    with pytest.raises(ValueError, match="no slots"):
+    with pytest.raises(ValueError, match="tiles with slots"):
         contributions(projected, bare, **size)
 
 

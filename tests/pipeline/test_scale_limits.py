@@ -107,7 +107,7 @@ def test_figures_count_needles_and_what_is_beyond():
     assert f["thin"] == pytest.approx(2 / 3) and f["beyond"] == 2
     assert f["largest_over_radius"] == pytest.approx(62 / 50) and f["largest_over_extent"] == pytest.approx(31)
     assert shape_figures(model, LimitConfig(max_size=0, max_ratio=0, max_reach=0), 50.0, 2.0, ring(4))["beyond"] == 0
-    assert "33.3%" in shape_summary(f) and "2 beyond" in shape_summary(f)
+    assert "33.3%" in shape_summary(f) and "2 exceed the limits" in shape_summary(f)
 
 
 @pytest.mark.parametrize("strategy", ["clone_split", "mcmc"])
