@@ -1,4 +1,4 @@
-"""`warpgs ablate`: a preset with its parts off one at a time. Parses, calls, prints; no logic."""
+"""`warpgs ablate`: a preset with one part changed at a time. Parses, calls, prints; no logic."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True, kw_only=True)
     class Ablate(base):
         preset: str = DEFAULT_PRESET
-        """Preset, as for `warpgs fit --preset`; its parts are switched off one at a time."""
+        """Preset, as for `warpgs fit --preset`; one part is changed at a time."""
 
     a = parse_flags(Ablate, arguments, "warpgs ablate", f"{about}\n\n{listed('presets', PRESETS.described())}")
     from warpgs.pipeline.study.compare import ablation_variants, preset_variants
