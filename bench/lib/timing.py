@@ -75,7 +75,7 @@ def _timed(work: Callable[[], object], device: torch.device) -> tuple[float, flo
 
 
 def _warm_up(work: Callable[[], object], device: torch.device, limit_ms: float, whole: bool) -> float:
-    """Run work `WARM_UP` times, and at least for `WARM_UP_SECONDS`, and return the shortest time of a call [ms].
+    """Run work `WARM_UP` times, or if ``whole`` at least for `WARM_UP_SECONDS`; return the shortest time of a call [ms].
 
     Stops after the second call if both took longer than the limit.
     """

@@ -110,12 +110,14 @@ def test_several_steps_at_once_are_those_one_by_one():
     density = DensityConfig(start=2, every=7, gradient=1e-5, reset_every=14)
     config = dataclasses.replace(PLAIN, batch=5, dropout=0.3, density=density)
     one, many = (Trainer(photos(3), seeds(61), config, CPU) for _ in range(2))
-    taken = []
+    series = []
     while many.step < 20:
-        taken.append(len(in_series(many).advance(100)))
-    losses = [fit.buffers.history.isfinite().all() for fit in (one, many)]
+        series.append(in_series(many).advance(100))
+    losses = [r.loss for r in sum(series, [])]
     assert [steps_at_once(batch) for batch in (1, 8, 500)] == [100, 25, 1]
-    assert max(taken) == 7 and len(many.table) > 61 and all(losses) and same_bits(advanced(one, 20), many)
+    assert max(map(len, series)) == 7 and len(many.table) > 61 and same_bits(advanced(one, 20), many)
+    again = Trainer(photos(3), seeds(61), config, CPU)
+    assert np.isfinite(losses).all() and losses == [again.advance()[0].loss for _ in range(20)]
 
 
 def test_a_loss_that_is_no_number_ends_a_series_before_its_step():
@@ -178,6 +180,36 @@ def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
     for count in (2, 3):
         fits = by_threads(lambda ranks: advanced(Trainer(photos(3), seeds(61), config, CPU, ranks=ranks), 10), count)
         assert 0 < fits[0].taker.batched.sums.divided < len(alone.table) and all(same_bits(alone, fit) for fit in fits)
+
+
+@pytest.mark.parametrize("stopped", [None, 5])
+def test_ranks_that_divide_the_coefficients_take_several_steps_at_once(monkeypatch, stopped):
+    """Moments are exchanged once for a series, and also where a view stops the series before its end."""
+    monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 4000)
+    views = photos(9)
+    if stopped is not None:
+        views[4] = View("bad", views[4].camera, np.full_like(views[4].image, np.nan))
+    config = dataclasses.replace(PLAIN, steps=10, batch=2, dropout=0.3, sh_degree=2)
+    order = [8, 7, 6, 5, 3, 2, 1, 0, 4]  # step 5 has the bad view
+    order.reverse()
+
+    def fitted(ranks: Ranks) -> Trainer:
+        fit = in_series(Trainer(views, seeds(61), config, CPU, ranks=ranks))
+        fit.order = list(order)
+        if stopped is None:
+            series = fit.advance(100)
+            assert len(series) > 1 and advanced(fit, 10)
+        else:
+            with pytest.raises(NotFiniteError, match=f"became nan at step {stopped}"):
+                fit.advance(100)
+        return fit
+
+    alone = Trainer(views, seeds(61), config, CPU)
+    alone.order = list(order)
+    advanced(alone, 10 if stopped is None else stopped - 1)
+    fits = by_threads(fitted, 2)
+    assert all(0 < fit.taker.batched.sums.divided for fit in fits)
+    assert all(same_bits(alone, fit, () if stopped is None else ("generator",)) for fit in fits)
 
 
 def test_a_batch_costs_memory_and_on_a_cpu_steps():

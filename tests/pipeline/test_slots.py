@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from warpgs.errors import UsageError
+from warpgs.pipeline.train import slots as train_slots
 from warpgs.pipeline.train.slots import SlotSums, Tree, check_ranks, check_renders, own_slots
 from warpgs.runtime.ranks import ALONE, Ranks
 
@@ -42,6 +43,7 @@ def summed(slots: list[list[torch.Tensor]], ranks: Ranks, means: int = 0) -> lis
             part.add_(value) if adds else part.copy_(value)
 
     parts = sums.add_up(add)
+    assert bool(sums.divided) == (ranks.count > 1 and 4 * parts[1].numel() >= train_slots.DIVIDED_BYTES)
     if sums.divided:
         assert sums.divided + 16 * ranks.count > len(parts[1])
         sums.sum_own_rows()
@@ -96,6 +98,13 @@ def test_every_slot_is_in_one_process_and_one_node(batch, ranks):
     assert [s for r in range(ranks) for s in own_slots(batch, ranks, r)] == list(range(batch))
     tree = Tree(batch, Thread(ranks - 1, ranks, [], threading.Barrier(1)))
     assert [s for nodes in tree.nodes for first, end in nodes for s in range(first, end)] == list(range(batch))
+
+
+@pytest.mark.parametrize(("batch", "ranks"), [(12, 2), (24, 4), (32, 3)])
+def test_every_process_plans_the_same_memory(batch, ranks):
+    """Also where processes sum different subtrees: with a memory limit, different plans would end in different models."""
+    trees = [Tree(batch, Thread(r, ranks, [], threading.Barrier(1))) for r in range(ranks)]
+    assert len({tree.buffers for tree in trees}) == 1
 
 
 def test_a_process_without_a_view_is_refused():

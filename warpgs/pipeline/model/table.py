@@ -140,9 +140,10 @@ class Table:
             lrs: A row of `lr_row`, float32, shape [3 P].
             skip: 0, or the reason for skipping the step, int32, shape [1].
             factors: Factor of the step of each mean, shape [N]; None for 1. Steps are scaled, not gradients, because Adam's
-                step does not depend on the scale of the gradient. With factors, all rows are updated.
-            rows: Rows to update.
+                step does not depend on the scale of the gradient.
+            rows: Rows to update; all rows if factors are given.
         """
+        assert factors is None or rows == slice(None)
         before = None if factors is None else self.params["means"].detach().clone()
         for i, name in enumerate(self.params):
             if name not in gradients:

@@ -139,7 +139,7 @@ def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Pr
 
 
 def print_warming(devices: list[torch.device] | None = None) -> None:
-    """Warm the cache; returns a line for each compiled module, and a summary."""
+    """Warm the cache; print a line for each compiled module, and a summary."""
     began, results = time.perf_counter(), []
     for w in precompile_kernels(devices):
         results.append(w)

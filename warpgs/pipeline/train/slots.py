@@ -121,9 +121,11 @@ class Tree:
 
     @property
     def rows(self) -> int:
-        """Number of sums that a process keeps side by side: partial sums, and at least one for each exchanged sum."""
-        own = self.nodes[self.ranks.rank]
-        return max(self.width, *(k + depth(node) for k, node in enumerate(own)))
+        """Number of sums that a process keeps side by side: partial sums, and at least one for each exchanged sum.
+
+        This is the largest number that any process needs, so that all processes plan the same memory and so the same limits.
+        """
+        return max(self.width, *(k + depth(node) for nodes in self.nodes for k, node in enumerate(nodes)))
 
     @property
     def buffers(self) -> int:

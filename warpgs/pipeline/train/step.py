@@ -32,8 +32,8 @@ from warpgs.scene import Camera, Gaussians, Render
 MAX_STEPS = 100
 """Largest number of steps between two reads of results from the device."""
 MAX_VIEWS = 200
-"""Largest number of rendered views between two such reads, for steps of several views: a request to stop waits for the next
-read."""
+"""Largest number of rendered views between two such reads, for steps of several views (a single step may have more): a request
+to stop waits for the next read."""
 
 
 def steps_at_once(batch: int) -> int:
@@ -85,7 +85,7 @@ class StepBuffers:
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
-        """Upload view rows, learning rates and settings (7 each) of the next steps, at most `MAX_STEPS`."""
+        """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as the buffers have rows."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
