@@ -2,11 +2,11 @@
 
 CASE is horns or garden. horns: PATH is a scene folder, split every:8, fitted from 112,000 random points; the set of Gaussians
 changes in the first half of the steps. garden: PATH is test_garden.npz; 2.8 million Gaussians on its points, 1920 x 1080 px, 8
-views, no growth. Start it with `torchrun --nproc-per-node N -m bench.fits.ranks`. Steps are taken in series of 10 (a fit
-takes more at once); the time of a step is the median over the series of the last half. A row replaces the row in --out with the same case, batch,
-steps and ranks. `same_model` is true if all rows of a case have the same SHA-256 of parameters, moments and statistics;
-``start_sha256`` is that of the start and of the photographs. Time in collectives is measured on the first rank by events around
-them, and includes the wait for slower ranks.
+views, no growth. Start it with `torchrun --nproc-per-node N -m bench.fits.ranks`. Steps are taken in series of 10 (a fit takes
+more at once); the time of a step is the median over the series of the last half. A row replaces the row in --out with the same
+case, batch, steps and ranks. `same_model` is true if all rows of a case have the same SHA-256 of parameters, moments and
+statistics; ``start_sha256`` is that of the start and of the photographs. Time in collectives is measured on the first rank by
+events around them, and includes the wait for slower ranks.
 """
 
 from __future__ import annotations

@@ -205,13 +205,13 @@ def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     sources, beside = _sources("ops", ops), next(iter(others.values()))
-    earlier, gswarp = (result_file.read(result_file.FOLDER / f"{n}_h100.json") for n in ("older_rasterizers", "gswarp"))
+    earlier, gswarp = (result_file.read(result_file.FOLDER / f"{n}.json") for n in ("older_rasterizers_h100", "gswarp_h200"))
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
         "ratios": rasterizers_page.ratios_table(beside),
         "earlier run": rasterizers_page.times_table(earlier, 3, EARLIER) + "\n" + result_file.source("older_rasterizers_h100"),
-        "gswarp": rasterizers_page.gpu_table(gswarp) + "\n" + result_file.source("gswarp_h100"),
+        "gswarp": rasterizers_page.gpu_table(gswarp) + "\n" + result_file.source("gswarp_h200"),
         "many channels": rasterizers_page.times_table(beside, 32),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "buffers": rasterizers_page.buffers_table(beside),

@@ -36,8 +36,6 @@ CAPTURES = {
     "fox:8": ("fox", 8), "fox:all": ("fox", 43), "temple:4": ("temple", 4), "temple:12": ("temple", 12),
 }  # fmt: skip
 """Scene and number of training views of each row of the presets' result."""
-BEFORE_DECAY = "default:method.hier=true,optimizer.opacities_decay=0"
-"""`default` as it was before decision 023."""
 ONE_LAYER = "default:method.hier=false,optimizer.opacities_decay=0.001"
 """`default` with up to 9 views with alpha, as it was measured before it became so."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
@@ -52,7 +50,7 @@ MCMC = {
     "gsplat mcmc, own units": "gsplat's MCMC, units of its parser",
     "warpgs 3dgs": "preset `3dgs`, which sets the cap",
 }
-PARITY, REPEATS = "parity_h100", "determinism_h100"
+PARITY, REPEATS = "parity_h200", "determinism_h100"
 """Results of the agreement with gsplat, and of the price of repeatable sums."""
 MODES = {
     "deterministic": "ours, fixed order",
@@ -155,26 +153,33 @@ def default_now() -> str:
 
 
 def coverage() -> str:
-    """Return the table of shares of pixels and errors by the number of training views that saw them."""
-    result, source = _result("coverage_h100")
-    found = {(r["scene"], r["preset"]): r["classes"] for r in result["rows"]}
-    body = []
+    """Return the tables of pixels and errors by how many training views saw them, and of pixels unseen in both fits."""
+    result, source = _result("coverage_h200")
+    before, body = result["rows"][0]["preset"], []
     for scene in ("fern:3", "horns:3"):
         for seen, words in (("0", "no view"), ("1", "one"), ("2+", "two or more")):
             body.append([f"{scene.replace(':', ', ')}: {words}"])
-            for preset in (BEFORE_DECAY, "default"):
-                own = found[scene, preset][seen]
-                body[-1] += [f"{100 * own[k]:.0f} %" for k in ("share_of_pixels", "share_of_error")] + [f"{own['psnr']:.2f}"]
+            for preset in (before, "default"):
+                own = [r["classes"][seen] for r in result["rows"] if (r["row"], r["preset"]) == (scene, preset)]
+                body[-1] += [f"{100 * statistics.mean(c[k] for c in own):.0f} %" for k in ("share_of_pixels", "share_of_error")]
+                body[-1].append(mean_sd([c["psnr"] for c in own]))
     head = [
         "scene, views: pixels seen by",
-        "two layers, no decay: pixels",
+        "before: pixels",
         "error",
         "PSNR",
         "`default`: pixels",
         "error",
         "PSNR",
     ]
-    return table(head, body) + source
+    unseen = []
+    for scene in ("fern:3", "horns:3"):
+        own = [r for r in result["unseen_in_both"] if r["row"] == scene]
+        share = 100 * statistics.mean(r["share_of_pixels"] for r in own)
+        scores = [mean_sd([r[k] for r in own]) for k in ("before", "after")]
+        unseen.append([scene.replace(":", ", "), f"{share:.0f} %", *scores])
+    both = table(["scene, views: unseen in both fits", "pixels", "before: PSNR", "`default`: PSNR"], unseen)
+    return table(head, body) + "\n" + both + source
 
 
 def mcmc() -> str:
@@ -189,7 +194,7 @@ def mcmc() -> str:
 
 def strategies() -> str:
     """Return the table of gsplat's strategies on its rasterizer and on ours."""
-    result, source = _result("strategies_fern_h100")
+    result, source = _result("strategies_fern_h200")
     return strategy_runs.table(result["rows"]) + source
 
 
