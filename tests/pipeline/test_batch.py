@@ -113,7 +113,7 @@ def test_several_steps_at_once_are_those_one_by_one():
     series = []
     while many.step < 20:
         series.append(in_series(many).advance(100))
-    losses = [r.loss for r in sum(series, [])]
+    losses = [r.loss for reports in series for r in reports]
     assert [steps_at_once(batch) for batch in (1, 8, 500)] == [100, 25, 1]
     assert max(map(len, series)) == 7 and len(many.table) > 61 and same_bits(advanced(one, 20), many)
     again = Trainer(photos(3), seeds(61), config, CPU)

@@ -85,7 +85,7 @@ class StepBuffers:
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
-        """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as the buffers have rows."""
+        """Upload view rows, learning rates and settings (7 each) of the next steps, at most one for each row."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
