@@ -151,7 +151,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
         if record is None:
             say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
         elif record.state == "failed":
-            runs[key] = Outcome("failed", None, f"failed: {record.message}")
+            runs[key] = Outcome("failed", None, record.message)
             continue
         resolved, _ = settings_by_views(fit.config, place.train, device.type)
         outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips, resolved, verbose="progress")

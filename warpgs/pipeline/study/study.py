@@ -196,6 +196,8 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
             notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
     if request.seeds < 2:
         notes.append("one seed gives no deviations and no intervals; run more seeds before you claim a difference")
+    elif request.seeds < 3:
+        notes.append("two seeds give wide, uncertain intervals; run at least three before you claim a difference")
     last = metrics[-1].key
     lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o.metrics)
     if last == "lpips":
