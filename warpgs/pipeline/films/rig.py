@@ -94,8 +94,8 @@ def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
     """Return the unit normal [3] of the plane through the origin that holds vectors [N, 3]; None if there is none.
 
     The normal is the eigenvector of the smallest eigenvalue of their second moments, computed by squaring the inverse, without
-    LAPACK (see `warpgs.geometry.matmul`). There is no plane if the vectors lie on a line, or if the smallest eigenvalue is above
-    ``largest`` times the sum of the others.
+    LAPACK (see `warpgs.geometry.matmul`). There is no plane if the vectors lie on a line, or if the smallest eigenvalue is
+    above ``largest`` times the sum of the others.
     """
     covariance = (vectors[:, :, None] * vectors[:, None, :]).mean(0)
     total = float(np.trace(covariance))
