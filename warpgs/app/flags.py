@@ -73,7 +73,7 @@ def either(flags: Any, name: str) -> bool | None:
 
 
 MAX_WHOLE = 2**63 - 1
-"""Largest whole number that a flag takes: that of 64 bits."""
+"""Largest whole number that a flag takes: the largest signed integer of 64 bits."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
 MAX_NUMBER = 3e38

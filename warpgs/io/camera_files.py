@@ -29,7 +29,7 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
         path: A cameras.json, a transforms.json, or a folder with a COLMAP reconstruction, binary or text.
 
     Raises:
-        DataError: The file is missing, malformed or holds no camera; a pose is not rigid, or a lens impossible.
+        DataError: The file is missing, malformed or holds no camera; a pose is not rigid, or a lens has impossible values.
     """
     if path.is_dir():
         found = _colmap(path)

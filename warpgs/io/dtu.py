@@ -20,9 +20,9 @@ from warpgs.scene import Scene
 FILES = ("cameras.npz", "cameras_sphere.npz")
 FOLDERS = ("image", "images")
 MAX_ARCHIVE_BYTES = 2**24
-"""Size of the largest archive that is read [bytes]; one of 64 cameras has a hundred thousand."""
+"""Size of the largest archive that is read [bytes]; an archive of 64 cameras has a hundred thousand."""
 MAX_MATRIX_BYTES = 4096
-"""Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is rejected."""
+"""Largest accepted size of an unpacked 4 x 4 matrix with its header [bytes]."""
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""WebP: chunks must fill the length that the file announces. Lossy WebP has no checksum: damage inside of it is not seen."""
+"""WebP: chunks must fill the length that the file announces. Lossy WebP has no checksum: damage to it is not detected."""
 
 from __future__ import annotations
 
