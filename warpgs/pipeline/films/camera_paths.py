@@ -62,7 +62,7 @@ def path_of(rig: Rig) -> str:
 
 
 def upright(rig: Rig, camera: Camera) -> Camera:
-    """Return a camera with its centre and axis turned upright, for rotated photographs."""
+    """Return an upright camera with the same centre and axis, for rotated photographs."""
     if not rig.turned:
         return camera
     pose = look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)

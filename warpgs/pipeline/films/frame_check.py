@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 EMPTY = 0.1
-"""A frame shows nearly nothing if its mean alpha is below this fraction of that of the training views' renders."""
+"""A frame shows nearly nothing if its mean alpha is below this fraction of the mean alpha of the training views' renders."""
 MIN_COVERAGE = 0.002
-"""A frame shows nearly nothing if its mean alpha is below this, whatever the training views' renders have."""
+"""A frame also shows nearly nothing if its mean alpha is below this value."""
 BLACK = 1 / 255
 """Mean of the brightest channel below which a frame is black."""
 
