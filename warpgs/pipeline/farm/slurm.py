@@ -31,8 +31,8 @@ ASK_EVERY = 1.0
 QUEUE_EVERY = 15.0
 """Time between two calls of squeue, which lists all jobs [s]."""
 MISSED = 3
-"""Number of calls of squeue in a row without a job after which the job is taken as ended: a network file system may show its
-answer late."""
+"""A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show its answer
+late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
 SECONDS_TO_SAVE = 120

@@ -166,7 +166,7 @@ def render(
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
         except WarpgsError as e:
             training = True
-            notes.append(f"masked-out regions count as seen, since the scene cannot be read: {e}")
+            notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
         done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)

@@ -39,7 +39,7 @@ class RunRecorder:
             self.log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
 
     def save(self, trainer: Trainer) -> None:
-        """Save the state as a checkpoint, after the log and the images before it."""
+        """Save the state as a checkpoint, after the log and the images of earlier steps are written."""
         job = self.job
         if job.out is None or self.log is None:
             return
@@ -99,7 +99,7 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
     """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
 
     Raises:
-        NotFiniteError: A loss or the state is not finite; with a run folder the state before is saved.
+        NotFiniteError: A loss or the state is not finite; with a run folder, the state before the step is saved.
         KeyboardInterrupt: A signal ended the fit; the state is saved.
     """
     recorder = RunRecorder(job, trainer.step, images_written)

@@ -25,7 +25,7 @@ class Target:
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None
-    """1 where a pixel counts, else 0, shape [H, W]; None if all pixels count."""
+    """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     maps: Mapping[str, torch.Tensor]
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None

@@ -29,7 +29,7 @@ DIVIDED_BYTES = 2**26
 """Least size of a tensor whose rows are divided among processes [bytes]: updating a smaller tensor takes less time than
 two more exchanges need to begin."""
 MAX_RENDERS = 2**24
-"""Upper bound of the number of renders of a fit: each render takes its random numbers from its number, a float32."""
+"""Upper bound of the number of renders of a fit: the random numbers of a render depend on its index, a float32."""
 
 
 def check_ranks(batch: int, ranks: Ranks) -> None:

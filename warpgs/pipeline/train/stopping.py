@@ -29,7 +29,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""The gain is measured since the last measurement at which the number of steps was smaller by at least this factor."""
+"""The gain is measured since the latest measurement at which the number of steps, times this factor, was at most the present
+number."""
 
 
 @dataclass(frozen=True)

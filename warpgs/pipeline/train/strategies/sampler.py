@@ -43,18 +43,24 @@ class SamplerConfig:
         if self.depth not in ("rendered", "consistent"):
             raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, consistent")
         if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
-            raise UsageError("sampler: fraction must be in (0, 1], gate quantile and min alpha in [0, 1)")
+            raise UsageError(
+                "sampler: `fraction` must be in (0, 1], `gate-quantile` and `min-alpha` in [0, 1), not "
+                f"{self.fraction}, {self.gate_quantile} and {self.min_alpha}"
+            )
         if (
             not 0 < self.opacity < 1
             or not 0 < self.footprint < math.inf
             or self.border < 0
             or not 0 <= self.max_fraction < math.inf
         ):
-            raise UsageError("sampler: opacity must be in (0, 1), footprint above 0, border and max fraction at 0 or above")
+            raise UsageError(
+                "sampler: `opacity` must be in (0, 1), `footprint` above 0, `border` and `max-fraction` at least 0, not "
+                f"{self.opacity}, {self.footprint}, {self.border} and {self.max_fraction}"
+            )
 
 
 def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | None, config: SamplerConfig) -> torch.Tensor:
-    """Return the pixels with enough opacity and finite depth, away from the border and not masked out; all maps are [H, W]."""
+    """Return the unmasked pixels with enough opacity and positive, finite depth, away from the border; all maps are [H, W]."""
     valid = (alpha > config.min_alpha) & torch.isfinite(depth) & (depth > 0)
     if mask is not None:
         valid &= mask > 0
@@ -125,7 +131,7 @@ def fine_gaussians(
         depth: z-depth [u], shape [H, W].
         at: Rows and columns, shape [S, 2].
         config: Opacity and footprint.
-        coefficients: Spherical-harmonics coefficients a channel.
+        coefficients: Spherical-harmonics coefficients per channel.
 
     Returns:
         Rows of the five tensors of `Gaussians`, shape [S, ...] each.
