@@ -97,8 +97,7 @@ class ImportanceSampling(Strategy):
         return bool(self.method.hier) and self.method.events and step > self.context.phases.refine
 
     def growth(self) -> Growth:
-        """Return the times of refinement and sampling; events are listed, since PSNR is up to 3 dB lower right after an
-        event."""
+        """Return the times of refinement and sampling; events are listed, since they lower PSNR by up to 3 dB for a while."""
         times, phases = self.gradients.times, self.context.phases
         return Growth(phases.refine, times.until, phases.events) if self.method.events else Growth(times.after, times.until)
 
