@@ -145,7 +145,7 @@ def test_classical_sources_say_so():
 def test_without_any_depth_geometry_does_not_count():
     (prior,), notes = view_priors([view(shapes()[0])], PriorConfig())
     assert not prior.disparity.any() and prior.depth_source == "none"
-    assert any("none from a network or from other views" in n for n in notes)
+    assert any("neither a network nor other views gave depth" in n for n in notes)
 
 
 def test_many_names_are_cut_short(tmp_path):

@@ -174,7 +174,7 @@ class SlurmEngine:
             return ""
 
     def close(self) -> None:
-        """Cancel running and queued jobs, and remove the private folder; running fits save their state."""
+        """Stop running jobs, drop queued ones, and remove the private folder; running fits save their state."""
         if self._running:
             done = _call("scancel", *(job.slurm_id for job in self._running.values()))
             if done.code:
