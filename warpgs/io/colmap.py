@@ -304,7 +304,7 @@ def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str)
     """Return the image file by view name, and a note for the user (empty where nothing was chosen).
 
     Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
-    the former are matched by stem, the latter by sorted order where the counts agree.
+    files with another suffix are matched by stem, files with other names by sorted order if the counts agree.
     """
     paths = {n: scene.child(images, n, where) for n in names}
     lost = [n for n in names if not paths[n].is_file()]
@@ -340,7 +340,7 @@ class ColmapReader(Reader):
         found = f"the COLMAP reconstruction in {model.relative_to(folder).as_posix()}"
         if missing := missing_parts(model):
             return Probe(found, " and ".join(missing))
-        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its images, a folder images")
+        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its image folder, images")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""

@@ -102,7 +102,7 @@ class DTUReader(Reader):
         found = next((f for f in FILES if (folder / f).is_file()), None)
         if found is None:
             return None
-        return Probe(found, "" if has_folder(folder, *FOLDERS) else f"its images, a folder {' or '.join(FOLDERS)}")
+        return Probe(found, "" if has_folder(folder, *FOLDERS) else f"its image folder, {' or '.join(FOLDERS)}")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""

@@ -39,7 +39,7 @@ class Split:
         both = set(self.train) & set(self.test)
         if both:
             some = ", ".join(sorted(both)[:5])
-            raise DataError(f"views {some} are in training and in test; a score on them would mean nothing. Name each once")
+            raise DataError(f"views {some} are in training and in test, so their scores would be meaningless; name each once")
         if not self.train:
             raise DataError("the split leaves no training view; name at least one")
 

@@ -73,17 +73,17 @@ class PhotoCheck:
 
     @property
     def blurred(self) -> bool:
-        """True where the photograph is clearly less sharp than others."""
+        """True if the photograph is clearly less sharp than others."""
         return self.sharpness is not None and self.sharpness < MIN_SHARPNESS
 
     @property
     def exposed_otherwise(self) -> bool:
-        """True where the photograph is clearly darker or brighter than others."""
+        """True if the photograph is clearly darker or brighter than others."""
         return self.brightness is not None and not 1 / MAX_BRIGHTNESS <= self.brightness <= MAX_BRIGHTNESS
 
     @property
     def tinted(self) -> bool:
-        """True where the white balance differs from that of others."""
+        """True if the white balance clearly differs from other photographs."""
         if self.channels is None or self.brightness is None:
             return False
         return any(not 1 / MAX_TINT <= c / self.brightness <= MAX_TINT for c in self.channels)

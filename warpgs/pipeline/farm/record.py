@@ -106,7 +106,7 @@ def file_digest(path: Path) -> str:
 
 
 def source_stamp(scene: Path) -> str:
-    """Return the SHA-256 of the names, sizes and times of a scene's files; empty where they cannot be listed or are many."""
+    """Return the SHA-256 of the names, sizes and times of a scene's files; empty if they cannot be listed or are too many."""
     rows = []
     try:
         if scene.is_file():

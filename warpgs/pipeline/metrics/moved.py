@@ -18,7 +18,7 @@ MAX_PIXELS = 20_000
 MIN_RESIDUAL = 0.05
 """Least residual, in [0, 1], of a pixel that differs from the model."""
 MIN_FACTOR = 3.0
-"""Least ratio of a differing pixel's residual to that of other views at the same point."""
+"""Least ratio of a differing pixel's residual to the residual of other views at the same point."""
 FLOOR = 0.005
 """Lower bound, in [0, 1], of the residual of other views in that ratio."""
 MIN_VIEWS = 2

@@ -47,7 +47,7 @@ def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Depths:
-    """Random depths for pixels of one view: near those of matched points around the pixel, else between the default bounds."""
+    """Random depths for pixels of one view: near the depths of nearby matched points, else between the default bounds."""
 
     def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
         seen = geometry.in_image(view.camera, matched.points)

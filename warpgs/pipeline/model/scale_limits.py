@@ -50,7 +50,7 @@ class Limits:
         Args:
             params: ``means`` [N, 3] and ``log_scales`` [N, 3] of `Gaussians`.
             cameras: Training cameras.
-            going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes. None stands for True.
+            going: Whether the step is taken, bool, shape [1]; if False, nothing changes. None stands for True.
         """
         if self == NO_LIMITS:
             return

@@ -40,7 +40,7 @@ class DensityUpdate:
     added: Mapping[str, torch.Tensor]
     """New rows of each parameter, shape [A, ...]; their moments start at zero."""
     parents: torch.Tensor
-    """Parent of each new row, by its index before the change, -1 for none, int64, shape [A]."""
+    """Parent of each new row, by its index before the change, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
     """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
     overwritten: torch.Tensor | None = None

@@ -132,7 +132,7 @@ def render(
         out: Folder or film to write; None for `path-PATH` in the run folder, or beside the file.
         settings: Settings of the film; their background is ignored.
         device_name: auto, cpu or cuda.
-        background: Colour behind the scene; auto for that of the fit, and for transparent images if the scene's images have an
+        background: Colour behind the scene; auto for the fit's colour, or for transparent images if the scene's images have an
             alpha channel.
         coverage: True to also write images of the coverage by training views.
         sheet: Whether to write six frames in one image, too.

@@ -70,7 +70,7 @@ class StepTeller:
     """Receiver of each step's report, for the terminal, the log and the caller."""
 
     def __init__(self, job: FitJob, trainer: Trainer, recorder: RunRecorder, progress: Progress | None):
-        """Start before the first step; ``progress`` is None for a fit that shows none."""
+        """Start before the first step; ``progress`` is None for a fit without a display of progress."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
         """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""

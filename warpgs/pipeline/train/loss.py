@@ -60,7 +60,7 @@ class LossInputs:
     """The Gaussians; differentiable."""
     camera: Camera
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
-    tensors. Where poses are refined, the pose is that of the step and differentiable."""
+    tensors. If poses are refined, this is the refined pose of the step, and it is differentiable."""
     step: torch.Tensor
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
     for later steps; `LossTerm.active` has the number on the host."""

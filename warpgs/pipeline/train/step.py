@@ -205,7 +205,7 @@ class Forward:
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
     """Take one training step: render the next view, compute the loss, update all parameters.
 
-    If the render overflows or the loss is not finite, nothing changes except ``buffers.stop``, which is set.
+    If the render overflows or the loss is not finite, no parameter changes, and ``buffers.stop`` is set.
 
     Args:
         learned: Tables and strategy that the step changes.

@@ -16,7 +16,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     """Return the weights [2] of the sums of 1 - SSIM and of absolute differences over ``count`` numbers.
 
-    They are cached for good, as CUDA graphs refer to their memory.
+    They stay cached, because CUDA graphs refer to their memory.
     """
     with torch.inference_mode(False):  # a first call may come in inference mode, whose tensors cannot be used in training
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
