@@ -132,7 +132,7 @@ def _number_rule(info: Any) -> Any:
 
 
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
-    """Return an instance of a dataclass of flags from the arguments of a command line; ``--help`` prints one screen.
+    """Parse the arguments of a command line into a dataclass of flags; ``--help`` prints one screen.
 
     Numbers are finite and written in the digits 0 to 9.
 

@@ -91,7 +91,7 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """Return the folder of a reconstruction in a scene, in sparse, or in sparse/0; None without one."""
+    """Return the folder of a reconstruction, given a scene folder, its sparse or its sparse/0; None without one."""
     found = colmap.model_folder(folder)
     return colmap.model_folder(folder / "0") if found is None else found
 

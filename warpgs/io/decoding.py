@@ -47,7 +47,7 @@ def read_image_start(path: Path, count: int) -> bytes:
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     if not os.path.exists(path):  # False for broken and circular links
-        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
+        what = "is a broken link" if path.is_symlink() else "the image file is missing"
         return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
     return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
 
@@ -95,7 +95,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
 
 def _too_large(path: Path, pixels: int) -> str:
     needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: decoding the image needs {needed:.1f} GiB, which are not free; shrink it, or end other programs"
+    return f"{path}: decoding the image needs {needed:.1f} GiB of free memory; shrink the image, or end other programs"
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:

@@ -20,7 +20,7 @@ UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bi
 NONE = "none"
 """Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
-"""End of the stem of a map of confidence."""
+"""Ending of a confidence map's file name, before its suffix."""
 MILLIMETRES = 0.001
 """Default length of a unit of integers: RGB-D cameras store depth in millimetres, with poses in metres."""
 MAX_DEPTH = 1e12

@@ -66,7 +66,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
             )
         if (size := len(os.fsencode(job.name))) > MOST_BYTES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} has {size} bytes, and a job's name at most {MOST_BYTES}; give another name "
+                f"{jobs}: {job.name[:100]!r} has {size} bytes, but a job's name may have {MOST_BYTES}; give another name "
                 "in a .jsonl file"
             )
         if job.name.casefold() in taken:

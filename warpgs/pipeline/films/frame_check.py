@@ -63,7 +63,11 @@ class FrameCheck:
             for numbers, words, advice in (
                 (self.empty, "show nearly nothing", f"the path leaves the captured area; {remedy}"),
                 (self.black, "are black", f"the camera is inside geometry, or the scene is unlit; {remedy}"),
-                (self.outside, f"have over {OUTSIDE:.0%} of pixels in no photograph", f"expect artefacts there; {nearer}"),
+                (
+                    self.outside,
+                    f"have over {OUTSIDE:.0%} of their pixels outside all photographs",
+                    f"expect artefacts there; {nearer}",
+                ),
             )
             if numbers
         ]

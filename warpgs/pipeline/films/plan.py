@@ -93,7 +93,7 @@ class FilmPlan:
     """Advice for frames that show nothing."""
     notes: list[str]
     """Lines for the user on the choices made."""
-    nearer: str = "move the cameras nearer to those of the photographs"
+    nearer: str = "move the cameras nearer to the photographs' cameras"
     """Advice for frames that show areas outside the photographs."""
 
 

@@ -25,7 +25,7 @@ VARIANTS = {
 """Definition of each score, for result files and reports. Scores by other definitions are not comparable."""
 ALPHA_VARIANTS = {
     "psnr_whole": "of views with an alpha channel: over all unmasked pixels, with the background of the fit behind both images",
-    "psnr_foreground": "as for the whole image, over the pixels with an opacity above 0.5",
+    "psnr_foreground": "as psnr_whole, but only over the pixels with an opacity above 0.5",
     "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
     "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
 }

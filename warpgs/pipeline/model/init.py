@@ -81,7 +81,7 @@ class InitConfig:
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must be between 0 and 1")
         if self.random_count < 1:
-            raise UsageError(f"init random count {self.random_count} must be at least 1")
+            raise UsageError(f"init random-count {self.random_count} must be at least 1")
 
     def epipolar(self) -> EpipolarConfig:
         """Return the settings of depth from flow.

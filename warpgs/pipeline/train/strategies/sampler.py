@@ -23,7 +23,7 @@ class SamplerConfig:
 
     depth: str = "rendered"
     """Depth of new Gaussians: rendered (the paper), or consistent, the initial depth that other views confirm. With consistent,
-    the gate lets only pixels with such depth pass, in views that have some."""
+    and with the reliability gate on, only pixels with such depth are sampled, in views that have some."""
     fraction: float = 0.005
     """Gaussians per event and view, as a fraction of the view's pixels."""
     gate_quantile: float = 0.6
