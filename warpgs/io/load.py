@@ -106,7 +106,7 @@ def load_scene(
 
 
 def _counted(root: Path, progress: Callable[[str], object] | None) -> Callable[[Path], None]:
-    """Return a function that shows the number of the image that is read."""
+    """Return a function that reports the number of the image that is read next."""
     numbers = itertools.count(1)
 
     def on_image(file: Path) -> None:

@@ -67,7 +67,7 @@ class MapFolder:
     """The maps of a folder, found by the names of images."""
 
     def __init__(self, folder: Path, flag: str, allow_outside: bool):
-        """List a folder; unless ``allow_outside``, no link below it may point outside it.
+        """List a folder; links in it may point outside the folder only with ``allow_outside``.
 
         Raises:
             DataError: The folder is missing or holds no map, two files are for one image, or a link points outside.

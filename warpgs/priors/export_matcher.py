@@ -33,7 +33,7 @@ FILES = {
 }
 """SHA-256 of the files that are used, by their path in the package."""
 MAX_BYTES = 2**26
-"""Largest size of such a file [bytes]."""
+"""Largest size of one of the package's files [bytes]."""
 OUTPUTS = ("keypoints", "scores", "descriptors")
 KEYPOINTS = 4096
 """Number of keypoints that the network returns: those with the highest scores."""

@@ -115,7 +115,7 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
 
 
 def plane_homographies(first: Camera, others: Sequence[Camera], inverses: np.ndarray) -> np.ndarray:
-    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]: it is linear in them."""
+    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]."""
     start = np.stack([plane_homography(first, o, 0.0) for o in others])
     slope = np.stack([plane_homography(first, o, 1.0) for o in others]) - start
     return start + inverses[:, None, None, None] * slope

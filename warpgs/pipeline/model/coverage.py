@@ -19,7 +19,7 @@ PROBES = 2
 
 @dataclass(frozen=True)
 class Coverage:
-    """Per Gaussian, over all training views; tensors of shape [N] on the device of the Gaussians."""
+    """Coverage of each Gaussian by all training views; tensors of shape [N] on the device of the Gaussians."""
 
     maxima: torch.Tensor
     """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806; a sum is small for thin Gaussians)."""

@@ -114,7 +114,7 @@ def _footprint(cameras: Sequence[Camera], points: np.ndarray) -> float:
 
 
 def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np.ndarray:
-    """Return the cells [N, 3] of ``half`` their width [u] that are neither empty nor inside."""
+    """Return the cells [N, 3] that are neither empty nor inside; ``half`` is half the width of a cell [u]."""
     empty, inside, seen = (np.zeros(len(cells), int) for _ in range(3))
     at = np.arange(len(cells))
     for k, shape in enumerate(shapes):

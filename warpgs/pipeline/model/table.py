@@ -45,7 +45,7 @@ class DensityUpdate:
     """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
     overwritten: torch.Tensor | None = None
     """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
-    [R]; None for none."""
+    [R]; None to overwrite no row."""
     values: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
