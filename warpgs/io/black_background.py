@@ -11,10 +11,10 @@ from warpgs.scene import View
 DARK = 16 / 255
 """A pixel is dark if its brightest channel is below this value, in [0, 1]."""
 DARK_FRACTION = 0.3
-"""Fraction of dark pixels from which on an image with a dark border shows an object on black."""
+"""An image with a dark border shows an object on black if at least this fraction of its pixels is dark."""
 
 HOLE = 0.001
-"""Fraction of an image from which on an enclosed dark region is a hole in the object, not a part of it."""
+"""An enclosed dark region is a hole in the object if it covers at least this fraction of the image."""
 
 
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:

@@ -109,7 +109,7 @@ class Stopping:
         self.marks: list[int] = []
         """Steps done when the blocks are measured: when growth begins, and after each interval."""
         self.earliest = 0.0
-        """Number of steps, the first ones, in which views have half size and growth does not end."""
+        """Number of first steps, in which views have half size and growth does not end."""
         self.measured: list[tuple[int, torch.Tensor]] = []
         """For every measurement, the steps done and the errors of the blocks [B]."""
 

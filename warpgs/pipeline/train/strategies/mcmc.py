@@ -123,7 +123,7 @@ def make_kernel() -> wp.Kernel:
 def perturb(
     gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float
 ) -> None:  # fmt: skip
-    """Add noise with each Gaussian's own covariance to its mean, in place; more opaque Gaussians get less noise (eq. 8).
+    """Add noise, multiplied by each Gaussian's covariance, to its mean, in place; opaque Gaussians get less noise (eq. 8).
 
     The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit.
 

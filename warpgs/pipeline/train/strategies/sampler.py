@@ -1,4 +1,4 @@
-"""Sampling of pixels for fine Gaussians, and initial values of these (paper, section "Geometric-Aware Sampling")."""
+"""Sampling of pixels for fine Gaussians, and their initial values (paper, section "Geometric-Aware Sampling")."""
 
 from __future__ import annotations
 
