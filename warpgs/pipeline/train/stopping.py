@@ -119,7 +119,7 @@ class Stopping:
         Args:
             context: Parts of the fit, with its views.
             strategy: Density strategy.
-            half_resolution: Fraction of the planned steps, the first ones, in which views have half size.
+            half_resolution: Fraction of the planned steps, from the first step on, in which views have half size.
         """
         assert self.config.min_gain_db is not None  # `settings_by_views` has chosen
         if self.config.min_gain_db == 0:
