@@ -108,7 +108,7 @@ def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
 
 
 def _footprint(cameras: Sequence[Camera], points: np.ndarray) -> float:
-    """Return the width of a pixel at points [N, 3] before the cameras, the median over both [u]."""
+    """Return the width of a pixel at points [N, 3] in front of the cameras, the median over points and cameras [u]."""
     widths = np.stack([geometry.project_points(c, points)[1] / focal_length(c) for c in cameras])
     return float(np.median(widths[widths > 0])) if (widths > 0).any() else 0.0
 
