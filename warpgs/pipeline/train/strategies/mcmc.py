@@ -24,7 +24,7 @@ from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
 MAX_COPIES = 51
-"""Largest number of Gaussians that replace one at an event, as in the authors' program."""
+"""Largest number of Gaussians that replace one Gaussian at an event, as in the authors' program."""
 MAX_OPACITY = 1 - 2**-24
 """Largest opacity in relocation; it is below 1, so that the logit is finite."""
 NOISE_STREAM = 0x6D636D63
