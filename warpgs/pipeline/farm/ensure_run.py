@@ -96,7 +96,7 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the requested run, finished.
+    """Ensure that a run folder holds the finished run that is requested.
 
     A finished run with the same configuration, user code, data, views, kind of device and version is kept. An interrupted run
     is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.

@@ -74,7 +74,7 @@ class Rig:
         return math.cos(elevation) * level + math.sin(elevation) * self.up
 
     def is_watched(self, cameras: list[Camera]) -> bool:
-        """Return whether all cameras look at a common point."""
+        """Return whether the rig is around or in front of its centre, and all cameras look at the centre."""
         to_center = [self.center - c.center for c in cameras]
         cosines = [(d * c.viewmat[2, :3]).sum() / max(math.sqrt((d * d).sum()), 1e-12) for c, d in zip(cameras, to_center)]
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE

@@ -40,18 +40,18 @@ class DensityUpdate:
     added: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """New rows of each parameter, shape [A, ...]; their moments start at zero. Empty if no row is added."""
     parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
-    """Parent of each new row, by its index before the change, -1 for none, int64, shape [A]."""
+    """Parent of each new row, by its index before the change, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
     """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
     overwritten: torch.Tensor | None = None
     """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
-    [R]; None for none."""
+    [R]; None to overwrite no row."""
     values: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
 
 class Table:
-    """Parameters with Adam moments and columns, kept row by row in step."""
+    """Parameters with their Adam moments, and columns; all of them have the same rows."""
 
     batch: int = 1
     """Number B of views over which gradients are averaged. Learning rates are multiplied by the square root of B, and decay
@@ -120,7 +120,8 @@ class Table:
         Args:
             lrs: Learning rate of each parameter, for steps of one view.
             step: Number of the step, from 1.
-            head_lrs: Learning rate of the first 3 numbers of each row, for parameters whose first numbers have their own.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters whose first numbers have a rate of their
+                own.
         """
         row, factor = [], math.sqrt(self.batch)
         for name in self.params:
@@ -133,7 +134,7 @@ class Table:
         self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor,
         factors: torch.Tensor | None = None, rows: slice = slice(None),
     ) -> None:  # fmt: skip
-        """Update parameters, unless ``skip`` [1] is not 0.
+        """Update parameters with Adam, if ``skip`` [1] is 0.
 
         Args:
             gradients: Gradients of all or some parameters by name.

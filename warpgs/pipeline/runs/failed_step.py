@@ -36,7 +36,7 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
         trainer: The fit, in the state before the step.
         view: Index of the step's view.
         name: Name of the view.
-        slot: Index of the view among those of the step.
+        slot: Index of the view among the step's views.
     """
     number = trainer.step + 1
     plan = trainer.plan_of(number)

@@ -40,7 +40,7 @@ class RunRecorder:
             self.log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
 
     def save(self, trainer: Trainer) -> None:
-        """Save the state as a checkpoint, after the log and the images before it."""
+        """Save the state as a checkpoint, after the log and the images of earlier steps are written."""
         job = self.job
         if job.out is None or self.log is None:
             return
@@ -71,7 +71,7 @@ class StepTeller:
     """Receiver of each step's report, for the terminal, the log and the caller."""
 
     def __init__(self, job: FitJob, trainer: Trainer, recorder: RunRecorder, progress: Progress | None):
-        """Start before the first step; ``progress`` is None for a fit that shows none."""
+        """Start before the first step; ``progress`` is None for a fit without a display of progress."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
         """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""
@@ -100,7 +100,7 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
     """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
 
     Raises:
-        NotFiniteError: A loss or the state is not finite; with a run folder the state before is saved.
+        NotFiniteError: A loss or the state is not finite; with a run folder, the state before the step is saved.
         KeyboardInterrupt: A signal ended the fit; the state is saved.
     """
     recorder = RunRecorder(job, trainer.step, images_written)

@@ -134,7 +134,7 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and a depth map of each held-out view.
 
-    If no view is held out, the images are those of training views. LPIPS is measured only on held-out views.
+    If no view is held out, the images show training views. LPIPS is measured only on held-out views.
 
     Args:
         out: The run folder; None to write nothing.
@@ -143,7 +143,7 @@ def evaluate_run(
         test: Held-out views.
         options: Options of the rasterizer.
         lpips: Network for LPIPS, or None.
-        names: Names of image files by view, from `image_names` of the whole scene; None for those of these views.
+        names: Names of image files by view, from `image_names` of the whole scene; None to make names for these views only.
         tell: Called with a line for each view before it is rendered.
 
     Returns:

@@ -152,7 +152,7 @@ def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
 
 
 def preset_word(preset: str) -> str:
-    """Return a short name of a user's preset for folders and tables: its own name, or that of its file or object."""
+    """Return a short name of a user's preset for folders and tables: its own name, or the name of its file or object."""
     return Path(preset).stem if preset.endswith(SUFFIX) else preset.rpartition(":")[2]
 
 
