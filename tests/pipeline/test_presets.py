@@ -240,7 +240,11 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
     assert str(path) in request.notes[0] and request.notes[0].endswith("then given: steps")
     assert request_of([*base, "--preset", f"{own}:PLAIN"], "").config == FitConfig(steps=5)
     (tmp_path / "broken.py").write_text("1 / 0\n")
+    (tmp_path / "wrong.py").write_text("X = {'stepz': 3}\n")
+    (tmp_path / "open.py").write_text("X = {\n")
     for preset, said in (
+        (f"{tmp_path}/wrong.py:X", f"{tmp_path}/wrong.py:X: unknown setting 'stepz'; did you mean steps?"),
+        (f"{tmp_path}/open.py:X", f"SyntaxError: '{{' was never closed ({tmp_path}/open.py, line 1); correct that code"),
         (f"{tmp_path}/broken.py:X", "ZeroDivisionError: division by zero"),
         (str(written(tmp_path, "stepz = 3", "b.toml")), "did you mean steps?"),
         ("best", "preset 'best' is not one of"),
@@ -248,3 +252,5 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
         assert main(["fit", *base, "--preset", preset]) == 2
         text = capsys.readouterr().err
         assert said in text and len(text.splitlines()) == 1
+    assert main(["compare", *base, "--presets", f"default,{tmp_path}/broken.py:X"]) == 2
+    assert f"the preset '{tmp_path}/broken.py:X' cannot be loaded" in capsys.readouterr().err

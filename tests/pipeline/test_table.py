@@ -58,6 +58,15 @@ def test_kept_rows_keep_everything_and_new_rows_start_anew():
     assert all(t.requires_grad and t.is_leaf and t.is_contiguous() for t in made.params.values())
 
 
+def test_rows_are_dropped_without_new_ones():
+    """A change that only keeps rows needs nothing else."""
+    made = table()
+    adam_step(made, {n: torch.ones_like(t) for n, t in made.params.items()})
+    before = snapshot(made)
+    made.apply(DensityUpdate(torch.tensor([0, 3])))
+    assert len(made) == 2 and all(torch.equal(t, before[n][[0, 3]]) for n, t in snapshot(made).items())
+
+
 def test_columns_are_inherited_or_filled():
     """By the parent where there is one and the column is inherited, else by what the change says, else by the fill."""
     made = table()
