@@ -59,7 +59,8 @@ class GivenDepth:
     values: np.ndarray
     """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 for missing values."""
     kind: str = "metric"
-    """Unit of the values, one of `DEPTH_KINDS`: metric [u], or an unknown scale and shift of each view."""
+    """Meaning of the values, one of `DEPTH_KINDS`. Metric values are in [u]; other kinds have an unknown scale and shift, which
+    differ between views."""
     confidence: np.ndarray | None = None
     """Confidence in each value, in [0, 1], float32, shape [H, W]; None for 1 everywhere."""
 
@@ -75,14 +76,15 @@ class View:
     image: np.ndarray
     """Colours in [0, 1], float32, shape [H, W, 3]."""
     mask: np.ndarray | None = None
-    """True where the pixel counts, bool, shape [H, W]; None if all pixels count."""
+    """True for pixels that are used, bool, shape [H, W]; None to use all."""
     score_mask: np.ndarray | None = None
     """True where a render is scored, bool, shape [H, W]; the fit does not use it. None to score by ``mask``."""
     alpha: np.ndarray | None = None
     """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None if the
     image is opaque."""
     alpha_estimated: bool = False
-    """True if ``alpha`` was estimated from a black background. It then selects the pixels that start Gaussians and are scored.
+    """True if ``alpha`` was estimated from a black background. ``alpha`` then selects the pixels that start Gaussians and are
+    scored.
     The loss does not use it, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
     """Given depth, for the start and the loss of a fit; None without."""
@@ -140,7 +142,7 @@ class Scene:
     normalization: Normalization = field(default_factory=Normalization)
     """Similarity from file to scene coordinates."""
     notes: tuple[str, ...] = ()
-    """Messages about choices made while reading (skipped images, undistortion, the image folder taken)."""
+    """Messages about choices made while reading (skipped images, undistortion, the chosen image folder)."""
     fingerprint: str = ""
     """SHA-256 over names, cameras and pixels, hexadecimal: the same data gives the same fingerprint."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -212,9 +214,9 @@ class ViewDepth:
     notes: tuple[str, ...] = ()
     """Messages for the user: pairs left out, files missing, nothing found."""
     searched: bool = True
-    """False where the depth of the view was not estimated, because enough other views have depth."""
+    """False if the depth of the view was not estimated, because enough other views have depth."""
     given: np.ndarray | None = None
-    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None without a map."""
+    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None if none was given."""
 
     @property
     def coverage(self) -> float:
@@ -284,7 +286,7 @@ class ActivatedGaussians:
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` of None as zeros [N, 1, 3]."""
+        """Return the five tensors by field name, in the order of `Gaussians`; zeros [N, 1, 3] if ``sh`` is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
         return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
 
@@ -305,8 +307,8 @@ class CovarianceGaussians:
     """World positions [u], shape [N, 3]."""
     covars: torch.Tensor
     """Covariances [u^2], positive semi-definite, shape [N, 3, 3]. Only the symmetric part of a matrix is used. Eigenvalues
-    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite one is not rendered. Zeros
-    render as a point with the width of the pixel filter."""
+    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite one is not rendered. A
+    covariance of zeros renders as a point with the width of the pixel filter."""
     opacities: torch.Tensor
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
@@ -322,7 +324,7 @@ class CovarianceGaussians:
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the four tensors by field name, in a fixed order; ``sh`` of None as zeros [N, 1, 3]."""
+        """Return the four tensors by field name, in a fixed order; ``sh`` is zeros [N, 1, 3] if it is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
         return {"means": self.means, "covars": self.covars, "opacities": self.opacities, "sh": sh}
 

@@ -25,7 +25,7 @@ MAX_PARTS = 2**19
 MAX_WHOLE = 2**63 - 1
 """Largest integer: that of 64 bits."""
 MAX_NUMBER = 1e300
-"""Largest magnitude of an integer that stands for a number: a larger one could overflow a float."""
+"""Largest magnitude of a finite number, and of an integer in the place of a number: a larger one could overflow a float."""
 
 Schema = Callable[[Any, str], None]
 
@@ -182,7 +182,7 @@ def items(schema: Schema, count: int | None = None) -> Schema:
 
 
 def mapping(schema: Schema, names: Schema = text) -> Schema:
-    """Return the schema of objects with names by ``names`` and values by ``schema``."""
+    """Return the schema of objects: ``names`` must allow each name, ``schema`` each value."""
 
     def check(value: Any, place: str) -> None:
         if not isinstance(value, dict):
@@ -200,7 +200,7 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
     Args:
         needed: Schema of each name that must be there.
         more: Schema of each name that may be there.
-        others: Whether names beside these are allowed.
+        others: Whether other names are allowed, too.
     """
     known = {**needed, **(more or {})}
 

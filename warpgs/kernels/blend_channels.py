@@ -29,7 +29,7 @@ from warpgs.runtime import interop
 from warpgs.runtime.derivatives import first_order, keep, kept
 
 GEOMETRY = 6
-"""Values of a projected Gaussian before its colour; its depth and its box follow that."""
+"""Number of values of a projected Gaussian before its colour; its depth and its box follow the colour."""
 
 
 def width_of(channels: int, widths: tuple[int, ...] = WIDTHS) -> int:

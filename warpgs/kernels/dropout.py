@@ -36,7 +36,7 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
 
     Args:
         count: Number of Gaussians N.
-        settings: Settings of the step (`Setting`), of which p and the number are read, float32, shape [7].
+        settings: Settings of the step (`Setting`), of which p and the step number are read, float32, shape [7].
         seed: Any 32-bit integer.
 
     Returns:

@@ -97,7 +97,7 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             listed = isinstance(given, (list, tuple))
-            order = "a list needs a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
+            order = "a list requires a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
             wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be an instance of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
@@ -164,7 +164,7 @@ def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: tor
     if needed > free:
         raise ResourceError(
             f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
-            "smaller images, fewer cameras at once, or parts of an image by RasterizeOptions(window=...)"
+            "smaller images, fewer cameras at once, or parts of an image with RasterizeOptions(window=...)"
         )
 
 

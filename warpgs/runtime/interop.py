@@ -44,7 +44,7 @@ FEW_THREADS = 4
 """Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
 
 SERIAL_WORK = 20_000
-"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. A range has at least half."""
+"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. A range has at least half this."""
 
 MAX_SIZE = 2**31 - 1
 """Largest number of entries of an axis, and of items of a launch: Warp indexes them with signed 32-bit integers."""
@@ -292,7 +292,7 @@ _OF_THREAD = _OfThread()
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
 
-    On a CPU, torch's number of threads share the items; results are repeatable, since each item has its own output memory.
+    On a CPU, as many threads as torch uses share the items; results are repeatable, since each item has its own output memory.
 
     Args:
         kernel: Warp kernel whose item number is ``begin + wp.tid()``.

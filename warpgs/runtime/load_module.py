@@ -64,7 +64,7 @@ def exclusive(path: Path) -> Iterator[None]:
     """Hold a file, which is made if it is missing, so that one thread of one process at a time runs the body.
 
     The system releases the file when its holder ends, killed or not. On a file system without locks the body runs
-    without one: Warp renames a compiled module into place, so two processes that compile it only lose time.
+    unlocked: Warp renames a compiled module into place, so two processes that compile it only lose time.
 
     Raises:
         ResourceError: The file cannot be opened.

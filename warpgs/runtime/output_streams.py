@@ -57,7 +57,7 @@ def reason(error: BaseException) -> str:
 
 
 class CarefulStream:
-    """A text stream that never raises: the first error is kept, and later writes are dropped."""
+    """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
 
     def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
         """Wrap a stream.

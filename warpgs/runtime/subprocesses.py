@@ -90,7 +90,7 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
     """Run a module of this package in another process, and yield the lines of its stdout as they come.
 
-    Like that of `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
+    As in `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
     The module calls `end_with_parent`, so that the process ends when this one is killed.
 
     Args:
@@ -152,7 +152,7 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
 class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
-    Like that of `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
+    As in `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
     stops at the end of its stdin, which also follows if the parent is killed.
     """
 
