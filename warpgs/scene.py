@@ -59,8 +59,7 @@ class GivenDepth:
     values: np.ndarray
     """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 for missing values."""
     kind: str = "metric"
-    """Meaning of the values, one of `DEPTH_KINDS`. Metric values are in [u]; other kinds have an unknown scale and shift, which
-    differ between views."""
+    """Meaning of the values, one of `DEPTH_KINDS`: metric [u]; the scale and shift of other kinds are unknown, view by view."""
     confidence: np.ndarray | None = None
     """Confidence in each value, in [0, 1], float32, shape [H, W]; None for 1 everywhere."""
 
@@ -83,8 +82,7 @@ class View:
     """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None if the
     image is opaque."""
     alpha_estimated: bool = False
-    """True if ``alpha`` was estimated from a black background. ``alpha`` then selects the pixels that start Gaussians and are
-    scored.
+    """True if ``alpha`` was estimated from a black background: it then selects pixels that start Gaussians and are scored.
     The loss does not use it, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
     """Given depth, for the start and the loss of a fit; None without."""

@@ -167,7 +167,6 @@ def sweep(folder: Folder, own: bool = False) -> None:
 
     Args:
         folder: Folder to remove them from.
-
         own: True to remove only entries of this user.
     """
     with contextlib.suppress(OSError):

@@ -70,7 +70,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def start_of(path: Path) -> bytes:
-    """Return the bytes of a PLY file up to the longest header, which is checked.
+    """Return the first bytes of a PLY file, as many as the longest allowed header has; its own header is checked.
 
     Raises:
         DataError: The file cannot be read, or is not a PLY file.
@@ -220,6 +220,6 @@ class CompressedPLY(Format):
         """Return whether the header declares antialiasing.
 
         Raises:
-            DataError: The file is missing or no PLY.
+            DataError: The file is missing or not a PLY file.
         """
         return is_antialiased(start_of(path))

@@ -263,6 +263,6 @@ class PLY(Format):
         """Return whether the header declares antialiasing.
 
         Raises:
-            DataError: The file is missing or no PLY.
+            DataError: The file is missing or not a PLY file.
         """
         return is_antialiased(start_of(path))

@@ -39,7 +39,7 @@ from warpgs.input_files import open_input, unread_reason
 LEVELS = 256
 """Entries of a codebook."""
 PALETTE = 65536
-"""Most rows of harmonics."""
+"""Largest number of rows of harmonics."""
 COLUMNS = 64
 """Rows of the palette side by side in its image."""
 ROUNDS = 12
@@ -48,12 +48,12 @@ MAX_META_BYTES = 2**20
 MAX_CONTENTS_BYTES = 2**16
 """Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
+"""Largest number of Gaussians per byte of a file, of pixels per Gaussian, and a number added to both limits: real files have
+one Gaussian per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
 MAX_PIXEL_BYTES = 8
 """Largest number of bytes per pixel of a lossless WebP image; incompressible pixels take little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
-"""Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
-"""Most Gaussians per byte of a file, most pixels per Gaussian, and a number added to both limits: real files have one Gaussian
-per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
+"""Largest number of pixels of the palette's image: 65,536 rows of 15 coefficients."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -106,7 +106,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a codebook of 256 values, ascending, and the index of the nearest entry, as uint8 in the shape of ``values``.
+    """Return a codebook of 256 ascending entries, and the index of the entry nearest to each of ``values``, uint8, equal shape.
 
     Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that results repeat.
     """

@@ -57,7 +57,7 @@ bomb 1000."""
 
 
 def fractional_bits(means: np.ndarray) -> int:
-    """Return the finest resolution, 2^-bits, at which all coordinates [N, 3] fit into 24 signed bits; at most 2^-24.
+    """Return the number of fractional bits, at most 24, at which all coordinates [N, 3] just fit into 24 signed bits.
 
     Raises:
         DataError: A coordinate is beyond 2^23, which the format cannot hold.

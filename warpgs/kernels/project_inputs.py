@@ -104,7 +104,6 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
             "gradients of opacity_factors are not supported: give opacity_factors.detach(), or multiply the opacities "
             "themselves"
         )
-
     return factors.detach()
 
 

@@ -103,7 +103,7 @@ def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
     stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
-    """Make a mesh of the surfaces that cameras see of a model.
+    """Make a mesh of the surfaces of a model that cameras see.
 
     Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
     for distances and for colours. Up to 16 million pixels in all are rendered once and kept. With more, each use renders one

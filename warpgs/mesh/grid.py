@@ -22,7 +22,7 @@ FENCE = 3.0
 """Distance outside the quartiles, in interquartile ranges, beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
 Data Analysis)."""
 QUANTILES = (0.005, 0.995)
-"""Quantiles of the surface points along an axis that bound the grid, where `FENCE` allows a wider one."""
+"""Quantiles of the surface points along an axis that bound the grid, unless `FENCE` gives a tighter bound."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14

@@ -45,6 +45,8 @@ def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch
 def densest_depths(matrices: torch.Tensor, means: torch.Tensor, rays: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
     """Return the z-depth [u] at which each of k Gaussians is densest along a ray, shape [P, k].
 
+    If that depth is not above 0 or not finite, the depth of the mean is returned.
+
     Args:
         matrices: Matrices of `whitening`, shape [N, 3, 3].
         means: Means in camera space [u], shape [N, 3].

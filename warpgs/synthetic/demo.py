@@ -27,7 +27,7 @@ TAU = 2 * np.pi
 
 
 def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-    """Return a smoothed checker with five tinting waves between half and twice its pitch.
+    """Return a smoothed checker with five tinting waves, whose wavelengths are 0.6 to 2.2 times its period.
 
     Args:
         rng: Generator of directions, tints and phases.

@@ -62,6 +62,6 @@ def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> 
 
 
 def stands_at(camera: Camera, other: Camera, near: float) -> bool:
-    """Return whether two cameras are within ``near`` [u] of each other and look the same way to a thousandth."""
+    """Return whether two cameras are within ``near`` [u] of each other, and their axes within 1.8 degrees."""
     turned = float(np.trace(matmul(camera.viewmat[:3, :3], other.viewmat[:3, :3].T)))
     return bool(np.linalg.norm(camera.center - other.center) <= near) and turned > 3 - 1e-3

@@ -73,7 +73,7 @@ def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, Vie
     try:
         _, train, test = scene_of(content.model, reader)
     except WarpgsError as e:
-        return {}, [f"cameras come without photographs, since the scene cannot be read: {e}"]
+        return {}, [f"cameras are shown without photographs, since the scene cannot be read: {e}"]
     return {v.name: v for v in [*train, *test]}, []
 
 

@@ -125,11 +125,11 @@ class Window:
             self._frusta[name] = frustum
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or by default all, to a camera of the model, with its field of view."""
+        """Move a browser's camera, or those of all if ``client`` is None, to a camera of the model, with its field of view."""
         self._move(self.content.model.scene_cameras[name], client)
 
     def reset(self, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or by default all, back to where pages start."""
+        """Move a browser's camera, or those of all if ``client`` is None, back to where pages start."""
         self._move(self.first, client)
 
     def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
