@@ -72,7 +72,7 @@ def check_pinhole(camera: Camera) -> None:
 
 
 def pinhole_of(camera: Camera) -> Camera:
-    """Return the pinhole of the same pose, K and size, which renders without distortion; it sees less than a wide fisheye.
+    """Return a pinhole camera with the same pose, K and size, and no distortion; it sees less than a wide fisheye.
 
     Raises:
         UsageError: The camera is orthographic, or its model is only supported by the kernels.
@@ -91,7 +91,7 @@ def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def cofactors(m: np.ndarray) -> np.ndarray:
-    """Return the cofactor matrix of m [3, 3]: that of a rotation is the rotation itself."""
+    """Return the cofactor matrix of m [3, 3]; the cofactor matrix of a rotation is the rotation itself."""
     a, b = m[[1, 2, 0]], m[[2, 0, 1]]  # row i is the cross product of the two others
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
@@ -220,7 +220,7 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
     """Compute the normals of the surface of a depth map, from finite differences of its back-projected pixels.
 
     A normal is perpendicular to two differences: between the right and left neighbour, and between the lower and upper one.
-    It is exact for planes. Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` if they require
+    Normals are exact for planes. Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` if they require
     gradients. Nothing is read back from the device. A NaN depth gives NaN normals.
 
     Args:

@@ -112,7 +112,7 @@ class Registry(Generic[T]):
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
             own = name.rpartition(":")[2]
-            in_study = f'; in a study: a preset in a .py file, with "strategy": {own}' if self.kind == "strategy" else ""
+            in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
                 f"the {self.kind} {name!r} is a class of your own. Files cannot import code: give the class again, on the "
                 f"command line or in Python{in_study}"
@@ -160,7 +160,7 @@ def load_object(kind: str, spec: str) -> object:
     except (ImportError, OSError) as e:
         raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); give path/to/file.py:{name or 'NAME'}") from e
     if not hasattr(module, name):
-        raise UsageError(f"the {kind} {spec!r} is not there: {where} has no {name}; give a name that it defines")
+        raise UsageError(f"the {kind} {spec!r} does not exist: {where} does not define {name}; give a name that it defines")
     LOADED.add(module.__name__)
     return getattr(module, name)
 

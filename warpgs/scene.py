@@ -37,8 +37,8 @@ class Camera:
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
     """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv k1 k2 p1 p2 k3 k4 k5 k6, for fisheye k1 to
-    k4, zeros for an ideal lens; None for models without coefficients. They have no gradient; tensors that require one are an
-    error."""
+    k4, zeros for an ideal lens; None for models without coefficients. Their gradients are not supported: a tensor that requires
+    gradients is an error."""
 
     @property
     def center(self) -> np.ndarray:
@@ -59,7 +59,7 @@ class GivenDepth:
     values: np.ndarray
     """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 for missing values."""
     kind: str = "metric"
-    """Meaning of the values, one of `DEPTH_KINDS`: metric [u]; the scale and shift of other kinds are unknown, view by view."""
+    """Meaning of the values, one of `DEPTH_KINDS`: metric in [u]; the others with an unknown scale and shift for each view."""
     confidence: np.ndarray | None = None
     """Confidence in each value, in [0, 1], float32, shape [H, W]; None for 1 everywhere."""
 
@@ -85,10 +85,10 @@ class View:
     """True if ``alpha`` was estimated from a black background: it then selects pixels that start Gaussians and are scored.
     The loss does not use it, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
-    """Given depth, for the start and the loss of a fit; None without."""
+    """Given depth, for the start and the loss of a fit; None if there is none."""
     normals: np.ndarray | None = None
-    """Given normals: unit vectors towards the camera in its axes (+x right, +y down, +z forward), float32, shape [H, W, 3]; 0
-    for missing values. None without normals."""
+    """Given normals: unit vectors towards the camera, in camera axes (+x right, +y down, +z forward), float32, shape [H, W, 3];
+    0 for missing values. None without normals."""
 
 
 @dataclass(frozen=True)
@@ -346,7 +346,7 @@ class Render:
     """Expected z-depth [u] (for a fisheye the distance): the mean under the blending weights; 0 where nothing is blended. Shape
     [..., H, W]."""
     projected: torch.Tensor
-    """Projected Gaussians in the layout of kernels/project.py, shape [C, N, 12]; keeps gradients after ``retain_grad()``."""
+    """Projected Gaussians, laid out as in kernels/project_inputs.py, shape [C, N, 12]; ``retain_grad()`` keeps gradients."""
     tile_counts: torch.Tensor
     """Number of tiles that a Gaussian touches, int32, shape [C, N]; 0 where it is culled."""
     weight_sums: torch.Tensor | None = None

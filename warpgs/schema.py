@@ -23,7 +23,7 @@ MAX_DEPTH = 50
 MAX_PARTS = 2**19
 """Largest number of lists and objects; each takes some thirty times as much memory as its text."""
 MAX_WHOLE = 2**63 - 1
-"""Largest integer: that of 64 bits."""
+"""Largest integer: that of 64 bits with a sign."""
 MAX_NUMBER = 1e300
 """Largest magnitude of a finite number, and of an integer in the place of a number: a larger one could overflow a float."""
 
@@ -92,7 +92,7 @@ def read(path: Path, below: Path | None = None) -> Any:
             the user names.
 
     Raises:
-        OSError: The file cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
+        OSError: The file cannot be read, is a link that is not followed, not a regular file, or larger than `MAX_BYTES`.
         SchemaError: `parse` rejects its content.
     """
     return parse(read_input(path, MAX_BYTES, below))

@@ -1,4 +1,4 @@
-"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more per harmonic and channel.
+"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
 
 Chunks of 256 Gaussians share the bounds between which positions (11, 10, 11 bits), log scales (11, 10, 11) and colours (8 each)
 are fractions; rotations have 2 bits for the largest component and 10 for each other. The loss is least when Gaussians that are

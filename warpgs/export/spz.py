@@ -1,4 +1,4 @@
-"""Niantic's SPZ format, versions 2 to 4, in fixed point: about 20 bytes a Gaussian, and one more per harmonic and channel.
+"""Niantic's SPZ format, versions 2 to 4, in fixed point: about 20 bytes a Gaussian, and one byte per harmonic and channel.
 
 Versions 2 and 3 are one gzip stream; version 4 has a plain header and one zstd stream per attribute (package zstandard). Axes
 are RUB (x right, y up, z back), a half turn about x from those of PLY.

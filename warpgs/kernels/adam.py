@@ -13,7 +13,7 @@ from warpgs.runtime.cuda_source import source
 BETAS = (0.9, 0.999)
 """Decay rates of the two moments (Kingma and Ba 2015)."""
 EPS = 1e-15
-"""Number added to the root, as in Kerbl et al. 2023, since gradients are tiny."""
+"""Number added to the root of the second moment, as in Kerbl et al. 2023, since gradients are tiny."""
 LANES = 16
 """Elements that are updated together on a CPU, in a loop that vectorises."""
 SEGMENT = 4096

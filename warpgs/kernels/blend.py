@@ -315,11 +315,11 @@ def blend(
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
-        deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less memory
-            but is not repeatable to the bit; elsewhere it has no effect.
+        deterministic: True to sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less
+            memory but is not repeatable to the bit; elsewhere it has no effect.
         origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: Sum magnitudes of the mean's gradient over pixels, too. They are the gradient of the last two values of
-            ``projected``, the half sides of the box.
+        absgrad: True to also sum magnitudes of the mean's gradient over pixels. They are the gradient of the last two values
+            of ``projected``, the half sides of the box.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the

@@ -10,8 +10,8 @@ import warp as wp
 from warpgs.runtime import interop
 
 BOX = 32
-"""Number of points in a box, and of boxes in a box of the next level; the highest level has at most so many boxes. A query
-enters a box only if the box is closer than the farthest of the nearest neighbours found so far."""
+"""Number of points in a box, and of boxes in a box of the next level; the highest level has at most this number of boxes. A
+query enters a box only if the box is closer than the farthest of the nearest neighbours found so far."""
 
 MAX_NEIGHBORS = 8
 """Largest number of neighbours of a query."""

@@ -21,7 +21,7 @@ from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, 
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
-"""Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
+"""Bytes of an instance with its gradient slot and its part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
 MAX_INSTANCES = interop.MAX_SIZE // 2
 """Largest number of instances: a radix sort needs one array of twice that size."""
@@ -31,7 +31,7 @@ MAX_INSTANCES = interop.MAX_SIZE // 2
 class Tiles:
     """(Gaussian, tile) instances, sorted by tile and within a tile by depth; equal depths are in the order of Gaussian numbers.
 
-    ``i`` below is a flat Gaussian number in [0, C N), a tile number is ``camera * tiles + row * columns + column``.
+    A flat Gaussian number is ``camera * N + n`` for Gaussian n, a tile number is ``camera * tiles + row * columns + column``.
     """
 
     size: int
@@ -220,7 +220,7 @@ def bin_tiles(
         rule: Cut-offs, the same as given to `project`.
         tile_size: Side of a tile [px].
         origin: Left and top [px] of the window given to `project`, multiples of ``tile_size``.
-        memory: Memory of the instances; M is its capacity where it has one.
+        memory: Memory of the instances; if it has a capacity, M is the capacity.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
         listed: True for the tiles that get instances, bool, shape [C * tiles]; the others stay empty. None for all tiles.
 

@@ -162,7 +162,7 @@ def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
 
 
 def mutual_matches(a: Features, b: Features) -> np.ndarray:
-    """Return the pairs of keypoints that are most similar to each other, and by more than `MIN_COSINE`, uint32 [M, 2]."""
+    """Return the pairs of keypoints that are each other's most similar, with a cosine above `MIN_COSINE`, uint32 [M, 2]."""
     if not (len(a.pixels) and len(b.pixels)):
         return np.zeros((0, 2), np.uint32)
     products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T

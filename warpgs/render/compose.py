@@ -1,7 +1,7 @@
 """Project, bin, blend: the steps from Gaussians to images.
 
-`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. Camera
-model, channels, cut-offs and window of a render are in `RenderSettings` and `ProjectInputs`, and nowhere else.
+`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. The camera
+model, the degree, the cut-offs and the window of a render are in `RenderSettings`, and nowhere else.
 """
 
 from __future__ import annotations

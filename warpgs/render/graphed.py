@@ -36,8 +36,8 @@ from warpgs.runtime.device_memory import available_bytes
 MIN_CALLS = 3
 """Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and for instances, as multiples of the numbers that the captured call needs; if an equal call
-exceeded its capacity before, of the larger numbers."""
+"""Capacity for visible Gaussians and for instances, as multiples of the numbers that a call needs, or that an equal call before
+needed when it exceeded its capacity, if these are larger."""
 SPARE = 1024
 """Number that is added to both capacities."""
 MAX_PROJECTED = 2**23
@@ -50,9 +50,9 @@ class Capacity(NamedTuple):
     """Numbers of a render that memory is allocated for."""
 
     visible: int
-    """Gaussians that touch a tile."""
+    """Number of Gaussians that touch a tile."""
     instances: int
-    """(Gaussian, tile) instances."""
+    """Number of (Gaussian, tile) instances."""
 
     def within(self, other: Capacity) -> bool:
         """Return whether neither number exceeds that of ``other``."""

@@ -45,7 +45,7 @@ def _no_collection():
 
 
 class CapturedGraph:
-    """A CUDA graph of the kernels that torch and Warp launch in one call, and all objects that must live as long as it."""
+    """A CUDA graph of the kernels that torch and Warp launch in one call, and the objects that it needs."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
         """Capture the work; nothing runs yet.

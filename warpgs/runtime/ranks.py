@@ -31,7 +31,7 @@ EXCHANGE_TIME = timedelta(days=1)
 
 
 class Ranks:
-    """The processes of a fit; this class itself for a single process."""
+    """The processes of a fit; this class itself stands for a single process."""
 
     rank = 0
     """Number of this process."""
@@ -62,7 +62,7 @@ class Ranks:
         found.copy_(own)
 
     def texts(self, own: str) -> list[str]:
-        """Return the ``own`` of each process, in the order of ranks; every process must call this once."""
+        """Return the text ``own`` of each process, in the order of ranks; every process must call this once."""
         return [own]
 
     def part(self) -> None:
@@ -115,7 +115,7 @@ class Group(Ranks):
             ) from e
 
     def texts(self, own):
-        """Return the ``own`` of each process, in the order of ranks."""
+        """Return the text ``own`` of each process, in the order of ranks."""
         with self._watched():
             return self.watch.texts(own)
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP end the program in one way; signals that it was started to ignore stay ignored."""
+"""Ctrl-C, SIGTERM and SIGHUP end the program in the same way; signals that it was started to ignore stay ignored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cameras between our conventions and the viewer's: poses as camera-to-world, fields of view, an upward direction."""
+"""Conversion of cameras to the viewer's conventions and back: poses as camera-to-world, fields of view."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Content:
     model: FittedModel
     """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
     stem: Path
-    """Beginning of the paths of files that are saved from the viewer: RUN/ for a run, x. for x.ply."""
+    """Beginning of the paths of files that are saved from the viewer: RUN for RUN/crop.json, x for x-crop.json beside x.ply."""
     fine: torch.Tensor | None = None
     """True for Gaussians of the fine layer, bool, shape [N]; None without layers."""
     views: Mapping[str, View] = field(default_factory=dict)
