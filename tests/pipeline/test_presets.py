@@ -140,7 +140,7 @@ def test_objects_and_mappings_are_presets(own):
     assert preset_settings({"base": "quick", "init.opacity": 0.5})[0] == config
     for wrong, said in (
         (f"{own}:NUMBER", "is of type int"),
-        (f"{own}:NONE", "is not there"),
+        (f"{own}:NONE", "does not exist"),
         ("no.such:X", "cannot be imported"),
     ):
         with pytest.raises(UsageError, match=said):
