@@ -164,7 +164,7 @@ def test_arguments_of_another_type_or_shape_are_named():
         (ValueError, r"camera.K must be \[\[fx, 0, cx\]", (gaussians, dataclasses.replace(cam, K=2 * cam.K))),
         (
             ValueError,
-            "skew is not rendered",
+            "skew is not supported",
             (gaussians, dataclasses.replace(cam, K=skewed)),
         ),
         (

@@ -280,7 +280,7 @@ def plane_costs(
     """
     radius = window // 2
     if not 1 <= radius <= MAX_RADIUS:
-        raise ValueError(f"window {window} must be 3 to {2 * MAX_RADIUS + 1} px")
+        raise ValueError(f"window must be 3 to {2 * MAX_RADIUS + 1} px, not {window}")
     height, width = gray.shape
     pitch, padded = (-(-n // LANES) * LANES for n in (width, len(homographies)))
     centred = (_whole(gray) - MIDDLE).astype(np.int64)

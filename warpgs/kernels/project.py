@@ -239,7 +239,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
         raise UsageError("gradients of distortion coefficients are not supported: give distortion.detach()")
     if sizes["K"] < settings.sh_count:
         degree = math.isqrt(settings.sh_count) - 1
-        raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {settings.sh_count}")
+        raise ValueError(f"sh has {sizes['K']} coefficients per channel, but degree {degree} needs {settings.sh_count}")
     width, height = settings.size
     if width < 1 or height < 1:
         raise ValueError(f"the image must be at least 1 x 1 px, not {width} x {height}")

@@ -114,7 +114,7 @@ class Matcher:
         if not 0 < descriptors.shape[1] <= MAX_CHANNELS:
             raise DataError(f"{self.path}: its descriptors have {descriptors.shape[1]} numbers, not 1 to {MAX_CHANNELS}")
         if not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors)):
-            raise DataError(f"{self.path}: its outputs hold NaN, infinity or no floating-point numbers; check its weights")
+            raise DataError(f"{self.path}: its outputs contain NaN or infinity, or are not floating-point; check its weights")
         there = scores > 0
         inside = (keypoints >= 0) & (keypoints <= [w, h])
         if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):

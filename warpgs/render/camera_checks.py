@@ -70,7 +70,7 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     (_, skew, _), (below, _, _), (left, middle, last) = matrix
     if max(map(abs, (skew, below, left, middle, last - 1))) > K_TOLERANCE:
         raise ValueError(
-            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
+            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: divide K by K[2, 2]; skew is not supported, so "
             "undistort images with skew"
         )
 

@@ -66,6 +66,6 @@ def select_rule(
         else:
             return rule, error
     raise UsageError(
-        f"no rule keeps a {measure} error of {max_error:g}: float32 alone errs by {error:.1e} under rule exact; raise "
-        "max_error, or render float64 tensors"
+        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, float32 rounding alone gives {error:.1e}; "
+        "raise max_error, or render float64 tensors"
     )
