@@ -147,7 +147,7 @@ def _rim(distortion: Array) -> float:
 
 
 def _bent(angle: Array, distortion: Sequence[float] | Array) -> tuple[Array, Array]:
-    """Return the radius in the plane of an angle [rad] from the axis of a fisheye, and its derivative."""
+    """Return the radius in the image plane at an angle [rad] from a fisheye's axis, and its derivative."""
     t, value, slope = angle * angle, 1.0, 1.0
     powers = t
     for i in range(4):

@@ -176,7 +176,7 @@ def own_code(classes: Iterable[type]) -> dict[str, str]:
 
 @functools.cache
 def _digest(cls: type) -> str:
-    """Return the SHA-256 of the file of a class when first requested, as it may be edited later; empty without one."""
+    """Return the SHA-256 of the file of a class when first requested, as it may be edited later; empty if it has no file."""
     return module_digest(sys.modules.get(cls.__module__))
 
 

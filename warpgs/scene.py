@@ -257,7 +257,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class ActivatedGaussians:
-    """A set of N Gaussians by scales and opacities, only for `rasterize`; fits and files use `Gaussians`.
+    """A set of N Gaussians given by scales and opacities, for `rasterize`; fits and files use `Gaussians`.
 
     Opacity 1 and scale 0 are allowed and have finite gradients: the rule clamps alpha, and the pixel filter keeps a flat
     Gaussian visible edge-on.
@@ -299,7 +299,7 @@ class ActivatedGaussians:
 
 @dataclass(frozen=True)
 class CovarianceGaussians:
-    """A set of N Gaussians by covariance matrices and opacities, only for `rasterize`; fits and files use `Gaussians`."""
+    """A set of N Gaussians given by covariances and opacities, for `rasterize`; fits and files use `Gaussians`."""
 
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""

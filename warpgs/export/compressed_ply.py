@@ -111,7 +111,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     bounds = [_bounds(path, chunk, group) for group in _GROUPS]
 
     def values(i: int, packed: np.ndarray, bits: tuple[int, ...], part: slice) -> np.ndarray:
-        """Return the numbers of the i-th group [P, 3], between the bounds of their chunks."""
+        """Return the unpacked values of the i-th group [P, 3], scaled to the bounds of their chunks if there are bounds."""
         fractions = _unpack(packed[part].astype(np.int64), bits)[:, :3]
         if (ends := bounds[i]) is None:
             return fractions

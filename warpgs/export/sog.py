@@ -128,7 +128,7 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return at most 65,536 rows that represent all rows, and for each row the index of its representative, int64 [N].
 
-    If there are more rows, cells are halved repeatedly at the median of their widest column; the mean represents a cell.
+    If there are more, cells of rows are halved at the median of their widest column; the mean of a cell represents it.
     """
     n = len(rows)
     if n <= PALETTE:
@@ -320,7 +320,7 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
 
 
 def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarray:
-    """Return labels of Gaussians from ``first`` on that all lie below ``count``; DataError where one does not."""
+    """Return the labels of the Gaussians from number ``first`` on; DataError if one is not below ``count``."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
         raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")

@@ -226,7 +226,7 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk; without a fixed order, not the smallest number, which takes the most memory."""
+    """Return the instances per chunk: more for larger images, and not the fewest unless the order is fixed, to save memory."""
     larger = sum(tiles > most for most in MAX_TILES)
     return CHUNKS[larger if deterministic else max(larger, 1)]
 

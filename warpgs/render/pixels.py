@@ -52,7 +52,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
 
 
 def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -> torch.Tensor:
-    """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True with a pixel of [1, P, 2] or [C, P, 2] inside."""
+    """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
     places = (pixels[..., 1] - y) // size * columns + (pixels[..., 0] - x) // size  # the edge of a window lies on tiles

@@ -1,4 +1,4 @@
-"""CUDA graphs: capture of torch's and Warp's kernels, replay, the memory of graphs, and functions that are graphed by address.
+"""CUDA graphs of torch's and Warp's kernels: capture, replay, memory, and functions with a graph for each set of addresses.
 
 `CapturedGraph` is one graph. `GraphedFunction` captures a function of tensors wherever it meets the same addresses again.
 """

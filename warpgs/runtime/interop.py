@@ -133,7 +133,7 @@ def rows(tensor: torch.Tensor, dtype) -> View:
 
 
 def span(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with the gaps between rows.
+    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, gaps between rows included.
 
     Rows are contiguous, and `View.row_stride` leads from each to the next.
     """

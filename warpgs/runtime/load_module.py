@@ -25,7 +25,7 @@ _LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
 def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]]:
     """Call ``listener`` within the block with the name of each module that the cache lacks, before it is compiled.
 
-    ``listener`` may be called from any thread. Yields a list that grows by the time of each module once it is compiled [s].
+    ``listener`` may be called from any thread. Yields a list, to which the compile time [s] of each module is added.
     """
     entry: tuple[Callable[[str], object], list[float]] = listener, []
     _LISTENERS.append(entry)

@@ -24,7 +24,7 @@ NAMES = ("stdin", "stdout", "stderr")
 def open_missing_descriptors() -> None:
     """Open the null device instead of a closed stdin, stdout or stderr.
 
-    Otherwise the next file that is opened gets that number, and output is written into it.
+    Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
     """
     for number in range(len(NAMES)):
         try:

@@ -1,4 +1,4 @@
-"""Watch of each process of a fit over the others: a lost rank stops all ranks with one error."""
+"""Mutual watch of the processes of a fit: if one rank is lost, all ranks stop and one prints the error."""
 
 from __future__ import annotations
 

@@ -22,13 +22,13 @@ ENDS_WITH_PARENT = (
 
 
 def end_with_parent() -> None:
-    """Have this process end when its parent ends, killed or not: its stdin ends then."""
+    """Have this process end with its parent, even if that is killed: the stdin of this process ends then."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
 
 
 @contextlib.contextmanager
 def _stdin_until_our_end() -> Iterator[int]:
-    """Give a stdin for a process that ends with this process or with the block, and holds nothing."""
+    """Give a child an empty stdin; the child ends once that closes, with the block or with this process."""
     read, write = os.pipe()
     try:
         yield read

@@ -129,7 +129,7 @@ class Window:
         self._move(self.content.model.scene_cameras[name], client)
 
     def reset(self, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or those of all if ``client`` is None, back to where pages start."""
+        """Move the camera of a browser, or of all browsers if ``client`` is None, back to where it started."""
         self._move(self.first, client)
 
     def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
