@@ -218,7 +218,7 @@ def _colors(book: np.ndarray, pixels: np.ndarray, sh: np.ndarray) -> np.ndarray:
 
 
 def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -> np.ndarray:
-    """Return the means [N, 3] of the lower and the upper bytes of their levels [P, 4]."""
+    """Return the means [N, 3] from the lower and the upper bytes of their levels, [P, 4] each."""
     low, high = (np.array(part[key], np.float64).reshape(3) for key in ("mins", "maxs"))
 
     def rows(p: slice) -> np.ndarray:

@@ -149,7 +149,7 @@ class Progress:
     """
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
-        """Prepare for ``total`` steps, ``done`` of them done before; ``live`` None shows the panel only in a terminal."""
+        """Prepare for ``total`` steps, of which ``done`` are already done; ``live`` None shows the panel only in a terminal."""
         self.total, self.told, self.step = total, done, done
         self.live = is_live() if live is None else live
         self.loss = self.psnr = self.seconds = None

@@ -280,7 +280,7 @@ def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
 
 
 class _OfThread(threading.local):
-    """Recorded launches of a thread on the CPU by kernel: threads launch one kernel at the same time, with other arguments."""
+    """Recorded launches on the CPU by kernel, for each thread: two may launch a kernel at once, with different arguments."""
 
     def __init__(self):
         self.recorded: dict[object, _Recorded] = {}

@@ -191,7 +191,7 @@ class PythonWorker:
         yield from self._process.stdout
 
     def end(self, seconds: float) -> tuple[int, str]:
-        """Ask it to stop, then end it; return its exit code, and the end of its stderr."""
+        """Close the stdin of the process, kill it after ``seconds``; return its exit code and the end of its stderr."""
         with contextlib.suppress(OSError):
             if self._process.stdin is not None:
                 self._process.stdin.close()

@@ -125,7 +125,7 @@ class Window:
             self._frusta[name] = frustum
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or those of all if ``client`` is None, to a camera of the model, with its field of view."""
+        """Give a browser, or all browsers if ``client`` is None, the pose and field of view of a camera of the model."""
         self._move(self.content.model.scene_cameras[name], client)
 
     def reset(self, client: viser.ClientHandle | None) -> None:
@@ -133,7 +133,7 @@ class Window:
         self._move(self.first, client)
 
     def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or all, to a camera; its whole image is in the window."""
+        """Give a browser, or all browsers if ``client`` is None, the pose of ``camera``, and show its whole image."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = distance_ahead(camera, self.content.model.gaussians())
         for c in [client] if client is not None else list(self.server.get_clients().values()):
