@@ -38,14 +38,14 @@ def moved(viewmat: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
 
 
 def pose_error(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
-    """Return the angle [degrees] between two view matrices and the distance [u] of their centres."""
+    """Return the angle [degrees] between two view matrices, and the distance [u] between their camera centres."""
     cosine = 0.5 * ((a[:3, :3] @ b[:3, :3].T).trace() - 1)
     centers = [-m[:3, :3].T @ m[:3, 3] for m in (a, b)]
     return float(torch.rad2deg(torch.arccos(cosine.clamp(-1, 1)))), float((centers[0] - centers[1]).norm())
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; return the final distance as a fraction of the first."""
+    """Run the example; return the final distance as a fraction of the initial distance."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=200, help="optimisation steps")

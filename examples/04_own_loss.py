@@ -3,8 +3,9 @@
     python examples/04_own_loss.py path/to/scene --out smooth.png
     warpgs fit path/to/scene --out run --loss-terms examples/04_own_loss.py:DepthSmoothness --depth-smoothness.weight 0.5
 
-The class below is the whole term. The second command loads it from this file, with its setting as a flag. The first command
-fits a scene with and without the term, prints roughness and held-out PSNR of both fits, and writes the depth maps of a view.
+The class below is the whole term. The second command loads the class from this file, and makes its setting a flag. The first
+command fits a scene with and without the term. It prints roughness and held-out PSNR of both fits, and writes the depth maps of
+a view.
 """
 
 import argparse
@@ -23,10 +24,11 @@ from PIL import Image
 
 
 def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return the mean step of inverse depth between covered neighbours, weighted down at edges of the image, shape [].
+    """Return the mean absolute difference of inverse depth between neighbours, weighted down at edges of the image, shape [].
 
-    The steps are relative to the mean inverse depth, so that the unit of length does not matter (Godard et al. 2017,
-    eq. 5). ``depth`` and ``alpha`` have shape [H, W], ``image`` [H, W, 3].
+    The means along x and y are added. A pair of neighbours counts if both are covered. Inverse depth is divided by its mean,
+    so that the unit of length does not matter (Godard et al. 2017, eq. 5). ``depth`` and ``alpha`` have shape [H, W],
+    ``image`` [H, W, 3].
     """
     covered = alpha > 0.5
     inverse = torch.where(covered, 1 / torch.where(covered, depth, 1), 0)

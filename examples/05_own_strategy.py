@@ -3,9 +3,9 @@
     python examples/05_own_strategy.py path/to/scene --out sprout.png
     warpgs fit path/to/scene --out run --strategy examples/05_own_strategy.py:Sprout --sprout.growth 0.2
 
-The class below is the whole strategy. The second command loads it from this file, with its settings as flags. The first command
-fits a scene with the strategy and without growth. It prints the numbers of Gaussians and the PSNR of both fits, and writes the
-image and the two renders side by side.
+The class below is the whole strategy. The second command loads the class from this file, with its settings as flags. The first
+command fits a scene with the strategy and without growth. It prints the numbers of Gaussians and the PSNR of both fits, and
+writes the image and the two renders side by side.
 """
 
 import argparse
@@ -39,18 +39,21 @@ class SproutConfig:
 
 @register("sprout")
 class Sprout(warpgs.Strategy):
-    """Adds Gaussians beside those whose projected means have the largest gradients; removes transparent ones."""
+    """Adds Gaussians next to those with the largest gradients of projected means; removes transparent Gaussians."""
 
     Config = SproutConfig
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the one value that is kept for each Gaussian: the sum of its gradient norms since the last change."""
+        """Return the one value that is stored for each Gaussian: the sum of its gradient norms since the last update."""
         return {"pull": Column(0.0, inherited=False)}
 
     def statistics(
         self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
     ) -> Mapping[str, torch.Tensor]:
-        """Return the gradient norms of the projected means, ``v_projected`` [1, N, 12], which are added to their sums.
+        """Return the gradient norms of the projected means, shape [N], which the trainer adds to the column.
+
+        ``v_projected`` [1, N, 12] is the gradient with respect to the projected Gaussians; the means are its first two columns.
+
 
         On CUDA the whole step is captured as a graph, so this method may only use tensors.
         """
@@ -58,7 +61,7 @@ class Sprout(warpgs.Strategy):
         return {"pull": torch.where(visible[0], norms, 0)}
 
     def due(self, step: int) -> bool:
-        """Return whether the set changes after a step; never in the last fifth of the fit."""
+        """Return whether Gaussians are added or removed after a step; never in the last fifth of the fit."""
         return step % self.config.every == 0 and step <= 0.8 * self.context.steps
 
     def update(self, step: int) -> Iterator[DensityUpdate]:

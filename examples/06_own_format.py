@@ -1,4 +1,4 @@
-"""Read a scene format of your own: define a Reader, pass it to warpgs.load_scene, or name it on the command line.
+"""Read a scene format of your own: define a Reader, then pass it to warpgs.load_scene or name it on the command line.
 
 The made-up format of this example is a folder with shots.csv, one line per image:
 
@@ -52,7 +52,7 @@ class ShotsReader(Reader):
         return Probe("shots.csv") if (folder / "shots.csv").is_file() else None
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
-        """Return the scene in file coordinates; DataError names the line that cannot be understood."""
+        """Return the scene in file coordinates; an invalid line raises a DataError with its number."""
         path = folder / "shots.csv"
         scene, views = SceneFolder(folder, options), ViewList()
         with path.open(newline="", encoding="utf-8") as file:
@@ -71,7 +71,7 @@ def parse(row: list[str], where: str) -> tuple[str, np.ndarray, np.ndarray, floa
     """Return name, position [3], target [3] and focal length [px] of a row.
 
     Raises:
-        DataError: The row does not hold a name and seven finite numbers, or the camera has no direction, or a vertical one.
+        DataError: The row is not a name and seven finite numbers, or the camera looks at itself or straight up or down.
     """
     try:
         name, *numbers = (word.strip() for word in row)

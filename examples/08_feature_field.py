@@ -1,4 +1,4 @@
-"""Gaussians that carry 16 features each instead of a colour, fitted to an image of features, as a network would give them.
+"""Gaussians with 16 features each instead of a colour, fitted to an image of features, such as the output of a network.
 
     python examples/08_feature_field.py --out features.png
 

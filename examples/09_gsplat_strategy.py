@@ -28,13 +28,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
 def render(
     params: Mapping[str, torch.Tensor], camera: warpgs.Camera, options: warpgs.RasterizeOptions
 ) -> tuple[warpgs.Render, dict[str, Any]]:
-    """Render parameters under gsplat's names; return the render, and the ``info`` that its strategies read."""
+    """Render parameters under gsplat's names; return the render, and the ``info`` that gsplat's strategies read."""
     sh = torch.cat([params["sh0"], params["shN"]], 1)
     gaussians = warpgs.Gaussians(params["means"], params["quats"], params["scales"], params["opacities"], sh)
     found = warpgs.rasterize(gaussians, camera, options)
     info = {
         "means2d": found.means2d,
-        "radii": found.projected.detach()[..., 10:12].ceil(),  # half sides of the boxes [px], 0 where culled
+        "radii": found.projected.detach()[..., 10:12].ceil(),  # half sides of the bounding boxes [px], 0 where culled
         "gaussian_ids": None,  # only read in packed mode
         "width": camera.width,
         "height": camera.height,

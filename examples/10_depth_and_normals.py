@@ -2,8 +2,8 @@
 
     python examples/10_depth_and_normals.py --out depth_and_normals.png
 
-Writes one row of images: expected, accumulated and median depth, the normals of the Gaussians, and those of the expected depth.
-Prints, for both kinds, the mean angle between the normals of the ball and those of a sphere.
+Writes one row of images: expected, accumulated and median depth, normals of the Gaussians, and normals of the expected depth.
+Prints, for both kinds, the mean angle between the rendered normals of the ball and the true normals of a sphere.
 """
 
 import argparse
@@ -21,7 +21,7 @@ CENTER = torch.tensor([0.0, 0.0, 3.0])
 
 
 def discs(points: torch.Tensor, normals: torch.Tensor, radius: float) -> dict[str, torch.Tensor]:
-    """Return flat Gaussians [N, ...] at points [N, 3], perpendicular to unit normals [N, 3], by field name."""
+    """Return the fields of flat Gaussians at points [N, 3], perpendicular to unit normals [N, 3]; each has shape [N, ...]."""
     n = len(points)
     x, y, z = normals.unbind(1)
     return {
@@ -46,7 +46,7 @@ def ball_and_wall(count: int) -> warpgs.Gaussians:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; return the mean angle between rendered normals of the Gaussians and a sphere's [degrees]."""
+    """Run the example; return the mean angle between the rendered normals of the Gaussians and those of a sphere [degrees]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("depth_and_normals.png"), help="PNG to write")
     parser.add_argument("--count", type=int, default=4000, help="number of Gaussians on the ball")
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> float:
     square, along = rays.square().sum(-1), rays @ CENTER  # a ray meets the ball where square t^2 - 2 along t + 8 = 0
     root = (along.square() - 8 * square).clamp_min(0).sqrt()
     sphere = rays * ((along - root) / square)[..., None] - CENTER
-    hit = root > 0.4  # it is 1 in the middle of the ball, 0 at its rim
+    hit = root > 0.4  # root is 1 in the middle of the ball, 0 at its rim
     angles = [torch.rad2deg(torch.arccos((n * sphere).sum(-1).clamp(-1, 1)))[hit].mean().item() for n in normals]
     print(f"normals of the Gaussians {angles[0]:.1f} degrees off the sphere's, of the depth {angles[1]:.1f}; images in {a.out}")
     return angles[0]

@@ -3,9 +3,10 @@
     python examples/11_cor_gs.py path/to/scene --split llff:3 --out cor_gs.png
     warpgs fit path/to/scene --out run --preset 3dgs --strategy examples/11_cor_gs.py:CorGS
 
-Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning), and the
-difference of both renders of a random camera near the training cameras is a loss (co-regularisation). The class below is the
-whole baseline, and docs/add-a-baseline.md explains it. Prints the held-out PSNR of 3DGS and of CoR-GS; writes both renders.
+Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning). Both models
+are rendered from random cameras near the training cameras, and a loss compares the renders (co-regularisation). The class below
+is the whole baseline, and docs/add-a-baseline.md explains it. Prints the held-out PSNR of 3DGS and of CoR-GS, and
+writes both renders.
 """
 
 import argparse
@@ -38,10 +39,10 @@ from PIL import Image
 SSIM_WEIGHT = 0.2
 """Weight of SSIM in every photometric loss, as in 3DGS."""
 CHUNK = 2**24
-"""Largest number of distances in memory at a time."""
+"""Largest number of distances that are in memory at the same time."""
 SPARE, MIN_INSTANCES = 2, 100_000
-"""Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times that of the heaviest training view, and
-`MIN_INSTANCES` more."""
+"""Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times the most instances of a training view, plus
+`MIN_INSTANCES`."""
 OF_TWIN = {"twin": schema.fields(GradientGrowth.STATE)}
 """Schema of the second model in a checkpoint, without its tensors."""
 
@@ -51,13 +52,13 @@ class CorConfig:
     """Settings of the strategy."""
 
     weight: float = 1.0
-    """Weight of the term between the renders of a random camera."""
+    """Weight of the loss between both models' renders from a random camera."""
     every: int = 500
     """Steps between two co-prunings."""
     distance: float = 1.0
-    """Largest distance to the nearest Gaussian of the other model, in extents of the scene; Gaussians beyond it are removed."""
+    """Largest distance to the nearest Gaussian of the other model, in scene extents; Gaussians farther away are removed."""
     noise: float = 0.3
-    """Standard deviation of a random camera's position, as a fraction of the distance to the nearest camera."""
+    """Standard deviation of the noise of a random camera's position, as a fraction of the distance to the nearest camera."""
 
 
 def nearest(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
@@ -91,16 +92,17 @@ def random_cameras(views: list[TrainingView], noise: float, count: int, generato
 
 @register("cor_gs")
 class CorGS(CloneSplit):
-    """Two models of one scene, pruned and regularised where they disagree; the first one is the result.
+    """Two models of one scene, pruned and regularised where they disagree; the first model is the result.
 
-    A step is captured as a CUDA graph: all random numbers are sampled at the start, and looked up by the number of the step.
+    A step is captured as a CUDA graph. So all random numbers are sampled before the first step, and looked up by the number of
+    the step.
     """
 
     Config = CorConfig
     STATE = staticmethod(schema.fields(GradientGrowth.STATE | OF_TWIN))
 
     def setup(self) -> None:
-        """Begin the second model with the Gaussians of the first, and sample the random cameras and the order of views.
+        """Copy the first model to the second, and sample the random cameras and the order of views.
 
         Raises:
             UsageError: The training views are fewer than two, of several sizes, transparent or distorted.
@@ -135,7 +137,7 @@ class CorGS(CloneSplit):
 
     @torch.no_grad()
     def _measure(self) -> None:
-        """Choose the renderer: on CUDA one with a fixed capacity for instances, which a graph can hold."""
+        """Choose the renderer: on CUDA, one with a fixed capacity for instances, so that a graph can capture it."""
         context, options = self.context, self.context.render_options()
         self.render = eager_renderer(options, None)
         if context.device.type == "cuda":
@@ -149,7 +151,7 @@ class CorGS(CloneSplit):
         return self.render(table.gaussians, camera, table.gaussians.sh_degree, None, None)
 
     def regularisation(self, phase: Hashable, gaussians: warpgs.Gaussians) -> torch.Tensor:
-        """Return the first model's term, shape [], and find the gradients of the second model."""
+        """Return the first model's loss term, shape [], and compute the gradients of the second model."""
         twin, weight, step = self.twin.table, self.config.weight, self.taken
         self.overflow.zero_()
         view = self.order.index_select(0, step)
@@ -176,7 +178,7 @@ class CorGS(CloneSplit):
         return total
 
     def after_step(self, phase: Hashable, settings: torch.Tensor, going: torch.Tensor) -> None:
-        """Update the second model where the step is taken, ``going`` [1]; ``settings`` [7] are not read."""
+        """Update the second model if ``going`` [1] is True; ``settings`` [7] are not read."""
         twin = self.twin.table
         gradients = dict(zip(twin.params, self.gradients_of_twin))
         twin.adam_step(gradients, self.lrs.index_select(0, self.taken)[0], (~going).to(torch.int32))
@@ -209,14 +211,14 @@ class CorGS(CloneSplit):
         self._measure()
 
     def _matched(self) -> list[torch.Tensor]:
-        """Return which Gaussians of each model have a neighbour in the other one, bool, shape [N]; if none has, all."""
+        """Return which Gaussians of each model have a neighbour in the other, bool, shape [N]; all if no Gaussian has one."""
         means = [t.params["means"].detach() for t in (self.context.table, self.twin.table)]
         most = self.config.distance * self.context.extent
         near = [nearest(a, b) <= most for a, b in (means, means[::-1])]
         return [m if bool(m.any()) else ~m for m in near]
 
     def state(self) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Return the second model, [N, ...] each, the number of its steps [1], and the states of both growths."""
+        """Return the second model's tensors [N, ...], the number of its steps [1], and the state of both `GradientGrowth`."""
         tensors, plain = super().state()
         twin = {f"twin.{n}": t for n, t in self.twin.table.state().items()}
         return tensors | twin | {"taken": self.taken}, plain | {"twin": self.twin_growth.state()}
@@ -231,7 +233,7 @@ class CorGS(CloneSplit):
 
 
 def _kept(table: Table, rows: torch.Tensor) -> DensityUpdate:
-    """Return the change that keeps the Gaussians whose row, bool [N], is True."""
+    """Return the update that keeps only the Gaussians that are True in ``rows``, bool [N]."""
     nothing = {n: t.detach()[:0] for n, t in table.params.items()}
     return DensityUpdate(rows.nonzero().squeeze(1), nothing, torch.empty(0, dtype=torch.int64, device=rows.device))
 

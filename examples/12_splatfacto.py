@@ -1,9 +1,9 @@
-"""A trainer like nerfstudio's splatfacto, around the rasterizer: dataparser, densification, cameras, in plain torch.
+"""A trainer like nerfstudio's splatfacto in plain torch, around the rasterizer: dataparser, densification, camera optimiser.
 
     python examples/12_splatfacto.py path/to/scene --out splatfacto.png --pose-noise 0.5
 
-`warpgs.load_scene` is the dataparser. Gaussians are split, duplicated and culled by absgrad (`Render.means2d.absgrad`), random
-backgrounds and `scale_loss` keep them from becoming fog and needles, and each training camera has a correction of its own.
+`warpgs.load_scene` is the dataparser. Gaussians are split and duplicated by absgrad (`Render.means2d.absgrad`), and culled by
+opacity. Random backgrounds prevent fog, and `scale_loss` prevents needles. Each training camera has a learned pose correction.
 Prints the number of Gaussians, the PSNR of a held-out view and the pose error of the training cameras, before and after; writes
 the image beside the render.
 """
@@ -26,7 +26,7 @@ C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
 
 def initial_parameters(scene: warpgs.Scene, count: int, cameras: int) -> dict[str, torch.Tensor]:
-    """Return a Gaussian on each of at most ``count`` points of a scene, and a correction of 0 for each camera."""
+    """Return a Gaussian at each of at most ``count`` points of a scene, and a pose correction of 0 for each camera."""
     assert scene.points is not None, "the scene has no points to start from"
     chosen = np.random.default_rng(0).permutation(len(scene.points))[:count]
     points = torch.tensor(scene.points.points[chosen], dtype=torch.float32)
@@ -69,9 +69,9 @@ def scale_loss(log_scales: torch.Tensor) -> torch.Tensor:
 
 
 def densify(params: dict[str, torch.Tensor], optimizer: torch.optim.Adam, pull: torch.Tensor, size: float) -> None:
-    """Add copies of small and halves of large Gaussians whose absgrad ``pull`` [N] is high, and remove transparent ones.
+    """Split large and duplicate small Gaussians with a high absgrad ``pull`` [N], and remove transparent Gaussians.
 
-    Kept rows keep their Adam moments; those of new rows are 0. ``size`` is the size of the scene [u].
+    Old rows keep their Adam moments; new rows have moments of 0. ``size`` is the size of the scene [u].
     """
     g = {name: p.detach() for name, p in params.items() if name != "twists"}
     grows = pull > GROW_ABSGRAD
@@ -104,7 +104,7 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("--steps", type=int, default=400, help="optimisation steps")
     parser.add_argument("--count", type=int, default=1000, help="largest number of Gaussians at the start")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
-    parser.add_argument("--pose-noise", type=float, default=0.0, help="first rotation error of each training camera [degrees]")
+    parser.add_argument("--pose-noise", type=float, default=0.0, help="initial rotation error of training cameras [degrees]")
     a = parser.parse_args(arguments)
 
     torch.manual_seed(0)

@@ -60,7 +60,7 @@ class Registry(Generic[T]):
 
         def decorate(cls: type[T]) -> type[T]:
             before = self._classes.get(name)
-            if before is not None and _is_ours(before) and not _is_ours(cls):
+            if before is not None and is_ours(before) and not is_ours(cls):
                 raise UsageError(
                     f"{cls.__name__}: {name!r} is a {self.kind} of warpgs itself; register yours under another name"
                 )
@@ -170,7 +170,7 @@ def own_code(classes: Iterable[type]) -> dict[str, str]:
 
     A class without a file, such as one of a notebook, is left out.
     """
-    digests = {str(getattr(c, "name", c.__qualname__)): _digest(c) for c in classes if not _is_ours(c)}
+    digests = {str(getattr(c, "name", c.__qualname__)): _digest(c) for c in classes if not is_ours(c)}
     return {name: digest for name, digest in sorted(digests.items()) if digest}
 
 
@@ -182,7 +182,7 @@ def _digest(cls: type) -> str:
 
 def own_places(classes: Iterable[type]) -> list[str]:
     """Return where `module_of` finds the modules of classes from outside warpgs; the running script is left out."""
-    modules = {c.__module__ for c in classes if not _is_ours(c)} - {"__main__"}
+    modules = {c.__module__ for c in classes if not is_ours(c)} - {"__main__"}
     files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
     return sorted(str(place) for place in files.values() if place)
 
@@ -196,7 +196,8 @@ def module_digest(module: ModuleType | None) -> str:
         return ""
 
 
-def _is_ours(cls: type) -> bool:
+def is_ours(cls: type) -> bool:
+    """Return whether a class belongs to warpgs, not to the user."""
     return cls.__module__.startswith("warpgs.")
 
 

@@ -3,8 +3,8 @@
     warpgs fit scene --out run --loss-terms examples/loss_terms/depth_normals.py:NormalSmoothness --normal-smoothness.weight 0.1
 
 The normals come from rendered depth (`warpgs.geometry.depth_normals`). The term is the mean of 1 - cos of the angle between
-neighbours, weighted down at edges of the image as in Godard et al. 2017, eq. 5. Its weight grows over the first steps, in
-which depth is still noise.
+neighbours, weighted down at edges of the image as in Godard et al. 2017, eq. 5. The weight of the term grows
+over the first steps, because depth is noisy at first.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     warpgs fit scene --out run --loss-terms examples/loss_terms/depth_prior.py:DepthCorrelation --depth-correlation.weight 0.05
 
-The term is 1 - rho, where rho is Pearson's correlation of inverse rendered depth with the view's relative disparity. It follows
-the global depth loss of FSGS (Zhu et al. 2024), which takes the better of two such correlations, does not divide depth by alpha
-and ends with a weight of 0.001. The disparity comes from a network (--depth-model), or from a start by sweep or flow; without
-one, the term and its gradient are 0.
+The term is 1 - rho, where rho is Pearson's correlation of inverse rendered depth with the view's relative disparity. The term
+follows the global depth loss of FSGS (Zhu et al. 2024). But FSGS takes the better of two such correlations, does not divide
+depth by alpha and ends with a weight of 0.001. The disparity comes from a network (--depth-model), or from a start by sweep or
+flow. Without a disparity, the term and its gradient are 0.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from warpgs.scene import Prior
 import torch
 
 MIN_ALPHA = 0.5
-"""Opacity above which the depth of a pixel counts: elsewhere the background contributes more."""
+"""Opacity above which the depth of a pixel is used: elsewhere the background contributes more."""
 FLAT = 1e-3
-"""Standard deviation at or below which a map counts as constant, for a disparity in [0, 1] and for mean depth over depth, whose
-values lie around 1. The gradient of a correlation grows with the inverse of this deviation."""
+"""Standard deviation at or below which a map counts as constant. The maps are a disparity in [0, 1], and mean depth divided by
+depth, with values around 1. The gradient of a correlation grows with the inverse of the standard deviation."""
 
 
 def centred(values: torch.Tensor, fraction: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-    """Return values [H, W] less their mean over the pixels that count, and 0 at others."""
+    """Return values [H, W] minus their mean over the pixels that count; 0 at other pixels."""
     mean = total(values * fraction) / pixels
-    # one number for each row: the gradient of a number for all is the sum of a whole tensor (see `total`)
+    # expanded to one number per row: the gradient of a single number would be the sum of a whole tensor (see `total`)
     return (values - (mean if values.is_cuda else mean.expand(len(values), 1))) * fraction
 
 
@@ -40,15 +40,16 @@ def depth_disagreement(
 ) -> torch.Tensor:
     """Compute 1 minus Pearson's correlation of rendered inverse depth with a disparity of any scale and offset.
 
-    The pixels that count have alpha above `MIN_ALPHA` and are kept by the mask. Differentiable in ``depth`` alone. Where either
-    map is constant over them (`FLAT`), and where none counts, there is no correlation: then the result is 0, without gradient.
-    The unit of depth does not matter from 1e-30 to 1e30 u: maps are scaled to values around 1 and centred before squaring.
+    The pixels that count have alpha above `MIN_ALPHA` and are kept by the mask. Differentiable in ``depth`` alone. If
+    either map is constant over these pixels (`FLAT`), or if no pixel counts, the correlation is undefined. Then the result is
+    0, without gradient. The unit of depth does not matter from 1e-30 to 1e30 u: maps are scaled to values around 1 and centred
+    before squaring.
 
     Args:
         depth: Expected z-depth [u], positive where alpha is, shape [H, W].
         alpha: Accumulated opacity, shape [H, W].
         disparity: Relative inverse depth in [0, 1], shape [H, W].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None where all count.
+        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
 
     Returns:
         A number in [0, 2], shape []; NaN if a pixel that counts is NaN.
@@ -70,14 +71,14 @@ def depth_disagreement(
 @register("depth_correlation")
 @dataclass(frozen=True)
 class DepthCorrelation(warpgs.LossTerm):
-    """The weighted disagreement of rendered depth with the prior of the view, in the first steps of a fit."""
+    """The weighted disagreement of rendered depth with the prior of the view, in the first part of a fit."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
     needs_priors: ClassVar[bool] = True
     weight: float = 0.05
     """Weight of the term, in [0, 1000]; 0.05 in FSGS."""
     until: float = 0.95
-    """Fraction of the steps, from the first, that have the term, in [0, 1]."""
+    """Fraction of the steps, from the first on, in which the term is active, in [0, 1]."""
 
     def __post_init__(self) -> None:
         if not (0 <= self.weight <= 1000 and 0 <= self.until <= 1):

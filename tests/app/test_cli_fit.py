@@ -121,7 +121,7 @@ def test_mistakes_are_named_before_anything_starts(tmp_path, capsys):
     for flags, message in [
         (["--memory-limit", "2 cows"], "2 cows"),
         (["--strategy", "best"], "unknown strategy 'best'; choose one of"),
-        (["--loss-terms", "alpha,alpha"], "two of them define the flags --alpha"),
+        (["--loss-terms", "alpha,alpha"], "two of these names define the flags --alpha"),
         (["--strategy", f"{tmp_path}/none.py:A"], "there is no file"),
         (["--strategy", "json:JSONDecoder"], "must be a class that derives from"),
         (["--strategy", f"{tmp_path}/broken.py:A"], "ZeroDivisionError: division by zero"),

@@ -265,7 +265,7 @@ def test_no_memory_for_an_image_is_no_damage(tmp_path, monkeypatch):
         raise error
 
     monkeypatch.setattr(cv2, "imdecode", full)
-    with pytest.raises(ResourceError, match=r"a.png: decoding the image needs 0.0 GiB, which are not free; shrink it"):
+    with pytest.raises(ResourceError, match=r"a.png: decoding the image needs 0.0 GiB of free memory; shrink the image"):
         decode(path)
 
 

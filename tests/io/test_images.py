@@ -225,7 +225,7 @@ def test_masks_folder(name, keeps, tmp_path):
     assert "1 image masked by a mask file" in scene.notes
     kept = "75.0%" if keeps == "white" else "25.0%"
     assert (
-        f"masks keep {kept} of the pixels, the {keeps} ones (--mask-keeps {keeps}); the others do not count (--masks ignore)"
+        f"masks keep {kept} of the pixels, the {keeps} ones (--mask-keeps {keeps}); the others are ignored (--masks ignore)"
         in (scene.notes)
     )
     half = load_scene(tmp_path, downscale=2, mask_keeps=keeps).views[0].mask

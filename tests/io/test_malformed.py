@@ -62,7 +62,7 @@ def test_formats_passed_over_are_noted(tmp_path):
 def test_scenes_without_images(kind, lack, tmp_path):
     scenes.WRITERS[kind](tmp_path)
     (tmp_path / lack).rename(tmp_path / "elsewhere")
-    refused(tmp_path, rf"lacks its images, a folder {lack}")
+    refused(tmp_path, rf"lacks its image folder, {lack}")
 
 
 # ---- COLMAP, binary --------------------------------------------------------------------------------------------------

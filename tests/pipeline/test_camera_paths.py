@@ -163,6 +163,13 @@ def test_three_photographs_are_enough_to_know_what_is_up(roll, azimuths):
     assert not rig_of(heights, 1.0).turned and rig_of(heights, 1.0).up @ UP > 0.9
 
 
+def test_close_photographs_from_below_do_not_tilt_a_film():
+    """Eight cameras on an arc and two below, nearer to the subject: a plane through them leans, but the cameras are level."""
+    cameras = [*around(np.linspace(-55, 50, 8), 5.0), *around([-10, 15], -20.0, 1.6)]
+    cameras = [rolled(c, 4 * (-1) ** i) for i, c in enumerate(cameras)]
+    assert rig_of(cameras, 4.0).up @ UP > math.cos(math.radians(5))
+
+
 def test_in_a_room_a_film_looks_around():
     """From the middle, level, all the way round."""
     cameras = room()

@@ -11,8 +11,8 @@ from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
-from warpgs.pipeline.runs.failed_step import FILE, failed_step, findings, read_failed_step, save_failed_step
-from warpgs.pipeline.train.loss import LossTerm, register
+from warpgs.pipeline.runs.failed_step import FILE, broken_terms, failed_step, findings, read_failed_step, save_failed_step
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm, register
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.view_modules.exposure import Exposure
 from warpgs.pipeline.train.view_modules.poses import RefinePoses
@@ -40,7 +40,8 @@ def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
     config = dataclasses.replace(BUSY, loss_terms=(NanLater(),), half_resolution=0.5, dropout=0.1)
     split = f"train={','.join(v.name for v in views[:4])};test={views[4].name}"
     run = {"split": split, "device": "cpu", "verbose": False}
-    with pytest.raises(NotFiniteError, match=r"nan at step 15, on .*\.png\. .*doctor --repeat .*not_finite") as found:
+    told = r"nan at step 15, on .*\.png, in the loss term nan_later\. .*doctor --repeat .*not_finite.* correct nan_later"
+    with pytest.raises(NotFiniteError, match=told) as found:
         warpgs.fit(scene, config, out=tmp_path / "run", **run)
     assert load_checkpoint(tmp_path / "run")[1]["step"] == 14
     bundle = read_failed_step(tmp_path / "run" / FILE, CPU)
@@ -53,6 +54,17 @@ def test_the_state_before_is_kept_and_the_step_repeats(tmp_path):
     with pytest.raises(NotFiniteError) as again:
         warpgs.fit(scene, config, out=tmp_path / "run", resume=True, **run)
     assert str(again.value) == str(found.value)
+
+
+def test_a_term_whose_code_is_not_loaded_is_named(monkeypatch):
+    """The step is repeated without it, as in another process than that of the fit."""
+    fit = Trainer(photos(4), seeds(), dataclasses.replace(BUSY, loss_terms=(*BUSY.loss_terms, NanLater(first=0))), CPU)
+    bundle = failed_step(fit, 0, "x")
+    assert broken_terms(bundle) == ["nan_later"]
+    monkeypatch.delitem(LOSS_TERMS._classes, "nan_later")
+    lines = findings(bundle)
+    assert any(line.startswith("  loss term photometric: 0.") for line in lines) and broken_terms(bundle) == []
+    assert lines[-1] == "  loss term nan_later: not computed, because it is your own code, which this command does not load"
 
 
 @pytest.mark.parametrize("learned", [False, True], ids=["", "with poses and exposures"])

@@ -151,7 +151,7 @@ def test_empty_and_black_frames_are_noticed(model, tmp_path):
         ("interpolate", {}, None),
         ("auto", {"size": (160, 32)}, "keep the shape and the field of view of the photographs"),
         ("spiral", {"fov_y": 1.0}, "keep the shape and the field of view of the photographs"),
-        ("own", {}, "move the cameras nearer to those of the photographs"),
+        ("own", {}, "move the cameras nearer to the photographs' cameras"),
     ],
 )
 def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, advice):
@@ -162,10 +162,14 @@ def test_what_no_photograph_saw_gets_a_note(model, tmp_path, path, settings, adv
         plan = FilmPlan([(str(i), c) for i, c in enumerate(aside)], 0.0, "", [])
     else:
         plan = plan_film(model, path, FilmSettings(frames=2, **settings))
-    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings()).notes if "in no photograph" in n]
+    notes = [n for n in render_film(model, plan, tmp_path / "a.webp", FilmSettings()).notes if "outside all photographs" in n]
     assert len(notes) == (advice is not None)
     if advice:
-        frames = "1 of 2 frames have over 10% of pixels in no photograph (frames 1)" if path == "own" else "2 of 2 frames"
+        frames = (
+            "1 of 2 frames have over 10% of their pixels outside all photographs (frames 1)"
+            if path == "own"
+            else "2 of 2 frames"
+        )
         assert notes[0].startswith(frames) and notes[0].endswith(f"expect artefacts there; {advice}")
 
 

@@ -77,7 +77,7 @@ def test_maps_that_contradict_are_refused_with_figures():
     views, depths = still_life()
     cases = {
         "its depths are 99": given(views[0], 1000 * depths[0]),
-        "its values fall where depth rises; are they disparity": given(views[0], 1 / depths[0], "relative"),
+        "its values change with depth in the wrong direction; are they disparity": given(views[0], 1 / depths[0], "relative"),
         "of its depths are within 10%": given(views[0], np.random.default_rng(0).uniform(1, 9, depths[0].shape), "relative"),
     }
     for reason, view in cases.items():

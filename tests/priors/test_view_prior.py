@@ -115,7 +115,7 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
         assert not p.foreground.any() and not p.boundary.any() and p.semantics_source.startswith("none")
         check(p, (32, 64))
     text = "\n".join(notes)
-    assert "used as foreground in a.png" in text and "not scored in c.png, d.png, which have hardly any foreground" in text
+    assert "is foreground in a.png" in text and "no score for c.png, d.png, which have hardly any foreground" in text
 
 
 def test_a_region_beats_saliency():
@@ -145,7 +145,7 @@ def test_classical_sources_say_so():
 def test_without_any_depth_geometry_does_not_count():
     (prior,), notes = view_priors([view(shapes()[0])], PriorConfig())
     assert not prior.disparity.any() and prior.depth_source == "none"
-    assert any("none from a network or from other views" in n for n in notes)
+    assert any("neither a network nor other views gave depth" in n for n in notes)
 
 
 def test_many_names_are_cut_short(tmp_path):

@@ -159,6 +159,13 @@ def test_the_first_view_is_that_of_the_page(window):
         np.testing.assert_allclose(getattr(client.camera, name), getattr(server.initial_camera, name), atol=1e-6)
 
 
+def test_cameras_where_the_page_starts_are_hidden_from_the_first_image_on(window):
+    """Their photographs would cover the model, also before the browser has sent the position of its camera."""
+    visible = {name: frustum.visible for name, frustum in window._frusta.items()}
+    first = next(n for n, c in window.content.model.scene_cameras.items() if c is window.first)
+    assert not visible[first] and any(visible.values())
+
+
 def test_a_narrow_window_shows_the_whole_width_of_an_image(window):
     """On a phone, when a browser connects and when it steps into a camera; a wide window keeps the camera's field of view."""
     camera = window.first

@@ -152,7 +152,7 @@ def _processor() -> Iterable[Finding]:
     yield Finding("CPU", OK, f"{processor_name()}, {usable_cores()} of {os.cpu_count()} cores usable")
     memory = machine_memory()
     if memory is None:
-        assumed = f"the system does not report its memory;{format_bytes(ASSUMED_BYTES)} are assumed"
+        assumed = f"the system does not report its memory; {format_bytes(ASSUMED_BYTES)} are assumed"
         yield Finding("Memory", NOTE, assumed)
         return
     total, free = memory
@@ -349,8 +349,8 @@ def print_report(findings: list[Finding], console=None) -> int:
     """Print the findings as a table, and the fixes below it.
 
     Args:
-        findings: what `diagnose` returned.
-        console: a `rich.console.Console`; the standard output where None.
+        findings: Result of `diagnose`.
+        console: A `rich.console.Console`; None for the standard output.
 
     Returns:
         The exit code: 0 if a fit can run, else 4.

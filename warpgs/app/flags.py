@@ -73,7 +73,7 @@ def either(flags: Any, name: str) -> bool | None:
 
 
 MAX_WHOLE = 2**63 - 1
-"""Largest whole number that a flag takes: that of 64 bits."""
+"""Largest whole number that a flag takes: the largest signed integer of 64 bits."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
 MAX_NUMBER = 3e38
@@ -132,7 +132,7 @@ def _number_rule(info: Any) -> Any:
 
 
 def parse_flags(kind: type, arguments: list[str], program: str, description: str) -> Any:
-    """Return an instance of a dataclass of flags from the arguments of a command line; ``--help`` prints one screen.
+    """Parse the arguments of a command line into a dataclass of flags; ``--help`` prints one screen.
 
     Numbers are finite and written in the digits 0 to 9.
 

@@ -26,7 +26,8 @@ def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
         raise
     except Exception as e:  # whatever a user's module raises
         last = traceback.extract_tb(e.__traceback__)[-1]
-        where = f"{e.filename}, line {e.lineno}" if isinstance(e, SyntaxError) else f"{last.filename}, line {last.lineno}"
+        syntax = isinstance(e, SyntaxError)
+        what, where = (e.msg, f"{e.filename}, line {e.lineno}") if syntax else (e, f"{last.filename}, line {last.lineno}")
         raise UsageError(
-            f"the {kind} {spec!r} cannot be loaded: {type(e).__name__}: {e} ({where}); fix that code, or leave it out"
+            f"the {kind} {spec!r} cannot be loaded: {type(e).__name__}: {what} ({where}); correct that code, or omit the {kind}"
         ) from e

@@ -1,4 +1,4 @@
-"""Objects photographed on black: detection, and dark pixels made transparent."""
+"""Objects photographed on black: their detection, and transparency for the dark background."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from warpgs.scene import View
 
 DARK = 16 / 255
-"""Brightness below which the brightest channel of a pixel belongs to a black background, in [0, 1]."""
+"""A pixel is dark if its brightest channel is below this value, in [0, 1]."""
 DARK_FRACTION = 0.3
-"""Fraction of dark pixels from which on an image with a dark border shows an object on black."""
+"""An image with a dark border shows an object on black if at least this fraction of its pixels is dark."""
 
 HOLE = 0.001
-"""Fraction of an image from which on an enclosed dark region is a hole in the object, not a part of it."""
+"""An enclosed dark region is a hole in the object if it covers at least this fraction of the image."""
 
 
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:
@@ -30,7 +30,8 @@ def dark_pixels(image: np.ndarray) -> np.ndarray | None:
 def empty_pixels(dark: np.ndarray) -> np.ndarray:
     """Return the dark pixels without an object in front of them, bool [H, W].
 
-    Their region of adjacent dark pixels (4 neighbours) touches the border, or is at least `HOLE` of the image.
+    The region of adjacent dark pixels (4 neighbours) around such a pixel touches the border, or covers at least `HOLE` of the
+    image.
     """
     import cv2
 
@@ -42,16 +43,16 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
 
 
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
-    """Give views that all show an object on black an opacity: 0 for the dark pixels around it and in its holes, else 1.
+    """Make the background transparent if all views show an object on black: the dark pixels around the object and in its holes.
 
-    Specks and cracks that the object encloses stay opaque. If any view has an opacity or a mask, or shows something else, all
-    views stay unchanged.
+    All other pixels get an opacity of 1, and so do specks and cracks that the object encloses. If any view has an opacity or a
+    mask, or shows something else, all views stay unchanged.
 
     Args:
         views: The views of a scene.
 
     Returns:
-        The views, and a note for the user; empty where nothing is changed.
+        The views, and a note for the user; an empty note if nothing is changed.
     """
     done, empty = [], 0.0
     for v in views:

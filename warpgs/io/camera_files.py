@@ -29,7 +29,7 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
         path: A cameras.json, a transforms.json, or a folder with a COLMAP reconstruction, binary or text.
 
     Raises:
-        DataError: The file is missing, malformed or holds no camera; a pose is not rigid, or a lens impossible.
+        DataError: The file is missing, malformed or holds no camera; a pose is not rigid, or a lens has impossible values.
     """
     if path.is_dir():
         found = _colmap(path)
@@ -91,7 +91,7 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """Return the folder of a reconstruction in a scene, in sparse, or in sparse/0; None without one."""
+    """Return the folder of a reconstruction, given a scene folder, its sparse or its sparse/0; None without one."""
     found = colmap.model_folder(folder)
     return colmap.model_folder(folder / "0") if found is None else found
 

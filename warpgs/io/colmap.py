@@ -81,8 +81,8 @@ class _BinaryFile:
         capacity = (len(self.data) - self.at) // smallest
         if count > capacity:
             raise DataError(
-                f"{self.path}: announces {count:,} records but holds bytes for at most {capacity:,}; it is truncated or no "
-                "COLMAP file. Copy it again"
+                f"{self.path}: announces {count:,} records but holds bytes for at most {capacity:,}; it is truncated or not "
+                "a COLMAP file. Copy it again"
             )
         return count
 
@@ -237,7 +237,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
 
     Args:
         path: The file; an empty one gives no points.
-        names: View names by image number; numbers that are not in it are left out of the tracks.
+        names: View names by image number; images without a name here are left out of the tracks.
 
     Returns:
         N points in file coordinates with colours in [0, 1] and tracks.
@@ -293,7 +293,7 @@ def missing_parts(folder: Path) -> list[str]:
 def model_folder(root: Path) -> Path | None:
     """Return the folder of the reconstruction: sparse/0, sparse, or the root; None if none contains a COLMAP file.
 
-    The first complete one is taken, else the first that holds anything, for the error message.
+    The first complete folder is taken, else the first with any COLMAP file, for the error message.
     """
     folders = (root / "sparse" / "0", root / "sparse", root)
     partial = [f for f in folders if any((f / f"{s}.{k}").is_file() for s in STEMS for k in ("bin", "txt"))]
@@ -304,7 +304,7 @@ def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str)
     """Return the image file by view name, and a note for the user (empty where nothing was chosen).
 
     Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
-    the former are matched by stem, the latter by sorted order where the counts agree.
+    files with another suffix are matched by stem, files with other names by sorted order if the counts agree.
     """
     paths = {n: scene.child(images, n, where) for n in names}
     lost = [n for n in names if not paths[n].is_file()]
@@ -340,7 +340,7 @@ class ColmapReader(Reader):
         found = f"the COLMAP reconstruction in {model.relative_to(folder).as_posix()}"
         if missing := missing_parts(model):
             return Probe(found, " and ".join(missing))
-        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its images, a folder images")
+        return Probe(found, "" if has_folder(folder, "images", "images_*") else "its image folder, images")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""

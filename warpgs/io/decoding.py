@@ -1,4 +1,4 @@
-"""Decoding of image files: the header first, then whether the file is whole, then the pixels."""
+"""Decoding of image files: read the header, check that the file is complete, then decode the pixels."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from warpgs.io.image_formats.kinds import format_of
 from warpgs.io.unread_formats import unread_format
 
 MAX_PIXELS = 100_000_000
-"""Default of the largest number of pixels of an image; decoded, it takes 1.2 GB."""
+"""Default limit on the pixels of an image; decoded, an image of this size takes 1.2 GB."""
 FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
-"""Bytes that a pixel may take in a file, four channels as float32, and bytes for all else in it."""
+"""Bytes that a pixel may take in a file (four channels as float32), and bytes for everything else in the file."""
 BYTES_PER_PIXEL = 32
 """Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
 
@@ -47,7 +47,7 @@ def read_image_start(path: Path, count: int) -> bytes:
 
 def _unreadable(path: Path, error: OSError) -> DataError:
     if not os.path.exists(path):  # False for broken and circular links
-        what = "is a link that leads to no file" if path.is_symlink() else "the image file is missing"
+        what = "is a broken link" if path.is_symlink() else "the image file is missing"
         return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
     return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
 
@@ -95,14 +95,14 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
 
 def _too_large(path: Path, pixels: int) -> str:
     needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: decoding the image needs {needed:.1f} GiB, which are not free; shrink it, or end other programs"
+    return f"{path}: decoding the image needs {needed:.1f} GiB of free memory; shrink the image, or end other programs"
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Decode a PNG to its numbers as stored, uint8 or uint16, shape [H, W] or [H, W, C] with colours in RGB order.
 
     Raises:
-        DataError: The file is missing, no PNG, too large, or damaged.
+        DataError: The file is missing, not a PNG, too large, or damaged.
         ResourceError: There is not enough memory for the image.
     """
     data = read_image_file(path, max_pixels)
@@ -115,7 +115,7 @@ def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
 def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
     """Decode an image file as stored, without rotation by its EXIF tag.
 
-    Gray, palette, 8- and 16-bit images and straight alpha are understood.
+    Gray, palette, 8- and 16-bit images and straight alpha are supported.
 
     Args:
         path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.

@@ -20,9 +20,9 @@ from warpgs.scene import Scene
 FILES = ("cameras.npz", "cameras_sphere.npz")
 FOLDERS = ("image", "images")
 MAX_ARCHIVE_BYTES = 2**24
-"""Size of the largest archive that is read [bytes]; one of 64 cameras has a hundred thousand."""
+"""Size of the largest archive that is read [bytes]; an archive of 64 cameras has a hundred thousand."""
 MAX_MATRIX_BYTES = 4096
-"""Size of an unpacked 4 x 4 matrix with its header [bytes] above which it is rejected."""
+"""Largest accepted size of an unpacked 4 x 4 matrix with its header [bytes]."""
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
@@ -102,7 +102,7 @@ class DTUReader(Reader):
         found = next((f for f in FILES if (folder / f).is_file()), None)
         if found is None:
             return None
-        return Probe(found, "" if has_folder(folder, *FOLDERS) else f"its images, a folder {' or '.join(FOLDERS)}")
+        return Probe(found, "" if has_folder(folder, *FOLDERS) else f"its image folder, {' or '.join(FOLDERS)}")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""

@@ -22,7 +22,7 @@ MAX_ENTRIES = 1000
 MAX_TEXT = 100
 """Longest maker or model that is read [bytes]."""
 MAX_FOCAL = 10_000
-"""Longest equivalent focal length that is believed [mm]."""
+"""Longest equivalent focal length that is accepted [mm]."""
 PREFIX = b"Exif\0\0"
 """First bytes of EXIF in JPEG, and in some WebP files."""
 

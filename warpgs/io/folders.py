@@ -32,16 +32,16 @@ def child(folder: Path, name: object, where: str, *, root: Path | None = None, a
 
     Args:
         folder: Folder to which the name is relative.
-        name: As found in the file.
-        where: Names the file in errors.
-        root: The folder that must not be left, links followed; ``folder`` where None.
+        name: Name as in the scene's file.
+        where: The scene's file and the place in it, for errors.
+        root: Folder that must contain the file, links followed; None for ``folder``.
         allow_outside: Allow links that point outside the folder.
 
     Returns:
         The path; the file may not exist.
 
     Raises:
-        DataError: The name is empty or no file name, or points outside the scene folder.
+        DataError: The name is empty or not a file name, or points outside the scene folder.
     """
     usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
     if usable:
@@ -70,7 +70,7 @@ def view_name(name: str) -> str:
 
 
 def view_name_of(path: Path, root: Path) -> str:
-    """Return the name of the view of a file: its path below ``root`` without following links, else a path below `outside`."""
+    """Return the view name of a file: its path below ``root`` without following links, else a path below `outside`."""
     plain, base = (posixpath.normpath(p.absolute().as_posix()) for p in (path, root))
     return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
 
@@ -152,7 +152,7 @@ class SceneFolder:
         return None
 
     def images(self, base: str = "images") -> tuple[Path, int, str]:
-        """Choose the image folder: `images_N` of the factor, else the full-size folder, whose images are resampled.
+        """Choose the image folder: `images_N` for a factor N, else the full-size folder, whose images are then resampled.
 
         Returns:
             The folder, the remaining factor for resampling, and a note for the user (empty without a choice).
@@ -169,7 +169,8 @@ class SceneFolder:
         Call it after all images are read, because ``max_side`` may have reduced any of them.
 
         Args:
-            by_folder: True if the format supports folders `images_N` (`images`); others read the files that the scene names.
+            by_folder: True if the format supports folders `images_N` (`images`); False if its reader reads the files that the
+                scene names.
         """
         name, factor = "images", self.options.downscale
         if by_folder:
@@ -180,7 +181,7 @@ class SceneFolder:
 
 
 def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the weight of each pixel by a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels.
+    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels.
 
     Raises:
         DataError: The file cannot be read.
@@ -252,7 +253,7 @@ class ViewList:
         mean = math.fsum(self._kept.values()) / len(self._kept)
         notes = [
             f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
-            f"the others {'are transparent' if cutout else 'do not count'} (--masks {options.masks})"
+            f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
         ]
         for fraction, what in ((0.0, "keep no pixel"), (1.0, "keep every pixel")):
             names = [n for n, kept in self._kept.items() if kept == fraction]

@@ -35,10 +35,10 @@ NOTHING_NAMED = NamedMaps()
 
 
 class GivenMaps:
-    """The maps of a scene, opened below the folders that the user names or by the files that the scene names."""
+    """Depth and normal maps of a scene, from the folders that the user names or the files that the scene names."""
 
     def __init__(self, options: MapOptions, max_pixels: int, allow_outside: bool):
-        """List the folders that are named.
+        """List the files of the folders in ``options``.
 
         Raises:
             DataError: A folder is missing, or holds no map.

@@ -1,4 +1,4 @@
-"""Ids of numbered images from their file names, so that nothing is matched by sorted order."""
+"""Ids of images from the numbers in their file names, so that numbered images are not matched by sorted order."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def named_by_dtu(names: list[str]) -> bool:
 def image_ids(names: list[str]) -> list[int] | None:
     """Return the ids of image files from their names, counted from 0; None if no number distinguishes the names.
 
-    DTU's own names `rect_001_3_r5000.png` count from 1 so 1 is id 0; other numbers are used unchanged.
+    DTU's own names, `rect_001_3_r5000.png`, count from 1, so number 1 is id 0; other numbers are used unchanged.
     """
     values = _numbers(names)
     if values is None:
@@ -44,8 +44,8 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
         where: Protocol and scene, for errors.
 
     Returns:
-        Name by id. Names without numbers are counted in sorted order; numbered ones must be there without a gap, for a gap
-        would shift every id after it.
+        Name by id. Names without numbers are counted in sorted order; numbered images must have no gaps, since a gap may mean
+        that the numbers are not the protocol's ids.
 
     Raises:
         DataError: There are too few images, or some are missing from the middle; the message names the ids.

@@ -1,4 +1,4 @@
-"""Images: orientation, undistortion and resizing, with intrinsics that follow."""
+"""Images: orientation, undistortion and resizing, with matching intrinsics."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
 MAX_INTRINSIC = 1e9
 MIN_FOCAL = 1e-3
-"""Smallest focal length in sides of the image, a field of view of 179.9 degrees."""
+"""Smallest focal length as a fraction of the image side: a field of view of 179.9 degrees."""
 MAX_DISTORTION = 1e4
-"""Largest distortion coefficient; beyond it, or an intrinsic beyond `MAX_INTRINSIC` [px], a file is taken for broken."""
+"""Largest distortion coefficient; a file is rejected if a coefficient exceeds it, or an intrinsic exceeds `MAX_INTRINSIC`
+[px]."""
 MIN_FOLD = 1e-9
 """Inverse of a squared radius; a fold of the lens beyond that radius lies outside any image."""
 
@@ -75,7 +76,7 @@ class LoadedImage:
     image: np.ndarray
     """Colours in [0, 1], float32, shape [H, W, 3], over the background where transparent."""
     mask: np.ndarray | None
-    """True where the pixel counts, bool, shape [H, W]; None for everywhere."""
+    """True for pixels that are used, bool, shape [H, W]; None for all pixels."""
     K: np.ndarray
     """Intrinsics [px], shape [3, 3]."""
     done: tuple[str, ...] = ()
@@ -83,7 +84,7 @@ class LoadedImage:
     alpha: np.ndarray | None = None
     """Opacity in [0, 1], float32, shape [H, W]; None if the image is opaque."""
     kept: float | None = None
-    """Fraction of the pixels that a mask file keeps, in [0, 1]; None without one."""
+    """Fraction of the pixels that a mask file keeps, in [0, 1]; None without a mask file."""
     camera_model: str = "pinhole"
     """Camera model of the pixels, as `Camera.model`."""
     distortion: np.ndarray | None = None
@@ -95,9 +96,9 @@ class LoadedImage:
     undone: Lens | None = None
     """Lens whose distortion was removed at ``full_size``; None without distortion."""
     depth: GivenDepth | None = None
-    """Given depth of its pixels, metric depth in file units; None without."""
+    """Given depth of its pixels, metric depth in file units; None without given depth."""
     normals: np.ndarray | None = None
-    """Given normals of its pixels, as `View.normals`; None without."""
+    """Given normals of its pixels, as `View.normals`; None without given normals."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -145,10 +146,10 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the columns and rows of the stored raster that the pixels of a pinhole [H, W] show, as OpenCV counts them.
+    """Return the column and the row in the distorted image of each pixel of a pinhole image, [H, W] each, as in OpenCV.
 
     Args:
-        K: Intrinsics [px] of both at this size, shape [3, 3].
+        K: Intrinsics [px] of both images at this size, shape [3, 3].
         lens: Lens with the distortion.
         width: Width [px].
         height: Height [px].
@@ -312,13 +313,14 @@ def load_image(
 
     Args:
         path: The image file.
-        lens: Its intrinsics, at any size; they are scaled to the image. Or a function that makes them from the width and
-            height [px] of the stored raster, for formats that do not store the image size.
+        lens: Its intrinsics, at any size; they are scaled to the image. For formats that do not store the image size, a
+            function that makes them from the width and height [px] of the stored raster.
         downscale: Factor by which both sides shrink (area resampling).
-        mask: Weight of each pixel, in [0, 1], [H, W] at the size of the file or of the same aspect.
+        mask: Weight of each pixel, in [0, 1], shape [H, W], at the size of the file or at another size of the same aspect.
         background: Colour in [0, 1] behind transparent pixels.
         max_pixels: Largest number of pixels that the file may have.
-        cutout: True to make masked-out pixels transparent, gray ones partly; False to ignore pixels kept by half or less.
+        cutout: True to make masked-out pixels transparent, gray ones partly; False to ignore pixels with a weight of at most a
+            half.
         max_side: Longest side that the image keeps [px] after ``downscale``; 0 for no limit.
         native: Keep the distortion of the lens instead of undoing it.
 
@@ -326,7 +328,7 @@ def load_image(
         The image with intrinsics for its final size.
 
     Raises:
-        DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel counts.
+        DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel is left.
         UsageError: ``downscale`` or ``max_side`` leaves a side below `MIN_SIDE`.
     """
     image, alpha = decode(path, max_pixels)
@@ -343,7 +345,7 @@ def load_image(
         mask = _fit_mask(path, mask if cutout else mask > 0.5, stored, (height, width), orientation)
     loaded = _with_mask(path, LoadedImage(image, mask, K, done, alpha), cutout)
     if not native and (lens.fisheye or len(lens.distortion) > 5):
-        raise DataError(f"{path}: an image of a {lens.model} lens is not undistorted here; keep the lens by --lenses native")
+        raise DataError(f"{path}: images of {lens.model} lenses cannot be undistorted; keep the lens with --lenses native")
     undone = lens if not native and any(lens.distortion) else None
     if undone is not None:
         loaded = _undistort(loaded, undone)

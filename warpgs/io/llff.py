@@ -52,7 +52,7 @@ class LLFFReader(Reader):
         """See `Reader.probe`."""
         if not (folder / FILE).is_file():
             return None
-        return Probe(FILE, "" if has_folder(folder, "images", "images_*") else "its images, a folder images or images_N")
+        return Probe(FILE, "" if has_folder(folder, "images", "images_*") else "its image folder, images or images_N")
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""

@@ -78,7 +78,7 @@ def load_scene(
         depth_unit: Length of one unit of a metric depth map in units of the cameras; None for 0.001 for integers and 1 for
             floats.
         normal_axes: Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera.
-        progress: Called with a line for the user before each image is decoded; None for nothing.
+        progress: Called with a line for the user before each image is decoded; None for no messages.
 
     Returns:
         The scene.
@@ -86,8 +86,8 @@ def load_scene(
     Raises:
         DataError: A file of the folder is missing or malformed; the message names file, reason and fix.
         ResourceError: There is not enough memory to decode an image.
-        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``depth_unit`` is not above 0, a choice
-            or the reader is unknown.
+        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``depth_unit`` is not above 0, or a
+            choice or the reader is unknown.
     """
     root, (factor, side) = Path(path), image_scale(downscale, max_side)
     given = [None if p is None else Path(p) for p in (depths, normals)]
@@ -106,7 +106,7 @@ def load_scene(
 
 
 def _counted(root: Path, progress: Callable[[str], object] | None) -> Callable[[Path], None]:
-    """Return a function that shows the number of the image that is read."""
+    """Return a function that reports the number of the image that is read next."""
     numbers = itertools.count(1)
 
     def on_image(file: Path) -> None:

@@ -20,11 +20,11 @@ UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bi
 NONE = "none"
 """Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
-"""End of the stem of a map of confidence."""
+"""Ending of a confidence map's file name, before its suffix."""
 MILLIMETRES = 0.001
 """Default length of a unit of integers: RGB-D cameras store depth in millimetres, with poses in metres."""
 MAX_DEPTH = 1e12
-"""Largest depth [file units]; beyond it a map is taken for broken."""
+"""Largest depth [file units]; maps with larger values are rejected."""
 AXES = ("opencv", "opengl")
 UNIT_TOLERANCE = 0.1
 """Largest difference of a normal's length from 1; eight bits round by less than 0.01."""
@@ -67,7 +67,7 @@ class MapFolder:
     """The maps of a folder, found by the names of images."""
 
     def __init__(self, folder: Path, flag: str, allow_outside: bool):
-        """List a folder; unless ``allow_outside``, no link below it may point outside it.
+        """List a folder; links in it may point outside the folder only with ``allow_outside``.
 
         Raises:
             DataError: The folder is missing or holds no map, two files are for one image, or a link points outside.
@@ -98,7 +98,7 @@ class MapFolder:
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for a missing one.
 
-        A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match counts.
+        A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match is used.
         """
         tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
         for tail in tails:

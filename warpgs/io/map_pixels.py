@@ -1,4 +1,4 @@
-"""Given maps in the pixels of an image: turned, undistorted and resized as the image was, without mixing near and far."""
+"""Given maps in the pixels of an image: turned, undistorted and resized as the image, without mixing near and far depths."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def _intrinsics(K: np.ndarray, where: str) -> np.ndarray:
 
 @register("middlebury")
 class MiddleburyReader(Reader):
-    """Middlebury scenes: a parameter file, and the images it names beside it."""
+    """Middlebury scenes: a parameter file, and beside it the images that it names."""
 
     description = "*_par.txt (Middlebury)"
     priority = 50

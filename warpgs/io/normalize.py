@@ -12,15 +12,16 @@ from warpgs.geometry import matmul
 from warpgs.scene import Normalization, PointCloud, View
 
 MIN_EXTENT = 1e-9
-"""Extent of a camera set [file units] below which all cameras count as one place."""
+"""Extent of a camera set [file units] below which all cameras are taken to be in one place."""
 MAX_COORDINATE = 1e12
-"""Largest coordinate of a camera centre [file units] and of a point [u]; beyond it a file is taken for broken."""
+"""Largest coordinate of a camera centre [file units] and of a point [u]; a file with a larger one is rejected."""
 
 
 def normalization_of(views: list[View], points: PointCloud | None, where: str) -> Normalization:
-    """Return the similarity that puts the mean camera centre at the origin and the farthest camera at 1 / 1.1.
+    """Return the similarity that puts the mean camera centre at the origin and the farthest camera at a distance of 1 / 1.1.
 
-    If all cameras are in one place, the points' median distance becomes 1; without points the scale is unchanged.
+    If all cameras are in one place, the median over the points of their largest offset along an axis becomes 1; without points
+    the scale is unchanged.
 
     Raises:
         DataError: A camera centre is absurdly far away; the message begins with ``where`` and names the image.

@@ -54,7 +54,7 @@ class ReadOptions:
     maps: MapOptions = NO_MAPS
     """Given maps of depth and normals."""
     on_image: Callable[[Path], object] | None = None
-    """Called with the file of each image before it is decoded; None for nothing."""
+    """Called with the file of each image before it is decoded; None for no call."""
 
     def __post_init__(self) -> None:
         if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
@@ -85,11 +85,11 @@ class Reader(abc.ABC):
     """Base class of the readers of scene formats."""
 
     name: ClassVar[str] = ""
-    """Name of the format: the one given to `register`, else that of the class attribute, else the name of the class."""
+    """Name of the format: the name given to `register`, else the class attribute, else the name of the class."""
     description: ClassVar[str] = ""
     """Files of the format, then its name in brackets, on one line, for the error message on an unknown folder."""
     priority: ClassVar[int] = 100
-    """Priority if a folder has several complete formats, lowest first; the built-in ones have 10 to 50."""
+    """Priority if a folder has several complete formats, lowest first; the built-in readers have 10 to 50."""
 
     _declared_name: ClassVar[str] = ""
 
@@ -135,7 +135,7 @@ def all_readers() -> list[Reader]:
 
 
 def find_reader(choice: str | type[Reader] | Reader) -> Reader:
-    """Return the reader of a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader object.
+    """Return the reader for a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader object.
 
     A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
 

@@ -39,7 +39,7 @@ class Split:
         both = set(self.train) & set(self.test)
         if both:
             some = ", ".join(sorted(both)[:5])
-            raise DataError(f"views {some} are in training and in test; a score on them would mean nothing. Name each once")
+            raise DataError(f"views {some} are in training and in test, so their scores would be meaningless; name each once")
         if not self.train:
             raise DataError("the split leaves no training view; name at least one")
 
@@ -121,7 +121,7 @@ class _Names:
 
 
 def check_spec(spec: str) -> None:
-    """Check that the specification of a split can be understood, before a scene is there.
+    """Check that the specification of a split can be understood, before a scene is read.
 
     Raises:
         UsageError: The specification is unknown or malformed, or leaves nothing to train.
@@ -164,9 +164,9 @@ def _explicit(names: list[str], spec: str) -> Split:
 def split_views(scene: Scene, spec: str) -> Split:
     """Return the split of a scene that a specification names.
 
-    ``llff:K`` and ``mip360:K``: of the sorted views every 8th is held out, K of the others are chosen evenly. ``dtu:K`` and
-    ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
-    ``train=a,b;test=c``: names, with or without suffix; a missing half consists of all other views.
+    ``llff:K`` and ``mip360:K``: every 8th of the sorted views is held out, and K of the others, evenly spaced, train. ``dtu:K``
+    and ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
+    ``train=a,b;test=c``: names, with or without suffix; if one half is missing, it consists of all other views.
 
     Raises:
         DataError: The scene lacks views of the split, or training and test views overlap.
@@ -189,7 +189,8 @@ def split_views(scene: Scene, spec: str) -> Split:
 def held_out_split(scene: Scene) -> tuple[str, str]:
     """Return the default split of a study, which needs held-out views, and a note.
 
-    Every 8th view is held out where there are at least 9, else the middle one; of two views none.
+    Every 8th view is held out if there are at least 9, else the middle view. No view is held out if there are only two, or if
+    the name of the middle view cannot be written in a specification.
     """
     names = sorted(v.name for v in scene.views)
     if len(names) >= 9:

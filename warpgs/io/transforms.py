@@ -27,9 +27,9 @@ UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
 """Keys of lens models that the five distortion terms of OpenCV cannot express; a fisheye's k4 is read with native lenses."""
 WHITE = (1.0, 1.0, 1.0)
 MAX_BYTES = 32 * 2**20
-"""Largest file [bytes]; ten thousand frames take some ten million."""
+"""Largest file [bytes]; ten thousand frames take about ten million bytes."""
 MAX_DEPTH = 16
-"""Largest depth of lists and objects within each other; real files have six."""
+"""Largest depth of nested lists and objects; real files have six."""
 
 
 def files_of(root: Path) -> list[Path]:
@@ -84,15 +84,15 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
 
 
 def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, native: bool = False) -> Lens:
-    """Return the intrinsics of a frame; its own values come before the shared ones.
+    """Return the intrinsics of a frame; the frame's own values override the shared values of the file.
 
     Args:
         frame: An entry of the list of frames.
         shared: The whole file.
-        width: Width of the image [px], where the file has none.
-        height: Height of the image [px], where the file has none.
+        width: Width of the image [px], used if the file gives none.
+        height: Height of the image [px], used if the file gives none.
         where: File and frame, for errors.
-        native: Fisheyes are read, too.
+        native: True to read fisheyes, too.
 
     Raises:
         DataError: There is no focal length, a number is not finite, or the lens model is not supported.

@@ -1,1 +1,1 @@
-"""The fit, in the order of the story: each file takes what the one before it made."""
+"""Models, training, scores, runs, films, farms and studies."""

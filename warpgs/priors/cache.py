@@ -1,4 +1,4 @@
-"""A disk cache of the maps that networks make of images, keyed by the hash of everything that decides them."""
+"""Disk cache of the maps that networks compute from images; the key is a hash of all inputs and settings of a map."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ CODE = 1
 
 
 def cache_folder() -> Path:
-    """Return the cache folder: WARPGS_CACHE, or the system's folder for caches.
+    """Return the cache folder: WARPGS_CACHE if set, else warpgs in the system's folder for caches.
 
-    Without a home folder it is a private folder of this process, with a line on stderr.
+    Without WARPGS_CACHE and a home folder, the maps go to a private folder of this process, and a line on stderr says so.
 
     Raises:
         ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE names an unknown home
@@ -45,26 +45,26 @@ def cache_folder() -> Path:
 
 @dataclass
 class MapCache:
-    """A folder of maps; a damaged entry is made again, and a folder that cannot be written is noted and not used."""
+    """A folder of maps. Damaged entries are computed again; if the folder cannot be written, a note says so."""
 
     folder: Path
     """Folder of the entries."""
     notes: list[str] = field(default_factory=list)
     """Messages for the user: entries that were damaged, a folder that cannot be written."""
     found: int = 0
-    """Entries taken from disk."""
+    """Number of entries read from disk."""
     made: int = 0
-    """Entries computed."""
+    """Number of entries computed."""
 
     def maps(
         self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
     ) -> tuple[np.ndarray, ...]:
-        """Return the maps of an image, from disk or made now.
+        """Return the maps of an image, read from disk or computed.
 
         Args:
             image: Colours, float32, shape [H, W, 3].
             names: Names of the maps.
-            decided_by: All other values on which the maps depend, as JSON data.
+            decided_by: All other values that affect the maps, as JSON data.
             make: Function that computes the maps, float32 [H, W] in [0, 1] each.
 
         Returns:

@@ -18,17 +18,18 @@ MIN_FRACTION = 1e-3
 def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Fill a depth map by edge-aware averages of inverse depth.
 
-    The result is the fast global smoother (Min et al. 2014) of the consistent inverse depths divided by that of the mask.
-    Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in docs/decisions/007-coarse-start.md.
+    The result is a ratio: smoothed inverse depths of consistent pixels, divided by the smoothed mask. The smoother is that of
+    Min et al. 2014. Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in
+    docs/decisions/007-coarse-start.md.
 
     Args:
         depth: z-depths [u], float32, shape [H, W].
-        valid: True where the depth counts, bool, shape [H, W].
+        valid: True where the depth is consistent, bool, shape [H, W].
         image: Colours in [0, 1], shape [H, W, 3].
 
     Returns:
         z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no consistent pixel reaches; 0 everywhere
-        where nothing is valid.
+        if no pixel is valid.
     """
     import cv2
 

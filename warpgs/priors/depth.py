@@ -16,7 +16,7 @@ CLIP = (0.5, 99.5)
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which the smoother's weight between neighbours falls to 1/e."""
 REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
-"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long one matters only where no
+"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long length matters only where no
 consistent depth is near."""
 MAX_ERROR_RATIO = 1e3
 """Largest ratio of an error to the median error; larger ratios are clipped, so no weight is below a millionth."""
@@ -25,7 +25,7 @@ MEAN_WEIGHT = 1e-9
 
 
 def unit_range(values: np.ndarray) -> np.ndarray:
-    """Return values scaled to [0, 1] by their minimum and maximum, float32; 0 everywhere where both are equal."""
+    """Return values scaled to [0, 1] by their minimum and maximum, float32; 0 everywhere if both are equal."""
     low, high = float(values.min()), float(values.max())
     if not high > low:
         return np.zeros(values.shape, np.float32)
@@ -44,7 +44,7 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
         Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
 
     Raises:
-        DataError: The output is not a map, or is depth that is not positive.
+        DataError: The output is not a map, or holds depths that are not positive.
     """
     output = network.run(preprocessing.prepare(network, image))
     shape = output.shape
@@ -76,8 +76,8 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     Args:
         image: Colours in [0, 1], shape [H, W, 3].
         depth: z-depth [u], shape [H, W].
-        valid: True where the depth counts, shape [H, W]; at least one pixel.
-        sensitivity: |dz/dpx| [u/px], at least 0, shape [H, W]; infinite counts least.
+        valid: True where the depth is consistent, shape [H, W]; at least one pixel.
+        sensitivity: |dz/dpx| [u/px], at least 0, shape [H, W]; infinite values get the smallest weight.
 
     Returns:
         Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].

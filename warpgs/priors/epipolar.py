@@ -1,7 +1,8 @@
 """Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
 
-After NexusGS (Zheng et al. 2025), with tests that its released code lacks: signs of both depths, smallest parallax, foot of
-the match inside the image, round trip of the flow, and the true derivative as sensitivity. Derivation: docs/flow_epipolar.md.
+After NexusGS (Zheng et al. 2025), with checks that its released code lacks: positive depths in both views, a smallest parallax,
+a position inside the image, and the round trip of the flow. The sensitivity is the true derivative. Derivation:
+docs/flow_epipolar.md.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class EpipolarConfig:
     near_count: int = 4
     """Number of nearest other views with which each view is matched."""
     blend: str = "least_sensitive"
-    """least_sensitive (the paper), nearest_first (what the code of NexusGS does), mean_valid or inverse_sensitivity."""
+    """least_sensitive (as in the paper on NexusGS), nearest_first (as in its code), mean_valid or inverse_sensitivity."""
 
     def __post_init__(self):
         if self.blend not in BLENDS:
@@ -59,8 +60,8 @@ class PairDepth:
     sensitivity: np.ndarray
     """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
     valid: np.ndarray
-    """True where both depths are positive, the parallax suffices, the nearest point of the line is in the second image and all
-    is finite."""
+    """True where both depths are positive, the parallax suffices, the point of the line nearest to the match is in the second
+    image, and the depth is finite."""
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
@@ -84,8 +85,8 @@ def homogeneous(pixels: np.ndarray) -> np.ndarray:
 def fundamental(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the fundamental matrix F [3, 3], the rotation R_st [3, 3] and the translation tau [3] of a pair of cameras.
 
-    ``F (x, y, 1)`` is the epipolar line in the second image of a pixel of the first. ``X_second = R_st (X_first + tau)``: -tau
-    is the second camera's centre in the frame of the first.
+    ``F (x, y, 1)`` is the epipolar line, in the second image, of pixel (x, y) of the first. ``X_second = R_st (X_first +
+    tau)``: -tau is the second camera's centre in the frame of the first.
 
     Raises:
         UsageError: A camera is not a pinhole.
@@ -114,8 +115,8 @@ def epipolar_depth(
         min_parallax: Smallest angle between the rays [deg].
 
     Returns:
-        Depth, residual, sensitivity and validity of N pixels; a match off its line is replaced by its foot on the line.
-        Without a baseline nothing is valid.
+        Depth, residual, sensitivity and validity of N pixels; a match off its line is replaced by the nearest point of the
+        line. Without a baseline nothing is valid.
     """
     F, R_st, tau = fundamental(first, second)
     rays = homogeneous(pixels) @ np.linalg.inv(first.K).T
@@ -169,9 +170,9 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
     Args:
         depths: Candidates [u], shape [S, N], nearest source first.
         sensitivities: |dz/dpx| of each [u/px], at least 0, shape [S, N].
-        valid: True where a candidate counts, shape [S, N].
-        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, the nearest source of equal ones;
-            nearest_first the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
+        valid: True where a candidate passed the checks, shape [S, N].
+        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties that of the nearest source; nearest_first
+            the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
 
     Returns:
         Depths [u], shape [N], 0 where no candidate is valid; and sensitivities [u/px], shape [N], infinite there.

@@ -171,7 +171,7 @@ def _depth_alone(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def build(request: ExportRequest) -> torch.nn.Module:
-    """Return the network in torch, ready to infer: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w].
+    """Return the network in torch, ready for inference: [1, 3, h, w] to disparity [1, h, w] or to scores [1, 21, h, w].
 
     Raises:
         ResourceError: A package of the extra ``export`` is missing.
@@ -202,7 +202,7 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
     Raises:
         DataError: The weights cannot be loaded, the file would be too large, or onnxruntime and torch disagree.
         ResourceError: A package is missing, or the file cannot be written.
-        UsageError: The network needs weights of the user, and none are given.
+        UsageError: The network needs the user's own weights, and none are given.
     """
     import torch
 

@@ -33,7 +33,7 @@ FILES = {
 }
 """SHA-256 of the files that are used, by their path in the package."""
 MAX_BYTES = 2**26
-"""Largest size of such a file [bytes]."""
+"""Largest size of one of the package's files [bytes]."""
 OUTPUTS = ("keypoints", "scores", "descriptors")
 KEYPOINTS = 4096
 """Number of keypoints that the network returns: those with the highest scores."""
@@ -48,7 +48,8 @@ LARGEST = 128
 TRIAL = (192, 256)
 """Height and width of the image [px] with which the export is tried."""
 SAME = 0.99
-"""Smallest fraction of the keypoints of torch that onnxruntime must find too: keypoints of equal score may be swapped."""
+"""Smallest fraction of torch's keypoints that onnxruntime must find, too. It is below 1, since keypoints of equal score may be
+swapped."""
 
 
 def package_files() -> dict[str, bytes]:
@@ -122,7 +123,7 @@ def build_matcher() -> torch.nn.Module:
 
 
 def agreement(found: list[np.ndarray], wanted: list[np.ndarray]) -> float:
-    """Return the fraction of the wanted keypoints that are found with the same score and descriptor, to 1e-3.
+    """Return the fraction of the wanted keypoints (score above 0) that are found with equal score and descriptor, to 1e-3.
 
     Args:
         found: Places [K, 2], scores [K] and descriptors [K, D] of one run.

@@ -22,18 +22,18 @@ KINDS = ("dis", "deepflow", "sparse")
 FLO_MAGIC = np.float32(202021.25)
 """First four bytes of a .flo file (Baker et al. 2011, vision.middlebury.edu/flow)."""
 MIN_UNKNOWN = 1e9
-"""Magnitude of a component from which flow is unknown (same source)."""
+"""Flow with a component of at least this magnitude is unknown (Baker et al. 2011)."""
 MAX_SIDE = 1 << 15
 MAX_FLOW_PIXELS = 100_000_000
 """Largest number of pixels of a .flo file that is read."""
 RATIO = 0.8
-"""Lowe's ratio test for the matches of kind sparse."""
+"""Largest ratio of the distances to the best and to the second match, for flow of kind sparse (Lowe's test)."""
 LINE_DISTANCE = 2.0
 """Largest distance of a sparse match from its epipolar line [px]."""
 MIN_SPARSE = 16
 """Smallest number of matches from which flow is interpolated."""
 NET_STRIDE = 8
-"""Multiple of both image sides [px] for networks of the RAFT kind."""
+"""Both image sides are multiples of this [px] for networks such as RAFT."""
 RANGES = {"255": (255.0, 0.0), "unit": (1.0, 0.0), "signed": (2.0, -1.0)}
 """Factor and offset from colours in [0, 1] to a network's input: RAFT's original code takes 0..255, torchvision's -1..1."""
 
@@ -66,7 +66,7 @@ def resize_flow(flow: np.ndarray, width: int, height: int, second: tuple[int, in
     """Return flow at another image size: resampled, with u and v scaled like the sides.
 
     Args:
-        flow: Flow between two images of its own size, shape [h, w, 2].
+        flow: Flow between two images of size h x w, shape [h, w, 2].
         width: New width of the first image [px].
         height: New height of the first image [px].
         second: New width and height of the second image [px], where they differ from the first's.
@@ -226,7 +226,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
 
 
 def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> FlowBetween:
-    """Return a function that gives the flow of an ordered pair of views, computed or read once each.
+    """Return a function that gives the flow of an ordered pair of views; each pair is computed or read only once.
 
     Args:
         views: Training views.
@@ -235,11 +235,12 @@ def flow_between(views: Sequence[View], kind: str, value_range: str = "255") -> 
         value_range: Colours that an ONNX network takes: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1).
 
     Returns:
-        From (i, j) to flow [H, W, 2] at the size of view i, or None if the pair has no flow.
+        Function of (i, j) that returns the flow [H, W, 2] at the size of view i, or None if the pair has no flow.
 
     Raises:
         UsageError: The kind or the range is unknown.
-        DataError: A file is missing or malformed; flow of a pair may also raise it when first requested.
+        DataError: A file is missing or malformed; the returned function may raise this error, too, when a pair is first
+            requested.
     """
     if value_range not in RANGES:
         raise UsageError(f"flow range {value_range!r} is not one of {', '.join(RANGES)}")

@@ -1,7 +1,8 @@
 """Given depth, converted to the scene's units, checked against consistent depth, and used instead of the sweep's depth.
 
 Derived in docs/decisions/022-given-depth.md. Depths are compared with the references of their view: depth of the sweep that
-other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to them.
+other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to the
+references.
 """
 
 from __future__ import annotations
@@ -24,9 +25,10 @@ MAX_RATIO = 1.25
 NEAR = 0.05
 """Relative difference of depths up to which they count as one surface."""
 GOOD, MIN_GOOD = 0.1, 0.5
-"""Largest relative difference from a reference of a good value of a fitted map, and the smallest fraction of good values."""
+"""A value of a fitted map is good if it differs from its reference by at most the first fraction; the second is the smallest
+fraction of good values."""
 EXACT = 0.015
-"""Median difference up to which a fitted map is treated like a metric one; maps of networks differ by more."""
+"""Median relative difference up to which a fitted map is treated like a metric one; maps of networks differ by more."""
 MIN_CONFIDENCE = 0.5
 """Smallest confidence at which a given depth may place Gaussians."""
 ROUNDS = 20
@@ -41,7 +43,7 @@ SHOWN = 5
 
 @dataclass(frozen=True)
 class Alignment:
-    """Meaning of the map of a view in scene units."""
+    """Conversion of a view's given map to scene units, and how well it agrees with the references."""
 
     scale: float = 1.0
     """Factor of the values."""
@@ -52,7 +54,7 @@ class Alignment:
     difference: float = float("nan")
     """Median relative difference from the references; NaN without any."""
     why_not: str = ""
-    """Reason why the map is not used; empty where it is."""
+    """Reason why the map is not used; empty if it is used."""
 
     def depth(self, given: GivenDepth) -> np.ndarray:
         """Return the z-depth [u] of a map, float32 [H, W]; 0 for missing values, or where it would not be positive."""
@@ -73,7 +75,7 @@ def check_given(views: Sequence[View]) -> None:
     """Check the given maps of views that were made in Python; `load_scene` has checked those that it read.
 
     Raises:
-        UsageError: A map has another size than its image, an unknown kind, or values that no depth or normal has.
+        UsageError: A map has another size than its image, an unknown kind, or values that are not finite or out of range.
     """
     for v in views:
         size = v.image.shape[:2]
@@ -138,7 +140,7 @@ def references(view: View, found: ViewDepth | None, known: PointCloud) -> tuple[
 
 
 def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
-    """Return the given depth of a view in scene units, scaled by its references.
+    """Return the conversion of a view's given depth to scene units; metric depth is only compared with the references.
 
     Args:
         view: A view with given depth.
@@ -170,12 +172,12 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
         return replace(made, why_not=f"{good:.0%} of its depths are within {GOOD:.0%} of depths that other views confirm")
     if not scale > 0:
         other = "relative" if kind == "disparity" else "disparity"
-        return replace(made, why_not=f"its values fall where depth rises; are they {other}?")
+        return replace(made, why_not=f"its values change with depth in the wrong direction; are they {other}?")
     return made
 
 
 def exact(given: GivenDepth, made: Alignment | None) -> bool:
-    """Return whether a map comes before estimated depth: a metric map, or one that fits its references closely."""
+    """Return whether a map replaces estimated depth: a metric map, or one that fits its references closely."""
     return given.kind == "metric" or (made is not None and made.difference <= EXACT)
 
 
@@ -188,7 +190,7 @@ def votes(
         views: All views, pinholes.
         depths: Depth of each [u], 0 for missing values, shape [H, W] each.
         index: Index of the view.
-        near: Number of nearest views that are compared.
+        near: Number of nearest views to compare with.
 
     Returns:
         Both counts, int, shape [H, W].
@@ -216,9 +218,9 @@ def with_given_depth(
 ) -> tuple[list[ViewDepth], list[str]]:
     """Return the depth of each view, combined with its given depth, and notes.
 
-    A given depth is dropped where more views see through it than confirm it. The depth of an `exact` map comes before the
-    estimate. That of another map is used only where a view confirms it, and the estimate is missing or differs.
-    ``ViewDepth.given`` has all depths that are not dropped, in scene units.
+    A given depth is dropped where more views see through it than confirm it. The depth of an `exact` map replaces the estimate.
+    The depth of any other map is used only where another view confirms it and the estimate is missing or differs from it.
+    ``ViewDepth.given`` has all given depths that are not dropped, in scene units.
 
     Args:
         views: Training views, pinholes.
@@ -287,7 +289,7 @@ def _notes(
     if len(compared) < len(used):
         notes[0] += f"; {len(used) - len(compared)} of them without a comparison"
     if removed:
-        notes[0] += f"; {removed:.1%} left out, because other views see through them"
+        notes[0] += f"; {removed:.1%} of the given depths left out, because other views see through them"
     if refused:
         shown = "; ".join(f"{name}: {why}" for name, why in refused[:SHOWN])
         notes.append(f"given depth: {len(refused)} maps are not used: {shown}{' ...' if len(refused) > SHOWN else ''}")

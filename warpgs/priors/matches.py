@@ -58,7 +58,7 @@ def sift_features(view: View, max_pixels: int | None = None, most: int = 0) -> F
 def agreeing_matches(
     a: View, b: View, first: Features, second: Features, min_angle: float = MIN_ANGLE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match the features of two views, and triangulate the matches that agree with their poses.
+    """Match the features of two views, and triangulate the matches that agree with the views' poses.
 
     Args:
         a: The first view.
@@ -68,7 +68,7 @@ def agreeing_matches(
         min_angle: Smallest angle between the two rays [deg]; 0 if only the matches are used, not their depth.
 
     Returns:
-        The rows of both features of each match, int, shape [N, 2]; and its point [u], shape [N, 3].
+        For each match, the rows of its two features, int, shape [N, 2], and its point [u], shape [N, 3].
     """
     import cv2
 

@@ -1,4 +1,4 @@
-"""Networks of torch as the bytes of ONNX files."""
+"""Conversion of torch networks to the bytes of ONNX files."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def folder_for_files() -> Iterator[Path]:
 def onnx_bytes(
     network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
 ) -> bytes:
-    """Return a network of one image as the bytes of an ONNX file.
+    """Return a network that takes one image as the bytes of an ONNX file.
 
     Args:
-        network: The network, ready to infer.
+        network: The network, ready for inference.
         image: An input, shape [1, 3, h, w].
         outputs: Names of its outputs.
-        sizes: Sizes that axes of the image may have, by axis; None for those of ``image``.
+        sizes: Sizes that axes of the image may have, by axis; None if only the sizes of ``image`` are allowed.
 
     Raises:
         ResourceError: A package is missing, or temporary files cannot be written.

@@ -1,4 +1,4 @@
-"""OpenCV on one thread and in its own code: results then depend neither on the number of cores nor on Intel's IPP."""
+"""OpenCV on one thread and without Intel's IPP, so that results depend neither on the number of cores nor on the processor."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ def single_threaded_opencv() -> Iterator[None]:
     """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel.
 
     Many OpenCV calls here are so short that starting threads takes longer than they save. The rounding of some calls depends on
-    the number of threads. With one thread, `cv2.distanceTransform` uses IPP's code. The fast global smoother cuts an image into
-    as many stripes as there are threads, and processes the last rows of a stripe in other code.
+    the number of threads. With one thread, `cv2.distanceTransform` uses IPP's code, unless `without_ipp` turned it off. The
+    fast global smoother cuts an image into as many stripes as there are threads, and processes the last rows of a stripe by
+    different code.
     """
     import cv2
 

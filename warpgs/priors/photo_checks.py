@@ -1,7 +1,7 @@
 """Faults of photographs that explain a bad model: blur, and light or colours that differ from photograph to photograph.
 
-Photographs are compared at the places that two of them show: SIFT matches that agree with the poses. So differences in content
-do not count, only those in blur and colour (docs/scenes.md, "Photograph checks").
+Two photographs are compared at points that both show: SIFT matches that agree with the poses. So the checks see only
+differences in blur and colour, not in content (docs/scenes.md, "Photograph checks").
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ MIN_SHARPNESS = 0.87
 MAX_BRIGHTNESS = 1.2
 """Factor of brightness, up or down, beyond which a photograph is reported; it stays below 1.1 at constant exposure."""
 MAX_TINT = 1.1
-"""Largest ratio, up or down, of a channel's factor to the factor of brightness at which the white balance is not reported."""
+"""The white balance is reported if a channel's factor differs from the factor of brightness by more than this ratio, up or
+down."""
 NEIGHBORS = 4
 """Number of nearest photographs that each photograph is compared with; others may choose that photograph, too."""
 MIN_MATCHES = 10
@@ -40,7 +41,7 @@ FINE, COARSE = 1.0, 2.0
 PATCH = 15
 """Side of the square around a match in which detail and colour are measured [px]."""
 NOISE = 0.1 / 255**2
-"""Mean square that is added to both bands of detail: less than a level of an 8-bit image is noise."""
+"""Mean square that is added to both bands of detail: differences below one level of an 8-bit image are noise."""
 DARKEST, BRIGHTEST = 0.04, 0.94
 """Colours in [0, 1] between which brightness is compared: outside, a photograph is black or clipped."""
 REMEDY = "fix it in the camera, or try --exposure"
@@ -53,19 +54,18 @@ PROGRESS_INTERVAL = 5.0
 
 @dataclass(frozen=True)
 class PhotoCheck:
-    """Comparison of one photograph with others at matched points; None with too few matches."""
+    """Comparison of one photograph with others at matched points; figures are None if there are too few matches."""
 
     name: str
     """Name of the view."""
     compared_with: int
     """Number of photographs that it could be compared with."""
     sharpness: float | None
-    """Fine detail relative to coarse detail, as a fraction of that of the other photographs; 1 if it is as sharp as they
-    are."""
+    """Ratio of fine to coarse detail, divided by the same ratio of the other photographs; 1 if equally sharp."""
     brightness: float | None
-    """Factor to the brightness of the other photographs, the mean of the three channels."""
+    """Brightness relative to the other photographs: the geometric mean of ``channels``."""
     channels: tuple[float, float, float] | None
-    """Factor of red, green and blue."""
+    """Red, green and blue relative to the other photographs."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the figures by name, for metrics.json."""
@@ -73,17 +73,17 @@ class PhotoCheck:
 
     @property
     def blurred(self) -> bool:
-        """True where the photograph is clearly less sharp than others."""
+        """True if the photograph is clearly less sharp than others."""
         return self.sharpness is not None and self.sharpness < MIN_SHARPNESS
 
     @property
     def exposed_otherwise(self) -> bool:
-        """True where the photograph is clearly darker or brighter than others."""
+        """True if the photograph is clearly darker or brighter than others."""
         return self.brightness is not None and not 1 / MAX_BRIGHTNESS <= self.brightness <= MAX_BRIGHTNESS
 
     @property
     def tinted(self) -> bool:
-        """True where the white balance differs from that of others."""
+        """True if the white balance clearly differs from other photographs."""
         if self.channels is None or self.brightness is None:
             return False
         return any(not 1 / MAX_TINT <= c / self.brightness <= MAX_TINT for c in self.channels)
@@ -129,7 +129,7 @@ def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int
 
 
 def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return pairs of a photograph and one of the nearest to it, each once; their number per photograph is bounded."""
+    """Return each pair of a photograph and one of its nearest photographs once, at most `NEIGHBORS` times their number."""
     centers, pairs = np.array([v.camera.center for v in views]), set()
     for i in range(len(views)):
         order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
@@ -151,7 +151,7 @@ def check_photos(views: Sequence[View], progress: Callable[[str], object] = lamb
 
     Args:
         views: All views of the scene, including held-out views; at least one.
-        progress: Called at intervals with a line for the user.
+        progress: Called with a line for the user, at intervals and after each pair.
 
     Returns:
         One check per view, in order.

@@ -25,13 +25,13 @@ class Preprocessing:
     """Size and colours of a network's input, and the meaning of its output."""
 
     size: int
-    """Shorter side [px] of the input where the graph leaves it free."""
+    """Shorter side [px] of the input, unless the graph fixes the size."""
     multiple: int
-    """Both sides are made multiples of this [px] where the graph leaves them free."""
+    """Both sides are multiples of this [px], unless the graph fixes the size."""
     mean: tuple[float, float, float]
     """Colour subtracted from colours in [0, 1], red first."""
     std: tuple[float, float, float]
-    """Divisor of colours less ``mean``, red first."""
+    """Divisor of the colours after ``mean`` is subtracted, red first."""
     output: str
     """Meaning of the output: disparity, depth or classes."""
 
@@ -50,7 +50,8 @@ class Preprocessing:
 def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
     """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5.
 
-    Bilinear where it grows; averages over areas where it shrinks, so that fine texture does not alias.
+    If neither side grows, pixels are averaged over areas, so that fine texture does not alias; else they are interpolated
+    linearly.
     """
     import cv2
 
@@ -126,7 +127,7 @@ def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) 
     Args:
         network: The opened model.
         flags: Values of flags by field name; None or 0 where a flag was not given.
-        defaults: Values that neither the flags nor the file give.
+        defaults: Values for everything that neither the flags nor the file give.
         flag: Prefix of the flags' names, for notes.
 
     Returns:

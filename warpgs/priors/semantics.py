@@ -31,7 +31,7 @@ L0_WEIGHT, L0_GROWTH = 0.04, 2.0
 """Weight of a gradient, and growth per round, of L0 smoothing. Xu et al. 2011 use 0.02 and 2 for photographs; twice that weight
 drops foliage and gravel and keeps outlines."""
 MAX_PIXELS = 50_000
-"""Largest number of pixels of an image without a network; larger ones are reduced first: smoothing takes 0.6 s
+"""Largest number of pixels that `classical_semantics` processes; larger images are reduced first, since smoothing takes 0.6 s
 at 504 x 378 px."""
 EDGE_LOW, EDGE_HIGH = 100.0, 250.0
 """Canny's thresholds on the smoothed image: sums of absolute Sobel derivatives of 8-bit colours."""
@@ -54,7 +54,8 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
     """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
 
-    An output that already sums to one is taken for probabilities; any other for logits, resized before the softmax.
+    An output that already sums to one is taken for probabilities. Any other output is taken for logits, which are resized
+    before the softmax.
 
     Returns:
         Probabilities, float32, shape [H, W, 21].

@@ -95,7 +95,8 @@ def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -
 
     Raises:
         UsageError: The provider is neither cpu nor cuda.
-        DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
+        DataError: The file is missing or not an ONNX model, needs other files or custom operators, or does not map one image to
+            one output.
         ResourceError: onnxruntime or the provider is missing.
     """
     if provider not in PROVIDERS:

@@ -1,4 +1,4 @@
-"""Depth by sweeping planes: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
+"""Plane-sweep depth: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
 
 Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996). The method
 is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a parabola between planes.
@@ -44,10 +44,10 @@ def _reduced(view: View, max_pixels: int) -> View:
 def consistent_depth(
     views: Mapping[int, View], inverses: Mapping[int, np.ndarray], index: int, others: Sequence[int], config: SweepConfig
 ) -> ViewDepth:
-    """Return the depth of one view where it is geometrically consistent with that of at least one other view.
+    """Return the depth of one view where it is geometrically consistent with the depth of at least one other view.
 
     A point is projected to each other view and back by the depth found there. It must return to within ``max_round_trip``
-    of its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest of the consistent views.
+    of its pixel, with both rays at least ``min_parallax`` apart. The sensitivity is the smallest among the consistent views.
 
     Args:
         views: Views by index.
@@ -145,7 +145,7 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [_unswept(v, f"not swept: {len(swept)} of the {len(views)} views together see most of the scene") for v in views]
+        out = [_unswept(v, f"not swept: the {len(swept)} swept views, of {len(views)}, see most of the scene") for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

@@ -29,7 +29,7 @@ def needed_bytes(view: View, planes: int) -> int:
 
 
 def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device) -> torch.Tensor:
-    """Return the costs of `sweep_cpu.matching_costs`, without planes past the last, int16, shape [H, W, D], on the device."""
+    """Return the costs of `sweep_cpu.matching_costs`, without its padding planes, int16, shape [H, W, D], on the device."""
 
     def box(maps: torch.Tensor) -> torch.Tensor:
         r = window // 2
@@ -66,7 +66,7 @@ def matching_costs(view: View, others: Sequence[View], inverses: np.ndarray, win
 
 
 def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return the inverse depths [1/u] of `plane_depths.best_inverses`, float64, shape [H, W], on the host."""
+    """Return inverse depths [1/u] as `plane_depths.best_inverses` does, float64, shape [H, W], on the host."""
     k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
     left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
     bend = left - 2 * middle + right

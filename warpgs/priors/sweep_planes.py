@@ -21,7 +21,7 @@ UNIT = 4096
 """Cost 1 in the 16-bit integers of cost volumes: they need half the memory of float32, and first access to memory takes as long
 as the computation."""
 MAX_LARGE_STEP = 0.99
-"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15."""
+"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
 PLANES_AT_ONCE = 16
 """Planes per launch on the GPU."""
 
@@ -33,7 +33,8 @@ class SweepConfig:
     near_count: int = 4
     """Number of other views with which each view is compared: the nearest that see the same surfaces."""
     max_views: int = 30
-    """Largest number of views that are swept: those that together see most. All others serve only for comparison."""
+    """Largest number of views that are swept: those that together see most of the scene. All others serve only for
+    comparison."""
     window: int = 7
     """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
     spacing: float = 0.5
@@ -45,7 +46,7 @@ class SweepConfig:
     small_step: float = 0.03
     """Penalty for a depth one plane off the neighbouring pixel's (P1); costs are in [0, 1]."""
     large_step: float = 0.5
-    """Penalty for any other depth (P2) where the image is even; less across its edges, but above 1.5 P1."""
+    """Penalty for any other depth (P2) where the image is even; less across the image's edges, but at least 1.5 P1."""
     max_round_trip: float = 0.6
     """Largest error [px] of a round trip of a pixel through another view and back by that view's depth."""
     min_parallax: float = 0.5
@@ -55,13 +56,13 @@ class SweepConfig:
         if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
             raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
         if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
-            raise UsageError("sweep needs at least 8 planes, 1 near view, 1 pixel and 2 views")
+            raise UsageError("sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2")
         for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
         if not max(self.large_step, 1.5 * self.small_step) <= MAX_LARGE_STEP:
             raise UsageError(
-                f"sweep large-step and 1.5 small-step must be at most {MAX_LARGE_STEP}, where the largest cost is 1"
+                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}; the largest cost is 1"
             )
 
 
@@ -114,7 +115,7 @@ def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarra
 
 
 def plane_homographies(first: Camera, others: Sequence[Camera], inverses: np.ndarray) -> np.ndarray:
-    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]: it is linear in them."""
+    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]."""
     start = np.stack([plane_homography(first, o, 0.0) for o in others])
     slope = np.stack([plane_homography(first, o, 1.0) for o in others]) - start
     return start + inverses[:, None, None, None] * slope

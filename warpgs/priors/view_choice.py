@@ -14,14 +14,14 @@ from warpgs.scene import Camera
 SAMPLES = 4
 """Pixels along either side of an image at which sight is sampled."""
 DEPTHS = 3
-"""Depths at each of them."""
+"""Number of depths at each of these pixels."""
 LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
 """Angles between two rays to a point [deg]. Below the first, depth is uncertain. Above the second, a surface looks different to
 both views. From the third on, the views are assumed to share nothing."""
 
 
 class Sight(NamedTuple):
-    """Sight that pairs of V views share, as fractions of what the first one sees."""
+    """Shared sight of pairs of V views, as fractions of what the first view of a pair sees."""
 
     overlap: np.ndarray
     """Fraction of the first view's sight that the second shares, less at larger angles, in [0, 1], shape [V, V]."""
@@ -77,9 +77,9 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
     """Return up to ``count`` views to compare a view with: the nearest cameras (ties by order) that share sight with it.
 
-    Views too near for depth are skipped: their angles halve the shared fraction. If none is left, the sampled points may have
-    missed the overlap, and the nearest cameras are returned. Views that share most at the best angles would give
-    fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
+    Views too near for depth are skipped: with the weight of their angles, the shared fraction is less than half. If none is
+    left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
+    most at the best angles gave fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
 
     Args:
         sight: What pairs of views share.

@@ -115,14 +115,14 @@ def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cac
 
 def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
     if depths is None:
-        notes.append("depth: none from a network or from other views, so geometry is not scored")
+        notes.append("depth: neither a network nor other views gave depth, so the importance has no geometry score")
         return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
     fractions = [float(d.valid.mean()) for d in depths]
     span = f"{min(fractions):.1%} to {max(fractions):.1%}"
     notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
     poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
     if poor:
-        notes.append(f"no consistent depth in {', '.join(poor)}, so geometry is not scored there; --depth-model adds depth")
+        notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
 
     def disparity(i: int) -> tuple[np.ndarray, str]:
         view, d = views[i], depths[i]
@@ -193,10 +193,10 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
         result.append((maps, source))
     reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        words = f"semantics: {reason}, so the mask or black background is used as foreground in {_names(replaced)}"
+        words = f"semantics: {reason}, so the object's region (by mask or black background) is foreground in {_names(replaced)}"
         notes.append(Detail(words) if classical else words)
     if empty:
-        notes.append(f"semantics: not scored in {_names(empty)}, which have hardly any foreground and no object mask")
+        notes.append(f"semantics: no score for {_names(empty)}, which have hardly any foreground and no object mask")
     return result
 
 
@@ -223,7 +223,7 @@ def view_priors(
             only if no depth network is given.
         regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
         threads: CPU threads of a network; 0 for as many as the process may use.
-        cache: Folder that keeps the maps of networks; None, or ``config.cache`` False, keeps none.
+        cache: Folder that keeps the maps of networks; no map is kept if the folder is None or ``config.cache`` is False.
         tell: Called with a line for each view.
 
     Returns:

@@ -49,7 +49,8 @@ dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
 details{margin-top:14px}summary{cursor:pointer}
 pre{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:16px;overflow:auto;
 font-size:13px;line-height:1.45}
-@media(max-width:700px){.row{grid-template-columns:1fr}.stack{grid-template-columns:1fr 1fr}}
+@media(max-width:700px){.figures div:last-child:nth-child(odd){grid-column:1/-1}
+.row{grid-template-columns:1fr}.stack{grid-template-columns:1fr 1fr}}
 """
 OVERVIEW, HELD_OUT = "the Gaussians, training cameras teal", ", held-out cameras orange"
 SCRIPT = (

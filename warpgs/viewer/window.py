@@ -159,12 +159,22 @@ class Window:
 
     def _hide_near(self) -> None:
         """Hide the cameras near the eye of a browser, because their photographs would fill the view."""
-        eyes = [c.camera.position for c in self.server.get_clients().values()]
+        eyes = self._eyes()
         for name, frustum in self._frusta.items():
             center = self.content.model.scene_cameras[name].center
             hidden = any(np.linalg.norm(eye - center) < HIDDEN * frustum.scale for eye in eyes)
             if frustum.visible != (self.panel.shows_cameras() and not hidden):
                 frustum.visible = not frustum.visible
+
+    def _eyes(self) -> list[np.ndarray]:
+        """Return the position [3] of each browser's camera: that of the first view until a browser sends its own."""
+        eyes = []
+        for client in self.server.get_clients().values():
+            try:
+                eyes.append(np.asarray(client.camera.position))
+            except AssertionError:  # the browser has not sent its camera yet
+                eyes.append(self.first.center)
+        return eyes or [self.first.center]
 
     def _render_maps(self) -> None:
         """Render an image for each browser after a change of its camera or choices, until the window is closed."""

@@ -1,5 +1,6 @@
 """`warpgs compare`: presets against each other. Parses, calls, prints; no logic."""
 
+import functools
 from dataclasses import dataclass
 
 from warpgs.app.commands.study import run_study_of, study_flags
@@ -20,6 +21,9 @@ def run(arguments: list[str], about: str) -> int:
 
     a = parse_flags(Compare, arguments, "warpgs compare", f"{about}\n\n{listed('presets', PRESETS.described())}")
     from warpgs.pipeline.study.compare import preset_variants
+    from warpgs.pipeline.train.presets import preset_settings
 
     names = [n.strip() for n in a.presets.split(",") if n.strip()]
-    return run_study_of(a, load_own("preset", a.presets, lambda: preset_variants(names, a.steps)), {})
+    for name in names:  # so that an error names its preset
+        load_own("preset", name, functools.partial(preset_settings, name))
+    return run_study_of(a, preset_variants(names, a.steps), {})

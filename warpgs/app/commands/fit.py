@@ -46,12 +46,12 @@ def _request_type() -> type:
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         resume: bool = False
-        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes all other flags except
-        --lpips-weights from the run."""
+        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
+        all settings from the run."""
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
         time_budget: float | None = None
-        """Choose the number of steps so that the fit finishes in this time [s]; not with --steps."""
+        """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps."""
         view: bool = False
         """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
         view_port: int = 8080
@@ -77,7 +77,7 @@ def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple
     parts: Parts = {}
     for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
         if flag_group(name) in parts:
-            raise UsageError(f"{flag} {given}: two of them define the flags --{flag_group(name)}; leave one out")
+            raise UsageError(f"{flag} {given}: two of these names define the flags --{flag_group(name)}; leave one out")
         kind = _load(registry, name)
         try:
             parts[flag_group(name)] = kind()

@@ -25,8 +25,8 @@ def run(arguments: list[str], about: str) -> int:
         rule: str | None = None
         """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
-        """Render a file of Gaussians with antialiasing, if it was trained with it (gsplat's rasterize_mode antialiased) but
-        does not declare it."""
+        """Render a file of Gaussians with antialiasing, for antialiased models (gsplat's rasterize_mode antialiased) in files
+        that do not declare this."""
         path: str = "auto"
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
@@ -44,7 +44,7 @@ def run(arguments: list[str], about: str) -> int:
         fov: float | None = None
         """Vertical field of view [deg]. Default: that of the photographs."""
         background: str = "auto"
-        """auto (that of the fit; images of cut-out objects are transparent PNGs), black, white, #rrggbb, or r,g,b in [0, 1]."""
+        """auto (the fit's colour; images of cut-out objects are transparent PNGs), black, white, #rrggbb or r,g,b in [0, 1]."""
         sheet: bool = False
         """Also write six frames in one image: sheet.png."""
         device: str = "auto"

@@ -1,6 +1,6 @@
 """AVIF, decoded to 8 bits by Pillow's libavif, and its detection: HEIC files are ISO base media files, too.
 
-libavif rejects a file that ends early. Damage inside of the coded pixels is not seen.
+libavif rejects a file that ends early. Damage inside the coded pixels is not detected.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """JPEG: markers and scans are checked, then libjpeg-turbo decodes; its warnings count as errors.
 
-JPEG has no checksum: damage that leaves a valid code of the same length is not seen (docs/decisions/012-files-from-anyone.md).
+JPEG has no checksum: damage that leaves a valid code of the same length is not detected
+(docs/decisions/012-files-from-anyone.md).
 """
 
 from __future__ import annotations

@@ -70,8 +70,8 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
     Args:
         pieces: The stream, in order.
-        limit: Number of bytes that are wanted. At most a little more is unpacked, which reveals damage but does not unpack a
-            bomb.
+        limit: Number of bytes that are wanted. Little more than this is unpacked: enough to reveal damage, but not a
+            decompression bomb.
 
     Raises:
         ValueError: The stream is damaged or ends early.

@@ -1,7 +1,7 @@
 """TIFF: the strips or tiles of the first image must lie in the file, must not overlap, and must hold all their pixels.
 
 Deflate has a checksum, which is checked. Pillow decodes other compressions, and stops if libtiff reports an error. OpenCV
-decodes pixels of more bits than Pillow supports; for those it stops at errors, too.
+decodes pixels with more bits than Pillow supports, and stops at errors, too.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""WebP: chunks must fill the length that the file announces. Lossy WebP has no checksum: damage inside of it is not seen."""
+"""WebP: chunks must fill the length that the file announces. Lossy WebP has no checksum: damage to it is not detected."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def size(data: bytes) -> tuple[int, int]:
 
 
 def check(data: bytes) -> None:
-    """Check that all chunks are whole.
+    """Check that all chunks are complete, and that the file holds pixels.
 
     Raises:
-        ValueError: A chunk is not whole, or there are no pixels.
+        ValueError: A chunk is not complete, or there are no pixels.
     """
     if not any(kind in PIXELS for kind, _ in chunks(data)):
         raise ValueError("it holds no pixels")

@@ -96,7 +96,7 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the requested run, finished.
+    """Ensure that a run folder holds the finished run that is requested.
 
     A finished run with the same configuration, user code, data, views, kind of device and version is kept. An interrupted run
     is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
@@ -118,7 +118,7 @@ def ensure_run(
         gap = "" if record is None else _difference(record, resolved or request.config, fingerprint, split, device)
         return _outcome(request, record, gap, why, variants, others)
     except WarpgsError as e:
-        return Outcome("failed", None, f"failed: {e}", e)
+        return Outcome("failed", None, str(e), e)
 
 
 def _stored(folder: Path) -> tuple[dict[str, Any] | None, str]:
@@ -167,4 +167,4 @@ def _outcome(
             note = f"could not be continued ({e}); moved to {_set_aside(folder).name} and fitted again"
             return Outcome("redone", fit(False), note)
     except WarpgsError as e:
-        return Outcome("failed", None, f"{note + '; ' if note else ''}failed: {e}", e)
+        return Outcome("failed", None, f"{note + '; then ' if note else ''}{e}", e)

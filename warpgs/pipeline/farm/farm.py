@@ -185,7 +185,7 @@ class _Farm:
 
 
 def seconds_left(statuses: list[JobStatus], slots: int) -> float | None:
-    """Estimate the time until all jobs are done [s] from the mean time of jobs done by this farm; None before the first."""
+    """Estimate the time until all jobs are done [s] from the mean time of jobs done by this farm; None before one is done."""
     took = [s.seconds for s in statuses if s.state == "done" and s.seconds]
     if not took:
         return None

@@ -33,7 +33,7 @@ class FarmJob:
     """Folder of all results, which contains ``folder``; links below it are not followed. None if it is ``folder`` itself."""
 
     def identity(self) -> str:
-        """Return the first 16 hexadecimal digits of the SHA-256 of all inputs of the result except the images."""
+        """Return an identifier of all inputs except the images: the first 16 hexadecimal digits of their SHA-256."""
         r = self.request
         weights = None if r.lpips_weights is None else str(r.lpips_weights)
         values = [dataclasses.asdict(r.scene), r.config.to_json(), weights, r.device]

@@ -1,4 +1,4 @@
-"""Lists of what to fit: a folder of scenes, a glob, or a file with a line of JSON for each job."""
+"""Lists of jobs: a folder of scenes, a glob, or a file with a line of JSON for each job."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
 
     Raises:
         DataError: A line of the file is not a job.
-        UsageError: There is nothing to fit, the folder is one scene, or two jobs have one name.
+        UsageError: There is nothing to fit, the folder is a single scene, or two jobs have the same name.
     """
     path = Path(jobs)
     if path.is_dir():
@@ -66,7 +66,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
             )
         if (size := len(os.fsencode(job.name))) > MOST_BYTES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} has {size} bytes, and a job's name at most {MOST_BYTES}; give another name "
+                f"{jobs}: {job.name[:100]!r} has {size} bytes, but a job's name may have {MOST_BYTES}; give another name "
                 "in a .jsonl file"
             )
         if job.name.casefold() in taken:

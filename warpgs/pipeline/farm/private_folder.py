@@ -1,4 +1,4 @@
-"""A private folder that the machines of a cluster share, in which a farm and its jobs exchange files that they trust."""
+"""A private folder that the machines of a cluster share, in which a farm and its jobs exchange trusted files."""
 
 from __future__ import annotations
 

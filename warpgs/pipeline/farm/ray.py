@@ -87,7 +87,7 @@ class RayEngine:
             return Event(name, "crashed", str(e).strip().splitlines()[-1])
 
     def close(self) -> None:
-        """End what runs, and leave the cluster."""
+        """Stop all running jobs, and leave the cluster."""
         for reference in self._running:
             self._ray.cancel(reference)  # KeyboardInterrupt there: the fit saves its state
         self._ray.wait(list(self._running), num_returns=len(self._running), timeout=60) if self._running else None

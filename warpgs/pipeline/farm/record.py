@@ -1,4 +1,4 @@
-"""The record of a job: job.json in its folder holds its state, and checksums that show that it is complete."""
+"""The record of a job: job.json in the job's folder holds the state, and checksums to verify that the results are complete."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CHECKED = (PLY, "metrics.json", CONFIG)
 """Files of a run with a checksum in the record."""
 FORMAT = 1
 MOST_FILES = 100_000
-"""Largest number of files and folders of a scene to list. In a larger scene only the fit, which reads it, detects changes."""
+"""Largest number of files and folders of a scene to list. Changes of a larger scene are detected only when a fit reads it."""
 
 _DIGEST = schema.text
 _SCHEMA = schema.fields(
@@ -106,7 +106,7 @@ def file_digest(path: Path) -> str:
 
 
 def source_stamp(scene: Path) -> str:
-    """Return the SHA-256 of the names, sizes and times of a scene's files; empty where they cannot be listed or are many."""
+    """Return the SHA-256 of the names, sizes and times of a scene's files; empty if they cannot be listed or are too many."""
     rows = []
     try:
         if scene.is_file():

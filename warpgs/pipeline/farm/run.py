@@ -49,7 +49,7 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
 
     Raises:
         ResourceError: The device is missing.
-        UsageError: The engine is unknown or not installed, it does not have so many slots, or other users can write to
+        UsageError: The engine is unknown or not installed, has fewer slots than requested, or other users can write to
             ``slurm_folder``.
     """
     r = request

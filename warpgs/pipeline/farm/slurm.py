@@ -31,7 +31,8 @@ ASK_EVERY = 1.0
 QUEUE_EVERY = 15.0
 """Time between two calls of squeue, which lists all jobs [s]."""
 MISSED = 3
-"""A job counts as ended once so many calls of squeue do not list it: a network file system may show its answer late."""
+"""A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show its answer
+late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
 SECONDS_TO_SAVE = 120
@@ -116,7 +117,7 @@ class SlurmEngine:
         self._running[job.name] = _Queued(slurm_id, number)
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return the jobs that have ended: looks for answers once a second, and asks Slurm four times a minute."""
+        """Return the jobs that have ended; answers are looked for once a second, and Slurm is asked four times a minute."""
         last = time.monotonic() + seconds
         while True:
             ended = self._ended()
@@ -173,7 +174,7 @@ class SlurmEngine:
             return ""
 
     def close(self) -> None:
-        """End what runs or is queued, and remove the private folder; running fits save their state."""
+        """Stop running jobs, drop queued ones, and remove the private folder; running fits save their state."""
         if self._running:
             done = _call("scancel", *(job.slurm_id for job in self._running.values()))
             if done.code:

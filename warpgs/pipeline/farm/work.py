@@ -1,4 +1,4 @@
-"""One job from beginning to end: every engine calls it in the processes that it starts."""
+"""One job from beginning to end, called by every engine in the processes that the engine starts."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ THUMBNAIL_SIDE = 480
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Run the job of a text; its output goes to its log. Engines of other machines call this.
+    """Run a job from its text; the job's output goes to its log.
 
     Args:
-        text: As of `job_text`.
+        text: Result of `job_text`.
         threads: CPU threads; 0 for as many as there are.
         on_step: As in `fit`.
 

@@ -15,10 +15,10 @@ from warpgs.scene import Camera
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
 """Default path for each kind of rig."""
 WIDE_ARC = math.radians(75)
-"""Range of azimuths of cameras on one side above which a film goes from photograph to photograph: a spiral would leave the
-captured area."""
+"""Range of azimuths [rad] of cameras on one side above which a film goes from photograph to photograph: a spiral would leave
+the captured area."""
 SWING = 0.9
-"""Fraction of the cameras' range that a film swings through: coverage is lower at its ends."""
+"""Fraction of the cameras' range that a film swings through: coverage is lower at the ends of the range."""
 MAX_ELEVATION = math.radians(80)
 """Largest elevation of a film: above it, the upward direction is lost."""
 LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
@@ -62,7 +62,7 @@ def path_of(rig: Rig) -> str:
 
 
 def upright(rig: Rig, camera: Camera) -> Camera:
-    """Return a camera with its centre and axis turned upright, for rotated photographs."""
+    """Return an upright camera with the same centre and axis, for rotated photographs."""
     if not rig.turned:
         return camera
     pose = look_at(camera.center, camera.center + camera.viewmat[2, :3], rig.up)

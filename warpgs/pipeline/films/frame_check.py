@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 EMPTY = 0.1
-"""A frame shows nearly nothing if its mean alpha is below this fraction of that of the training views' renders."""
+"""A frame shows nearly nothing if its mean alpha is below this fraction of the mean alpha of the training views' renders."""
 MIN_COVERAGE = 0.002
-"""A frame shows nearly nothing if its mean alpha is below this, whatever the training views' renders have."""
+"""A frame also shows nearly nothing if its mean alpha is below this value."""
 BLACK = 1 / 255
 """Mean of the brightest channel below which a frame is black."""
 
@@ -63,7 +63,11 @@ class FrameCheck:
             for numbers, words, advice in (
                 (self.empty, "show nearly nothing", f"the path leaves the captured area; {remedy}"),
                 (self.black, "are black", f"the camera is inside geometry, or the scene is unlit; {remedy}"),
-                (self.outside, f"have over {OUTSIDE:.0%} of pixels in no photograph", f"expect artefacts there; {nearer}"),
+                (
+                    self.outside,
+                    f"have over {OUTSIDE:.0%} of their pixels outside all photographs",
+                    f"expect artefacts there; {nearer}",
+                ),
             )
             if numbers
         ]

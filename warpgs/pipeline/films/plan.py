@@ -27,7 +27,7 @@ PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
 SECONDS = 3.0
 """Default duration of a film."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
-"""Duration of a film through training views [s]: for each view, and largest in all."""
+"""Duration of a film through training views [s]: per view, and at most in all."""
 MIN_FRAMES_PER_VIEW = 4
 """Fewest frames from one training view to the next; a film with too few frames passes through some of the views only."""
 MAX_FRAMES = 1_000_000
@@ -93,13 +93,13 @@ class FilmPlan:
     """Advice for frames that show nothing."""
     notes: list[str]
     """Lines for the user on the choices made."""
-    nearer: str = "move the cameras nearer to those of the photographs"
+    nearer: str = "move the cameras nearer to the photographs' cameras"
     """Advice for frames that show areas outside the photographs."""
 
 
 @torch.no_grad()
 def depth_and_coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> tuple[float, float]:
-    """Return the median rendered depth [u] over covered pixels and the median alpha of at most five cameras' images.
+    """Return the median depth [u] over covered pixels, and the median over images of their mean alpha, for up to nine cameras.
 
     The depth is 1 if no pixel is covered.
     """

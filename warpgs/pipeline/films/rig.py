@@ -28,6 +28,12 @@ MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
 """Length of the mean of the cameras' upward unit directions above which they agree."""
+FLAT = 0.02
+"""Largest variance of positions across the plane of cameras on a circle, as a fraction of the variance in the plane."""
+ROLLED = 0.05
+"""The same for horizontal axes of level photographs, which lean by 13 degrees (root mean square) at most."""
+MIN_SAME = math.cos(math.radians(15))
+"""Cosine of the largest angle between the normals of both planes for which they count as equal."""
 MIN_SWING = math.radians(6)
 """Smallest range of azimuths of a film, for cameras above each other."""
 
@@ -68,7 +74,7 @@ class Rig:
         return math.cos(elevation) * level + math.sin(elevation) * self.up
 
     def is_watched(self, cameras: list[Camera]) -> bool:
-        """Return whether all cameras look at a common point."""
+        """Return whether the rig is around or in front of its centre, and all cameras look at the centre."""
         to_center = [self.center - c.center for c in cameras]
         cosines = [(d * c.viewmat[2, :3]).sum() / max(math.sqrt((d * d).sum()), 1e-12) for c, d in zip(cameras, to_center)]
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
@@ -84,14 +90,14 @@ def _unit(v: np.ndarray) -> np.ndarray:
     return v / math.sqrt((v * v).sum())
 
 
-def _plane_normal(points: np.ndarray) -> np.ndarray | None:
-    """Return the unit normal [3] of the plane of points [N, 3]; None if the points fill space or lie on a line.
+def _normal_of(vectors: np.ndarray, largest: float) -> np.ndarray | None:
+    """Return the unit normal [3] of the plane through the origin that holds vectors [N, 3]; None if there is none.
 
-    The normal is the eigenvector of the smallest eigenvalue of their covariance, computed by squaring the inverse, without
-    LAPACK (see `warpgs.geometry.matmul`).
+    The normal is the eigenvector of the smallest eigenvalue of their second moments, computed by squaring the inverse, without
+    LAPACK (see `warpgs.geometry.matmul`). There is no plane if the vectors lie on a line, or if the smallest eigenvalue is
+    above ``largest`` times the sum of the others.
     """
-    offsets = points - points.mean(0)
-    covariance = (offsets[:, :, None] * offsets[:, None, :]).mean(0)
+    covariance = (vectors[:, :, None] * vectors[:, None, :]).mean(0)
     total = float(np.trace(covariance))
     if not total > 0:
         return None
@@ -103,24 +109,28 @@ def _plane_normal(points: np.ndarray) -> np.ndarray | None:
     least = float((normal * matmul(covariance, normal)).sum())
     minors = 0.5 * (total**2 - float((covariance * covariance).sum()))  # sum of the products of pairs of eigenvalues
     both, product = total - least, minors - least * (total - least)
-    return normal if least < 0.02 * both and product > 0.05 * both**2 else None
+    return normal if least < largest * both and product > 0.05 * both**2 else None
 
 
 def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, bool]:
     """Return the upward direction [3] of a film, and whether the photographs lie on their side.
 
-    For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. Else
-    it is the mean of the cameras' own upward directions.
+    For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. If the
+    cameras' horizontal axes lie in another plane, it is the normal of that one: some photographs are nearer or lower than the
+    others. Else it is the mean of the cameras' own upward directions.
     """
     rights, ups, forwards = (sign * np.array([c.viewmat[i, :3] for c in cameras]) for i, sign in ((0, 1), (1, -1), (2, 1)))
     centers = np.array([c.center for c in cameras])
     mean = ups.mean(0)
     length = math.sqrt((mean * mean).sum())
-    normal = _plane_normal(centers) if len(cameras) > 2 else None
+    normal = _normal_of(centers - centers.mean(0), FLAT) if len(cameras) > 2 else None
     if normal is not None and np.abs(matmul(forwards, normal)).mean() < 0.9:
         upright, lying = matmul(ups, normal), matmul(rights, normal)
         few = len(cameras) < 5  # any three centres lie in a plane: it must be that of the photographs, too
         turned = bool((np.abs(lying) > 0.9).all()) if few else float(np.abs(lying).mean()) > 0.8
+        level = None if few or turned else _normal_of(rights, ROLLED)
+        if level is not None and abs(float((normal * level).sum())) < MIN_SAME:
+            normal, upright = level, matmul(ups, level)
         if turned or (not few and np.abs(upright).mean() > 0.5):
             sign = float(upright.mean())
             if abs(sign) < 0.3:  # cameras disagree; people photograph from above

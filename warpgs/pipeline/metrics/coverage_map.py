@@ -16,7 +16,7 @@ from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02
 """Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
-difference, the squared colour difference of two photographs is twice (3 dB) that at the best agreement of depths (decision
+difference, the squared colour difference of two photographs is twice (3 dB) its value at the best agreement of depths (decision
 019)."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface; other pixels have no depth."""
@@ -72,8 +72,9 @@ def depth_views(
         gaussians: N Gaussians in the units of the cameras.
         cameras: Cameras of the training views, arrays of numpy.
         options: Options of the rasterizer.
-        masks: True where a pixel of a view counts, bool, shape [H, W] each; None for a view without a mask, or for no masks.
-        max_pixels: Most pixels of all maps together; with more of them every map is rendered smaller, both sides alike.
+        masks: True for pixels of a view that are used, bool, shape [H, W] each; None for a view without a mask, or for no
+            masks.
+        max_pixels: Most pixels of all maps together; if there are more, both sides of every map are reduced by the same factor.
 
     Returns:
         The views in the order of the cameras, on the device of the Gaussians.
@@ -189,7 +190,7 @@ def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthVi
 
 
 def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
-    """Return the fraction of a render's pixels that show a point outside the images of all photographs, in steps of a grid.
+    """Return the fraction of a render's pixels that show a point outside the images of all photographs, sampled on a grid.
 
     Unlike `coverage_map`, this function renders nothing, and counts occluded points as seen.
 
@@ -197,7 +198,7 @@ def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[
         depth: z-depth of the render [u], 0 where there is no surface, shape [H, W].
         camera: Camera of the render, a pinhole; arrays of numpy.
         photographs: Cameras of the photographs; a lens is replaced by the pinhole of the same K.
-        empty: Whether pixels without a surface count, as at the median depth of the others.
+        empty: Whether pixels without a surface are included, at the median depth of the other pixels.
 
     Raises:
         UsageError: A photograph has no pinhole of the same K, such as an orthographic one.

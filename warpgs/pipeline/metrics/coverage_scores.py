@@ -22,7 +22,8 @@ from warpgs.scene import Gaussians, View
 CLASSES = {
     "0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, empty",
 }  # fmt: skip
-"""Classes of pixels, with a description of each for the user. Where no view of a scene has an alpha, nothing is background."""
+"""Classes of pixels, with a description of each for the user. If no view of a scene has an alpha channel, no pixel is
+background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
 """Upper bounds of the classes of depth difference, each with its expected error; the last class has no bound."""
 PROBED = 6
@@ -31,7 +32,7 @@ PROBED = 6
 
 @torch.no_grad()
 def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
-    """Measure the colour difference between two training photographs of one point, by the difference of their depths.
+    """Measure how much two training photographs of the same point differ in colour, as a function of their depth difference.
 
     Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
     result estimates the error of a pixel whose nearest training view has this depth difference. The estimate uses the data that
@@ -42,8 +43,8 @@ def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.nda
         training: Their depths, from `depth_views`.
 
     Returns:
-        Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has that of
-        the class before it. None where no pixel of a photograph can be compared.
+        Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has the value of
+        the class before it. None if no pixel of a photograph can be compared.
     """
     chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
     photos = {i: _photo(train[i], training[i]) for i in chosen}

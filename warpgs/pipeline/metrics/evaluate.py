@@ -25,7 +25,7 @@ VARIANTS = {
 """Definition of each score, for result files and reports. Scores by other definitions are not comparable."""
 ALPHA_VARIANTS = {
     "psnr_whole": "of views with an alpha channel: over all unmasked pixels, with the background of the fit behind both images",
-    "psnr_foreground": "as for the whole image, over the pixels with an opacity above 0.5",
+    "psnr_foreground": "as psnr_whole, but only over the pixels with an opacity above 0.5",
     "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
     "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
 }
@@ -45,13 +45,13 @@ class ViewMetrics:
     name: str
     """Name of the view."""
     psnr: float
-    """Peak signal-to-noise ratio [dB] after rounding to 8 bits, over the pixels that count."""
+    """Peak signal-to-noise ratio [dB] after rounding to 8 bits, over the scored pixels."""
     ssim: float
     """Mean structural similarity, 3DGS variant (zero padding, every pixel)."""
     ssim_skimage: float
     """Mean structural similarity, scikit-image variant (Gaussian weights, border cropped)."""
     region: str
-    """Pixels that count: all, mask, score mask, or foreground (the object on a black background)."""
+    """Scored pixels: all, mask, score mask, or foreground (the object on a black background)."""
     lpips: dict[str, float] = field(default_factory=dict)
     """LPIPS by variant (`lpips_vgg_legacy`); empty without weights, NaN if the image is too small."""
     opacity: dict[str, float] = field(default_factory=dict)
@@ -165,7 +165,7 @@ def baselines(train: list[View], test: list[View]) -> dict[str, float]:
 def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
     """Return the means over views of every numeric score; empty without views.
 
-    Those of opacity are over the views that have one.
+    Means of opacity scores are over the views that have such a score.
     """
     if not metrics:
         return {}
@@ -178,5 +178,5 @@ def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
 
 
 def variants(lpips: Lpips | None) -> dict[str, str]:
-    """Return the definition of each score; that of LPIPS states if it was not measured for lack of weights."""
+    """Return the definition of each score; for LPIPS without weights, a note that it was not measured."""
     return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())

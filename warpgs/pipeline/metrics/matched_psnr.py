@@ -1,4 +1,4 @@
-"""PSNR of a held-out view after its colours were matched, for fits with an exposure for each training view."""
+"""PSNR of a held-out view after the render's colours are matched to it, for fits with an exposure for each training view."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def affine_map(rendered: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np
 
 
 def matched_psnr(view: View, image: np.ndarray) -> float:
-    """Return the PSNR [dB] of a render [H, W, 3] of a view by `RULE`; NaN where a half has no pixel that counts."""
+    """Return the PSNR [dB] of a render [H, W, 3] of a view by `RULE`; NaN if a half has no scored pixel."""
     region, _ = scored_region(view)
     counted = np.ones(view.image.shape[:2], bool) if region is None else region
     left, right = counted.copy(), counted.copy()

@@ -18,7 +18,7 @@ MAX_PIXELS = 20_000
 MIN_RESIDUAL = 0.05
 """Least residual, in [0, 1], of a pixel that differs from the model."""
 MIN_FACTOR = 3.0
-"""Least ratio of a differing pixel's residual to that of other views at the same point."""
+"""Least ratio of a differing pixel's residual to the residual of other views at the same point."""
 FLOOR = 0.005
 """Lower bound, in [0, 1], of the residual of other views in that ratio."""
 MIN_VIEWS = 2
@@ -38,9 +38,9 @@ HIGH_MISFIT = 0.002
 """The fit is too early for this check if the median over views of their median residuals exceeds this; finished fits reach
 0.001."""
 LOW_MISFIT = 0.0005
-"""Lower bound, in [0, 1], of the median over views in that comparison."""
+"""Lower bound, in [0, 1], of the median over views to which `MAX_MISFIT` is applied."""
 SMOOTHING = 32
-"""Width of the image over the side of the square in which residuals are averaged."""
+"""Image width divided by the side of the square in which residuals are averaged."""
 
 
 class Rendered(NamedTuple):
@@ -107,8 +107,8 @@ def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[i
 def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
     """Return for each training view the fraction of its pixels, in [0, 1], in regions that it shows differently from others.
 
-    A pixel counts if the view's residual is much larger than those of other views at the same point, and at least two other
-    views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
+    A pixel is included if the view's residual is much larger than those of other views at the same point, and at least two
+    other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
 
     Args:
         views: The training views, at least one.
@@ -141,7 +141,7 @@ def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[
 
 
 def moved_notes(fractions: dict[str, float]) -> list[str]:
-    """Return notes that name views with such regions, by the fraction of their pixels."""
+    """Return notes that name views with moved regions, by the fraction of their pixels."""
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
     if not named:
         return []

@@ -11,12 +11,12 @@ from warpgs.kernels.step_buffers import squared_error
 
 
 def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Return the mean squared error of a rendered image clamped to [0, 1], over the pixels that count.
+    """Return the mean squared error of a rendered image, clamped to [0, 1], over the unmasked pixels.
 
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
     """
     if mask is None:
         return squared_error(rgb, target) / rgb.numel()

@@ -6,9 +6,9 @@ import torch
 
 
 def quantiles(values: torch.Tensor, *fractions: float) -> list[torch.Tensor]:
-    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1]: linear between neighbours; a NaN is the largest.
+    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1], linear between neighbours; a NaN ranks last.
 
-    torch.quantile rejects more than 2^24 numbers, and cameras have more pixels.
+    torch.quantile rejects more than 2^24 numbers, and photographs may have more pixels.
     """
     ordered = values.sort().values
     found = []

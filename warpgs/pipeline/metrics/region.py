@@ -1,4 +1,4 @@
-"""Pixels that count for the fit and for the score: those of a mask, or of an object on a black background."""
+"""Pixels that a fit and its scores use: those of a mask, or of an object on a black background."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OPAQUE = 0.5
 def scored_region(view: View) -> tuple[np.ndarray | None, str]:
     """Return the pixels that a render is scored on, bool [H, W], and their name; None for all.
 
-    They are those of the view's score mask, if any (DTU's protocol), else the region of `counted_region`.
+    These are the pixels of the view's score mask, if any (DTU's protocol), else the region of `counted_region`.
     """
     if view.score_mask is not None:
         return view.score_mask, "score mask"
@@ -22,10 +22,10 @@ def scored_region(view: View) -> tuple[np.ndarray | None, str]:
 
 
 def counted_region(view: View) -> tuple[np.ndarray | None, str]:
-    """Return the pixels of a view that count in its fit, bool [H, W], and their name; None for all.
+    """Return the pixels of a view that a fit compares with the render, bool [H, W], and their name; None for all.
 
-    They are those of the view's mask, if any; else the bright pixels, if the view shows an object on black, because a black
-    frame around a small object would otherwise dominate the score.
+    These are the pixels of the view's mask, if any; else the bright pixels, if the view shows an object on black, because a
+    black frame around a small object would otherwise dominate the score.
     """
     if view.mask is not None and not view.mask.all():
         return view.mask, "mask"
@@ -36,7 +36,7 @@ def counted_region(view: View) -> tuple[np.ndarray | None, str]:
 def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
     """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all.
 
-    They are the opaque pixels within the mask if the view has an alpha channel, else the region of `counted_region`.
+    These are the opaque pixels within the mask if the view has an alpha channel, else the region of `counted_region`.
     """
     if view.alpha is None:
         return counted_region(view)

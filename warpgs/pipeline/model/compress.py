@@ -30,7 +30,7 @@ WORTHWHILE = 0.02
 def largest_fraction(accepted: Callable[[float], bool], rounds: int = ROUNDS) -> float:
     """Return the largest accepted fraction in [0, 1], by bisection; 1 is tried first, 0 needs no test.
 
-    The result was accepted itself, or is 0, so acceptance need not be monotone.
+    The result itself was accepted, or is 0; if acceptance is not monotone, a larger fraction may be accepted, too.
     """
     if accepted(1.0):
         return 1.0
@@ -132,7 +132,7 @@ class ViewSet:
 
 
 def cheapest(gaussians: Gaussians, pairs: Merges, accepted: Callable[[Gaussians], bool]) -> int:
-    """Return the number of pairs, the cheapest first, that may be merged so that the result is accepted."""
+    """Return how many pairs, the cheapest first, may be merged so that the result is accepted."""
     count, total = len(gaussians), len(pairs.first)
     return int(total * largest_fraction(lambda s: accepted(changed(gaussians, pairs.change(count, int(s * total))))))
 
@@ -144,11 +144,11 @@ def merge_neighbours(
 
     Args:
         gaussians: The set.
-        kinds: Only Gaussians of the same number are paired, int, shape [N].
+        kinds: Only Gaussians with the same number are paired, int, shape [N].
         view_set: Training views.
         accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent. The fraction
-            grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last of the round
-            before.
+            grows over the first `RAMP` rounds, because the cheapest pairs of one round cost less than the last merged pairs of
+            the round before.
     """
     idle = 0
     for number in range(PASSES):
@@ -171,7 +171,7 @@ def dispensable(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gau
 
 
 def needed_degrees(gaussians: Gaussians, view_set: ViewSet, accepted: Callable[[Gaussians], bool]) -> torch.Tensor:
-    """Return the degree of each Gaussian: 0 for as many as ``accepted`` allows, the others keep theirs.
+    """Return the degree of each Gaussian: 0 for as many as ``accepted`` allows, unchanged for the others.
 
     Args:
         gaussians: N Gaussians.
@@ -209,7 +209,7 @@ def prune_model(
 
     Args:
         gaussians: N Gaussians.
-        kinds: Only Gaussians of the same number are merged, int, shape [N].
+        kinds: Only Gaussians with the same number are merged, int, shape [N].
         view_set: The training views.
         accepted: Test whether a model is good enough when a fraction in [0, 1] of the allowed loss may be spent.
 

@@ -11,14 +11,15 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 SEEN = 4 / 255
-"""Least blending weight at which a view sees a Gaussian: with less, it changes no pixel by more than four of 255 levels."""
+"""Least blending weight at which a view sees a Gaussian: with less, the Gaussian changes no pixel by more than 4 of 255
+levels."""
 PROBES = 2
 """Random images per view for the Fisher sensitivity."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Per Gaussian, over all training views; tensors of shape [N] on the device of the Gaussians."""
+    """Coverage of each Gaussian by all training views; tensors of shape [N] on the device of the Gaussians."""
 
     maxima: torch.Tensor
     """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806; a sum is small for thin Gaussians)."""
@@ -28,7 +29,7 @@ class Coverage:
 
 @torch.no_grad()
 def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> Coverage:
-    """Render every view once and measure its weights of each Gaussian.
+    """Render every view once; measure each Gaussian's largest blending weight, and the number of views that see it.
 
     Args:
         gaussians: N Gaussians.
@@ -49,8 +50,9 @@ def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOption
     """Estimate the change of the images when a Gaussian moves by its own width or its axes grow.
 
     The result is the trace of PUP-3DGS' sensitivity (arXiv 2406.10219, eq. 6: the sum over pixels of the outer product of the
-    gradient of the colour in mean and scale), in units of the Gaussian's width; PUP uses the log-determinant instead. With
-    random signs e as the gradient of an image, the backward pass gives J^T e; the mean of its square is the diagonal of J^T J.
+    colour's gradient with respect to mean and scale), in units of the Gaussian's width; PUP uses the log-determinant instead.
+    With random signs e as the gradient of an image, the backward pass gives J^T e; the mean of its square is the diagonal of
+    J^T J.
 
     Args:
         gaussians: N Gaussians.

@@ -77,7 +77,7 @@ def merge(points: np.ndarray, colors: np.ndarray, cells: np.ndarray) -> PointClo
 
 
 def in_free_space(points: np.ndarray, views: Sequence[View], depths: Sequence[np.ndarray], without: int) -> np.ndarray:
-    """Return a mask [N], True if a point [N, 3] occludes the depths [H, W] (0: none) of a view other than ``without``."""
+    """Return a mask [N], True if a point [N, 3] occludes the depths [H, W] (0 if unknown) of a view other than ``without``."""
     hides = np.zeros(len(points), bool)
     for j, (view, depth) in enumerate(zip(views, depths)):
         if j != without:
@@ -112,7 +112,7 @@ class KnownPoints:
 
     @staticmethod
     def of(points: PointCloud, views: Sequence[View]) -> KnownPoints:
-        """Return the points with two of the views in their tracks; none if tracks are unknown."""
+        """Return the points with at least two of the views in their tracks; none if tracks are unknown."""
         names = {v.name for v in views}
         keep = [t is not None and len(names & t) >= 2 for t in points.tracks or ()] or [False] * len(points)
         chosen, tracks = np.nonzero(keep)[0], [t for t, k in zip(points.tracks or (), keep) if k]
@@ -150,9 +150,9 @@ def coarse_points(
         fill_px: Width of the cells of filled points, where no depth is consistent [px]; 0 fills in none. Their depths come from
             `complete`. No filled point is in space that another view sees through, or in the cell of a consistent point. Views
             without estimated depth get none, so that the work for each view is bounded.
-        source: Name of the source in the notes, sweep or flow.
-        known: Points of a reconstruction. Points that two of the views saw are used where no depth is consistent, and their
-            depths are filled in around them.
+        source: Name of the source in the notes, such as sweep or flow.
+        known: Points of a reconstruction. Points that at least two of the views saw are used where no depth is consistent, and
+            their depths are filled in around them.
 
     Returns:
         The cloud: consistent points first, then points of the reconstruction, then filled points. And notes: one per view

@@ -21,15 +21,16 @@ from warpgs.scene import PointCloud, View, ViewDepth
 EXTRAPOLATED_OPACITY = 0.5
 """Initial opacity of an extrapolated Gaussian."""
 BEYOND, BEYOND_PX = 0.25, 16
-"""Width of the extrapolated frame around an image, as a fraction of the image's; width of its cells, one point each [px]."""
+"""Width of the extrapolated frame around an image, as a fraction of the image width; and width of its cells, one point each
+[px]."""
 DEPTH_PX, COLOR_PX = 31, 6
 """Radius within which depth and colour at the image's border are averaged for the frame [px]."""
 REACH, BEHIND_PX, BEHIND_COLOR_PX = 24, 8, 3
 """Distance by which a far surface is continued behind a near one; width of its cells, one point each; and radius within which
 its colour is averaged [px]."""
 STEP, EDGE = 1.02, 1.15
-"""Ratios of depth: a surface ends between neighbouring pixels above the first; points are added if that of the far to the near
-side is above the second."""
+"""Ratios of depth: a surface ends between neighbouring pixels above the first; points are added if the ratio of the far to the
+near depth is above the second."""
 SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and direction of the four neighbours of a pixel."""
 
@@ -37,7 +38,8 @@ SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> PointCloud:
     """Return extrapolated points of all views: first those beyond the images, then those behind edges of depth.
 
-    Views with masks get none, since the border of a mask is not the border of the image.
+    There are none if any view has a mask, an alpha channel or a black background, since the border of a masked region is not
+    the border of the image.
 
     Args:
         views: Training views.
@@ -54,7 +56,7 @@ def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> P
 
 
 def all_count(views: Sequence[View]) -> bool:
-    """Return whether all pixels of all views count in a fit."""
+    """Return whether Gaussians may start behind all pixels of all views."""
     return all(fitted_region(v)[0] is None for v in views)
 
 

@@ -160,7 +160,7 @@ def limit_degree(gaussians: Gaussians, degree: int) -> Gaussians:
 
 
 def harmonics_rotation(rotation: np.ndarray) -> torch.Tensor:
-    """Return the matrix that turns coefficients with the scene, float64 [25, 25] (Wigner's D for degrees 0 to 4, real).
+    """Return the matrix that rotates coefficients with the scene, float64 [25, 25] (Wigner's D for degrees 0 to 4, real).
 
     Entry (j, k) is the integral over the sphere of Y_j(d) Y_k(R^T d), exact by a product rule of 50 points.
 

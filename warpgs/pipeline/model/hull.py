@@ -15,7 +15,7 @@ from warpgs.pipeline.model.depth_points import focal_length, merge, merge_cells
 from warpgs.scene import Camera, PointCloud, View
 
 MARGIN = 1.5
-"""Least distance from the nearest opaque pixel of a point in the empty region of a view [px]."""
+"""A point is in the empty region of a view if the nearest opaque pixel is at least this far away [px]."""
 FINEST = 1.5
 """Largest width of the finest cells, as the median over the views [px]."""
 PROJECTIONS = 2**25
@@ -26,13 +26,14 @@ TOLERANT = 12
 """Number of views per tolerated error: from this many views on, two must find a cell empty to remove it; from twice as many on,
 three."""
 SEEN = 0.9
-"""Least fraction of the views that have a cell in their image: space that few views look into cannot be carved."""
+"""Least fraction of the views that must have a cell in their image: space that few views look into cannot be carved."""
 OPAQUE_COLOR = 0.9
 """Least opacity of a pixel whose colour is that of the object alone."""
 LEAST_VIEWS = 2
 """Fewest views that must see a cell, because unseen cells are inside the object or outside the photographs."""
 LIKE = 0.15
-"""Largest standard deviation over views of similar colours of a cell, in the channel that differs most."""
+"""The colours of a cell are similar if their standard deviation over views is at most this, in the channel that differs
+most."""
 BEHIND_CELLS = 3.0
 """A cell is hidden if it is farther than this behind the first cell at its pixel, in widths of a cell."""
 
@@ -107,13 +108,13 @@ def carve(shapes: Sequence[Silhouette]) -> tuple[np.ndarray, float]:
 
 
 def _footprint(cameras: Sequence[Camera], points: np.ndarray) -> float:
-    """Return the width of a pixel at points [N, 3] before the cameras, the median over both [u]."""
+    """Return the width of a pixel at points [N, 3] in front of the cameras, the median over points and cameras [u]."""
     widths = np.stack([geometry.project_points(c, points)[1] / focal_length(c) for c in cameras])
     return float(np.median(widths[widths > 0])) if (widths > 0).any() else 0.0
 
 
 def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np.ndarray:
-    """Return the cells [N, 3] of ``half`` their width [u] that are neither empty nor inside."""
+    """Return the cells [N, 3] that are neither empty nor inside; ``half`` is half the width of a cell [u]."""
     empty, inside, seen = (np.zeros(len(cells), int) for _ in range(3))
     at = np.arange(len(cells))
     for k, shape in enumerate(shapes):

@@ -38,8 +38,8 @@ class InitConfig:
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
     reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep for few
-    views or given depth, else points if training views saw at least 100, else random. If views have an alpha channel, points in
-    an empty area of a view are left out."""
+    views or given depth; else points if the training views saw at least 100 of them; else random. If views have an alpha
+    channel, points in an empty area of a view are left out."""
     sweep_up_to: int = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
     random_count: int = 20_000
@@ -81,7 +81,7 @@ class InitConfig:
         if not 0 < self.opacity < 1:
             raise UsageError(f"init opacity {self.opacity} must be between 0 and 1")
         if self.random_count < 1:
-            raise UsageError(f"init random count {self.random_count} must be at least 1")
+            raise UsageError(f"init random-count {self.random_count} must be at least 1")
 
     def epipolar(self) -> EpipolarConfig:
         """Return the settings of depth from flow.
@@ -166,7 +166,7 @@ def _number_extrapolated(views: list[View], count: int) -> str:
 
 
 def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
-    """Return the reconstruction's points that two of the views saw, or the only view; none without a reconstruction.
+    """Return the reconstruction's points that at least two views saw, or that the only view saw; none without a reconstruction.
 
     A point that only one of several views saw was triangulated with held-out views.
     """
@@ -200,7 +200,7 @@ def check_points(views: list[View], points: PointCloud | None, config: InitConfi
 
 
 def on_object(start: Start, views: list[View]) -> Start:
-    """Return the start without points that are empty in a view with an alpha channel.
+    """Return the start without points in empty areas of views with an alpha channel.
 
     If fewer than `MIN_POINTS` points would be left, the start is unchanged.
     """
@@ -273,7 +273,7 @@ def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
 
 
 def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
-    """Return the size of the scene [u]: that of the camera set, or a tenth of the cloud's size if all cameras coincide."""
+    """Return the size of the scene [u]: the extent of the cameras, or a tenth of the cloud's spread if all cameras coincide."""
     extent = geometry.camera_extent(cameras)
     spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
     return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
@@ -282,13 +282,13 @@ def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
 def initial_gaussians(
     cloud: PointCloud, config: InitConfig, sh_degree: int, extent: float, device: torch.device, extrapolated: int = 0
 ) -> Gaussians:
-    """Return one isotropic Gaussian per point, as wide as the root mean square distance to its three neighbours.
+    """Return one isotropic Gaussian per point; widths follow the root mean square distance to the three nearest points.
 
     Args:
         cloud: At least one point.
-        config: Opacity, and the factor of the widths.
+        config: Opacity, and the factor from distances to widths.
         sh_degree: Degree of the spherical harmonics, 0 to 4.
-        extent: Size of the scene [u]; widths are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
+        extent: Size of the scene [u]; the distances are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
         device: Device of the tensors, float32.
         extrapolated: Number of points, the last ones, that start with `EXTRAPOLATED_OPACITY`.
 

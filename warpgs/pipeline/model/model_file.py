@@ -89,7 +89,7 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
         TypeError: The Gaussians have other parameters (``stored()`` of `ActivatedGaussians` converts them), or tensors differ
             in type.
         UsageError: The units are unknown, or scene units are given without a normalization.
-        ValueError: A shape disagrees.
+        ValueError: The shapes of the tensors do not match.
     """
     from safetensors.torch import save as to_bytes
 

@@ -47,7 +47,7 @@ def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Depths:
-    """Random depths for pixels of one view: near those of matched points around the pixel, else between the default bounds."""
+    """Random depths for pixels of one view: near the depths of nearby matched points, else between the default bounds."""
 
     def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
         seen = geometry.in_image(view.camera, matched.points)
@@ -85,8 +85,8 @@ def random_points(views: list[View], count: int, generator: np.random.Generator)
 
     A view with at least 10 triangulated SIFT matches takes each depth from one of the 5 matches nearest to the pixel, spread by
     a tenth (docs/decisions/003-random-start.md). Any other view samples inverse depths uniformly, and prefers points that a
-    second view sees. If views show an object on black, or have an alpha channel, points start on the object. Of several
-    candidates those are taken that fall on empty pixels in the fewest views, so that no point is in empty space.
+    second view sees. If views show an object on black, or have an alpha channel, points start on the object. Several candidates
+    are made, and those that fall on empty pixels in the fewest views are taken, to avoid empty space.
 
     Raises:
         DataError: Masks leave no pixel of any training view.

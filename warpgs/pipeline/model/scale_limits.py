@@ -50,7 +50,7 @@ class Limits:
         Args:
             params: ``means`` [N, 3] and ``log_scales`` [N, 3] of `Gaussians`.
             cameras: Training cameras.
-            going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes. None stands for True.
+            going: Whether the step is taken, bool, shape [1]; if False, nothing changes. None stands for True.
         """
         if self == NO_LIMITS:
             return
@@ -164,7 +164,8 @@ def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 def scene_radius(cameras: list[Camera], cloud: PointCloud) -> float:
     """Return the radius around the mean of the cameras that contains all cameras and 90 % of the initial points [u].
 
-    `scene_extent` differs: it is the size of the camera set alone. The photographed scene may be much larger or smaller.
+    `scene_extent` differs: it is the size of the camera set, unless all cameras coincide. The photographed scene may be much
+    larger or smaller.
     """
     center = np.mean([c.center for c in cameras], axis=0)
     reach = float(np.quantile(np.linalg.norm(cloud.points - center, axis=1), WITHIN)) if len(cloud) else 0.0

@@ -11,7 +11,7 @@ FLOAT = 4
 
 
 def model_bytes(degrees: torch.Tensor) -> int:
-    """Return the bytes of a model with these degrees [N]: float32, no coefficient above them, nothing compressed."""
+    """Return the bytes of a model with these degrees [N]: float32, uncompressed, without coefficients above the degrees."""
     return FLOAT * int((11 + 3 * (degrees.long() + 1) ** 2).sum())
 
 
@@ -22,10 +22,10 @@ def truncated(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
 
 
 def pack(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
-    """Return the coefficients [N, K, 3] that Gaussians of these degrees [N] have, one after the other, in one row.
+    """Pack coefficients, given as [N, K, 3], up to each Gaussian's degree [N], Gaussian by Gaussian, into one vector [M].
 
     Raises:
-        ValueError: The degrees do not ascend: stored degree-sorted, equal degrees make one uniform block.
+        ValueError: The degrees do not ascend; Gaussians are stored sorted by degree, so that equal degrees make one block.
     """
     if bool((degrees.diff() < 0).any()):
         raise ValueError("degrees must ascend; sort the Gaussians by degree first")
@@ -34,7 +34,7 @@ def pack(sh: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
 
 
 def unpack(packed: torch.Tensor, degrees: torch.Tensor) -> torch.Tensor:
-    """Return the coefficients [N, K, 3] that `pack` stored, K that of the highest degree, zeros above each one's degree.
+    """Return coefficients [N, K, 3] from the vector [M] of `pack`: K for the highest degree, 0 above each Gaussian's degree.
 
     Raises:
         ValueError: The degrees are not integers from 0 to 4, or do not match the packed coefficients.

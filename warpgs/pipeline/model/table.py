@@ -37,21 +37,21 @@ class DensityUpdate:
 
     keep: torch.Tensor
     """Indices of the surviving rows in ascending order, int64, shape [S]."""
-    added: Mapping[str, torch.Tensor]
-    """New rows of each parameter, shape [A, ...]; their moments start at zero."""
-    parents: torch.Tensor
-    """Parent of each new row, by its index before the change, -1 for none, int64, shape [A]."""
+    added: Mapping[str, torch.Tensor] = field(default_factory=dict)
+    """New rows of each parameter, shape [A, ...]; their moments start at zero. Empty if no row is added."""
+    parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    """Parent of each new row, by its index before the change, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
     """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
     overwritten: torch.Tensor | None = None
     """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
-    [R]; None for none."""
+    [R]; None to overwrite no row."""
     values: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """Parameters of the overwritten rows, shape [R, ...]; parameters left out are unchanged."""
 
 
 class Table:
-    """Parameters with Adam moments and columns, kept row by row in step."""
+    """Parameters with their Adam moments, and columns; all of them have the same rows."""
 
     batch: int = 1
     """Number B of views over which gradients are averaged. Learning rates are multiplied by the square root of B, and decay
@@ -120,7 +120,8 @@ class Table:
         Args:
             lrs: Learning rate of each parameter, for steps of one view.
             step: Number of the step, from 1.
-            head_lrs: Learning rate of the first 3 numbers of each row, for parameters whose first numbers have their own.
+            head_lrs: Learning rate of the first 3 numbers of each row, for parameters whose first numbers have a rate of their
+                own.
         """
         row, factor = [], math.sqrt(self.batch)
         for name in self.params:
@@ -133,7 +134,7 @@ class Table:
         self, gradients: Mapping[str, torch.Tensor], lrs: torch.Tensor, skip: torch.Tensor,
         factors: torch.Tensor | None = None, rows: slice = slice(None),
     ) -> None:  # fmt: skip
-        """Update parameters, unless ``skip`` [1] is not 0.
+        """Update parameters with Adam, if ``skip`` [1] is 0.
 
         Args:
             gradients: Gradients of all or some parameters by name.
@@ -162,17 +163,18 @@ class Table:
         Raises:
             UsageError: A parameter is missing, or the numbers of new rows and parents differ.
         """
-        rows = {n: len(update.added[n]) if n in update.added else None for n in self.params}
-        if any(count != len(update.parents) for count in rows.values()):
+        none = {} if update.added or len(update.parents) else {n: t.detach()[:0] for n, t in self.params.items()}
+        new_rows, keep, parents = none or update.added, update.keep, update.parents.to(self.device)
+        rows = {n: len(new_rows[n]) if n in new_rows else None for n in self.params}
+        if any(count != len(parents) for count in rows.values()):
             raise UsageError(
-                f"a DensityUpdate has {len(update.parents)} parents but adds {rows} rows: each parameter needs one row for "
+                f"a DensityUpdate has {len(parents)} parents but adds {rows} rows: each parameter needs one row for "
                 "each entry of parents (-1 for a row without a parent)"
             )
         if update.overwritten is not None:
             self._overwrite(update.overwritten, update.values)
-        keep, parents = update.keep, update.parents
         for name in self.params:  # each old tensor is freed before the next is allocated
-            added = update.added[name].to(self.params[name].dtype)
+            added = new_rows[name].to(self.params[name].dtype)
             self.params[name] = torch.cat([self.params[name].detach()[keep], added]).requires_grad_()
             for moments in (self.exp_avg, self.exp_avg_sq):
                 moments[name] = torch.cat([moments[name][keep], torch.zeros_like(added)])

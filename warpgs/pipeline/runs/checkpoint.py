@@ -46,7 +46,7 @@ def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
-    """Write a checkpoint; it replaces the last one only once it is complete on disk.
+    """Write a checkpoint; the last checkpoint is replaced only when the new one is complete on disk.
 
     ``state`` is stored in the header of the same file, so tensors and state always belong to the same step.
 

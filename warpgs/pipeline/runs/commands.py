@@ -132,7 +132,7 @@ def render(
         out: Folder or film to write; None for `path-PATH` in the run folder, or beside the file.
         settings: Settings of the film; their background is ignored.
         device_name: auto, cpu or cuda.
-        background: Colour behind the scene; auto for that of the fit, and for transparent images if the scene's images have an
+        background: Colour behind the scene; auto for the fit's colour, or for transparent images if the scene's images have an
             alpha channel.
         coverage: True to also write images of the coverage by training views.
         sheet: Whether to write six frames in one image, too.
@@ -166,7 +166,7 @@ def render(
             training = scene_of(stored)[1] if isinstance(stored, StoredRun) else True
         except WarpgsError as e:
             training = True
-            notes.append(f"masked-out regions count as seen, since the scene cannot be read: {e}")
+            notes.append(f"masked-out regions are shown as seen, since the scene cannot be read: {e}")
         notes.append(f"images in {out / COVERAGE}: {LEGEND}")
     with contextlib.nullcontext() if named else writing_into(home):
         done = render_film(stored, plan, out, settings, coverage=training, sheet=sheet, tell=tell)

@@ -1,4 +1,4 @@
-"""Coverage of a run's held-out views: scores split by it, an image of each view, and the section of the report page."""
+"""Coverage of a run's held-out views: scores split by coverage, an image of each view, and the section of the report page."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from warpgs.scene import Gaussians, View
 FOLDER = "coverage"
 """Folder in a run folder with an image of each held-out view."""
 EXPECTED = (
-    "The expected PSNR is that between training photographs at points whose depths differ as much: an estimate from training "
-    "data, not a bound."
+    "The expected PSNR is the PSNR between training photographs at points with the same depth difference: an estimate from "
+    "training data, not a bound."
 )
 """Meaning of the expected PSNR, as text for the user."""
 
@@ -36,7 +36,7 @@ def coverage_of_run(
     names: Mapping[str, str],
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Split the scores of held-out views by coverage, and save an image of each.
+    """Split the scores of held-out views by coverage, and save an image of each view.
 
     Args:
         out: The run folder; None to write nothing.

@@ -97,7 +97,7 @@ def _maxima(stored: StoredRun) -> torch.Tensor:
 
 
 def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
-    """Return the rotation [3, 3] of a user's text; None for no rotation.
+    """Return the rotation [3, 3] that a user's text specifies; None for no rotation.
 
     Args:
         wish: Axis and angle as x,y,z,degrees; level; or None.

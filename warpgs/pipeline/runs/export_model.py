@@ -42,7 +42,7 @@ def convert(
     Args:
         source: The file to read; for cameras also a folder with a COLMAP reconstruction.
         target: The file to write; its suffix selects the format.
-        filters: Filters; cameras are rotated only.
+        filters: Filters; cameras are only rotated.
         formats: Formats that have priority for files with their suffix, as in `write_gaussians`.
 
     Raises:
@@ -77,7 +77,7 @@ def export(
     Args:
         folder: The run folder.
         target: The file to write; its suffix selects the format.
-        filters: Filters; cameras are rotated only.
+        filters: Filters; cameras are only rotated.
         format: Format to write, as in `write_gaussians`; None for the format of the suffix.
 
     Raises:

@@ -14,7 +14,7 @@ from warpgs.input_files import open_input, unread_reason
 from warpgs.pipeline.runs.checkpoint import safetensors_chunks
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.learned_views import LearnedViews
-from warpgs.pipeline.train.loss import term_values
+from warpgs.pipeline.train.loss import LOSS_TERMS, term_values
 from warpgs.pipeline.train.setup import terms_of
 from warpgs.pipeline.train.step import Forward, StepBuffers, StepPlan, eager_renderer, forward
 from warpgs.pipeline.train.trainer import Trainer
@@ -36,7 +36,7 @@ def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle
         trainer: The fit, in the state before the step.
         view: Index of the step's view.
         name: Name of the view.
-        slot: Index of the view among those of the step.
+        slot: Index of the view among the step's views.
     """
     number = trainer.step + 1
     plan = trainer.plan_of(number)
@@ -88,10 +88,17 @@ def read_failed_step(path: Path, device: torch.device) -> Bundle:
         raise DataError(f"{path}: not the inputs of a failed step ({e}); give the {FILE} of a run folder") from e
 
 
+def _known_terms(config: dict[str, Any]) -> tuple[list[Any], list[str]]:
+    """Return the stored loss terms whose classes are loaded, and the names of the others, which are code of the user."""
+    names = LOSS_TERMS.names()
+    known = [t for t in config["loss_terms"] if (LOSS_TERMS.knows(t["name"]) if ":" in t["name"] else t["name"] in names)]
+    return known, [t["name"] for t in config["loss_terms"] if t not in known]
+
+
 def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
     """Repeat the forward pass of a failed step; returns the step's plan, and the results."""
     tensors, plain = bundle
-    config = FitConfig.from_json(plain["config"])
+    config = FitConfig.from_json(plain["config"] | {"loss_terms": _known_terms(plain["config"])[0]})
     gaussians = Gaussians(**{n: tensors[f"params.{n}"].requires_grad_() for n in Gaussians.__dataclass_fields__})
     device, K = gaussians.means.device, tensors["K"][None]
 
@@ -115,10 +122,17 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
     return plan, forward(gaussians, learned, plain["dropout_seed"], views, buffers, plan, render)
 
 
+def broken_terms(bundle: Bundle) -> list[str]:
+    """Compute a failed step again; returns the names of the loaded loss terms with a non-finite value."""
+    plan, found = repeated(bundle)
+    values = term_values(plan.terms, found.inputs)
+    return [t.name for t, v in zip(plan.terms, values, strict=True) if not bool(torch.isfinite(v.detach()).all())]
+
+
 def findings(bundle: Bundle) -> list[str]:
     """Compute a failed step again; returns a line for every input and result, with its range or its non-finite values.
 
-    User-defined loss terms are computed if their modules are loaded. The strategy's loss terms are not computed.
+    Loss terms of the user are computed if their classes are loaded, and else named. The strategy's loss terms are not computed.
 
     Raises:
         DataError: A tensor or a value is missing or of another shape.
@@ -139,6 +153,8 @@ def findings(bundle: Bundle) -> list[str]:
             broken = [n for n, g in zip(params, of) if g is not None and not bool(torch.isfinite(g).all())]
             lines += [f"    gradient with respect to {n}: not finite" for n in broken]
         lines += [f"  view module {n}: {float(t.detach()):g}" for n, t in found.of_views.items()]
+        of_user = "not computed, because it is your own code, which this command does not load"
+        lines += [f"  loss term {n}: {of_user}" for n in _known_terms(plain["config"])[1]]
     except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as e:
         raise DataError(f"the stored step is incomplete ({e!r}); fit again to store it again") from e
     return lines

@@ -72,7 +72,7 @@ class FitResult(FittedModel):
     """A finished fit."""
 
     config: FitConfig
-    """All settings, including those chosen by the time budget."""
+    """All settings, including those that were chosen automatically."""
     metrics: dict[str, Any]
     """Scores, sizes and times, as in metrics.json."""
     notes: tuple[str, ...]
@@ -120,8 +120,8 @@ def fit(
         ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. Only the first
             prints, writes and scores; the others return a result without metrics.
         **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
-            ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` lists
-            them, and `warpgs fit --help-all`.
+            ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` and `warpgs
+            fit --help-all` list them.
 
     Raises:
         DataError: The file of a preset cannot be read.

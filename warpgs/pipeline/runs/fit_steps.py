@@ -10,13 +10,14 @@ from warpgs.errors import NotFiniteError
 from warpgs.pipeline.model.model_file import FittedModel
 from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
 from warpgs.pipeline.runs.failed_step import FILE as FAILED
-from warpgs.pipeline.runs.failed_step import failed_step, save_failed_step
+from warpgs.pipeline.runs.failed_step import broken_terms, failed_step, save_failed_step
 from warpgs.pipeline.runs.folder import camera_values
 from warpgs.pipeline.runs.job import FitJob
 from warpgs.pipeline.runs.learned_views import cameras_of, learned_cameras
 from warpgs.pipeline.train.loop import run
 from warpgs.pipeline.train.step_report import StepReport
 from warpgs.pipeline.train.trainer import Trainer
+from warpgs.plugins import is_ours
 from warpgs.report.events import EventLog
 from warpgs.report.progress import Progress
 from warpgs.runtime.stop_signals import noted_signals
@@ -39,7 +40,7 @@ class RunRecorder:
             self.log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
 
     def save(self, trainer: Trainer) -> None:
-        """Save the state as a checkpoint, after the log and the images before it."""
+        """Save the state as a checkpoint, after the log and the images of earlier steps are written."""
         job = self.job
         if job.out is None or self.log is None:
             return
@@ -70,7 +71,7 @@ class StepTeller:
     """Receiver of each step's report, for the terminal, the log and the caller."""
 
     def __init__(self, job: FitJob, trainer: Trainer, recorder: RunRecorder, progress: Progress | None):
-        """Start before the first step; ``progress`` is None for a fit that shows none."""
+        """Start before the first step; ``progress`` is None for a fit without a display of progress."""
         self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
         self.slow, self.compiled = -1, -1
         """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""
@@ -99,7 +100,7 @@ def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]
     """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
 
     Raises:
-        NotFiniteError: A loss or the state is not finite; with a run folder the state before is saved.
+        NotFiniteError: A loss or the state is not finite; with a run folder, the state before the step is saved.
         KeyboardInterrupt: A signal ended the fit; the state is saved.
     """
     recorder = RunRecorder(job, trainer.step, images_written)
@@ -123,11 +124,15 @@ def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteErr
     """Save the inputs of a step with a non-finite loss; returns the error for the user."""
     assert error.view is not None
     name = job.split.train[error.view]
-    save_failed_step(out / FAILED, failed_step(trainer, error.view, name, error.slot))
+    bundle = failed_step(trainer, error.view, name, error.slot)
+    save_failed_step(out / FAILED, bundle)
+    broken = broken_terms(bundle)
+    own = [t.name for t in trainer.terms if t.name in broken and not is_ours(type(t))]
+    where = f", in the loss term {' and '.join(broken)}" if broken else ""
+    mend = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
     return NotFiniteError(
-        f"{error}, on {name}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` names the non-finite values. --resume would fail at the same step; fit again into a new --out "
-        "with lower learning rates"
+        f"{error}, on {name}{where}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
+        f"{out / FAILED}` names the non-finite values. Continued, the fit would fail at the same step; {mend} into a new --out"
     )
 
 

@@ -1,4 +1,4 @@
-"""Cameras of a run's views after its view modules, and values of the modules for the report."""
+"""Cameras of a run's views as its view modules changed them, and values of the modules for the report."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def learned_cameras(scene: Scene, split: Split, learned: LearnedViews) -> Mappin
 
 
 def with_cameras(scene: Scene, cameras: Mapping[str, Camera]) -> Scene:
-    """Return a scene with the cameras of a mapping by name, for the views in it."""
+    """Return a scene in which the views named in a mapping have the mapping's cameras; other views are unchanged."""
     return replace(scene, views=tuple(replace(v, camera=cameras.get(v.name, v.camera)) for v in scene.views))
 
 

@@ -79,5 +79,5 @@ def _lines(found: FusedMesh, views: int) -> list[str]:
         "the mesh is open there"
     )
     if found.uncolored:
-        lines.append(f"{found.uncolored:,} vertices without an observed colour take that of the nearest vertex with one")
+        lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
     return lines

@@ -34,7 +34,7 @@ def open_file(
     Args:
         path: The file, in any format of `warpgs.export.formats`.
         cameras: cameras.json, transforms.json, a COLMAP reconstruction, or a scene folder of any format.
-        rule: Name of the cut-offs of its training: inria, gsplat-1.6 or another of `RULES`; None for inria.
+        rule: Name of the cut-offs that the model was trained with: inria, gsplat-1.6 or another of `RULES`; None for inria.
         device: auto, cpu or cuda.
         antialiased: True for a model that was trained with `RasterizeOptions.antialiased`, if its file does not declare it.
 

@@ -1,4 +1,4 @@
-"""Plots of a run: its cameras with its Gaussians or initial points, in their own colours or coloured by coverage."""
+"""Plots of a run: its cameras with its Gaussians or the reconstruction's points, in their own colours or by coverage."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ CAMERA_MODEL = "pinhole"
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
-    """Return a kernel of each module that a fit on such a device launches, with the block size of its launches.
+    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches.
 
     On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
     """

@@ -75,7 +75,7 @@ def prune(
     """Shrink a run's model so that the mean PSNR over its training views falls by no more than ``keep_psnr`` [dB].
 
     The new folder has config.json, a checkpoint with each Gaussian's own degree, and the PLY file; `warpgs eval`, `render` and
-    `export` accept it like the original run.
+    `export` accept the new folder like the original run.
 
     Args:
         folder: The run folder, which is not changed.

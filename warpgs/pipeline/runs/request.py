@@ -159,9 +159,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
             "folder idrmasks, or give them with --score-masks"
         )
     for test, train in coincident_views(scene, split):
-        notes.append(
-            f"{test} is held out, but training view {train} is at the same place, so the score is not that of a new view"
-        )
+        notes.append(f"{test} is held out, but training view {train} has the same pose, so its score is no test of new views")
     return split, notes
 
 

@@ -94,7 +94,7 @@ def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
             *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),
         ]
     else:
-        lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no view is held out, so there are no scores)"]
+        lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no score of new views: no view is held out)"]
     compiling = metrics["seconds"].get("compiling", 0.0)
     once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
     size = format_bytes(metrics["complexity"]["bytes"])
@@ -134,7 +134,7 @@ def evaluate_run(
 ) -> dict[str, Any]:
     """Score held-out and training views, and save a render and a depth map of each held-out view.
 
-    If no view is held out, the images are those of training views. LPIPS is measured only on held-out views.
+    If no view is held out, the images show training views. LPIPS is measured only on held-out views.
 
     Args:
         out: The run folder; None to write nothing.
@@ -143,7 +143,7 @@ def evaluate_run(
         test: Held-out views.
         options: Options of the rasterizer.
         lpips: Network for LPIPS, or None.
-        names: Names of image files by view, from `image_names` of the whole scene; None for those of these views.
+        names: Names of image files by view, from `image_names` of the whole scene; None to make names for these views only.
         tell: Called with a line for each view before it is rendered.
 
     Returns:
@@ -224,7 +224,8 @@ def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         held_out += [(LABELS[k], f"{metrics['test'][k]:.3f}") for k in alphas]
     return [
         *held_out,
-        ("training PSNR", f"{metrics['train']['psnr']:.2f} dB"), ("Gaussians", f"{metrics['gaussians']:,}"),
+        ("training PSNR" if held_out else "training PSNR: no score of new views", f"{metrics['train']['psnr']:.2f} dB"),
+        ("Gaussians", f"{metrics['gaussians']:,}"),
         ("model", format_bytes(metrics["complexity"]["bytes"])),
         ("steps", f"{metrics['steps']:,}"), ("time", duration(metrics["seconds"]["total"])),
     ]  # fmt: skip

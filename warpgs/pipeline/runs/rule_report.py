@@ -78,7 +78,7 @@ def rule_report_of(
     Returns:
         ``max``, ``mean`` and ``psnr`` [dB] (None if infinite) of the error of colours in [0, 1] over all parts; ``views`` by
         name with their windows; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``; and
-        ``summary``, the same as a sentence.
+        ``summary``, the same figures as a sentence.
     """
     generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]

@@ -31,13 +31,13 @@ SHOWN = 3
 SHEET_WIDTH = 1600
 """Largest width of an image on the report page [px]."""
 OPEN, CLOSED = (0.97, 0.97, 0.95), (0.17, 0.19, 0.22)
-"""Colours of pixels that the gate lets pass, and of the others."""
+"""Colours of pixels that pass the gate, and of all others."""
 FADED = 0.45
 """Contrast of the view's image behind the dots."""
 
 
 def shown_steps(phases: Phases) -> set[int]:
-    """Return the steps of the events that get an image: the first, and the first of the second half of phase 2."""
+    """Return the steps of the events that get an image: the first event, and the first event in the second half of phase 2."""
     middle = 0.5 * (phases.refine + phases.stable_start)
     late = [e for e in phases.events if e >= middle]
     return {*phases.events[:1], *late[:1]}

@@ -38,9 +38,9 @@ ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
     **{f"with {name}": {name: True} for name in SWITCHES},
     PAPER: None,
 }
-"""Switches that each row of the ablation changes in the preset. The rows: no change; pixels sampled uniformly, by the residual,
-then by one more score at a time; each part that is on switched off alone, and each that is off switched on. `PAPER` is a preset
-of its own. A row that equals an earlier one is left out."""
+"""Switches that each row of the ablation changes in the preset. The rows: no change; pixels sampled uniformly; by the residual;
+by the residual and one more score at a time; each enabled part switched off alone; each disabled part switched on alone.
+`PAPER` is a preset of its own. A row that equals an earlier one is left out."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
@@ -151,7 +151,7 @@ def _run_all(request: StudyRequest, places: list[Place], device: torch.device, l
         if record is None:
             say(f"[{len(runs) + 1}/{len(fits)}] {key[0]}, {key[1]}, seed {key[2]}")
         elif record.state == "failed":
-            runs[key] = Outcome("failed", None, f"failed: {record.message}")
+            runs[key] = Outcome("failed", None, record.message)
             continue
         resolved, _ = settings_by_views(fit.config, place.train, device.type)
         outcome = ensure_run(fit, place.fingerprint, place.split, device.type, lpips, resolved, verbose="progress")

@@ -55,9 +55,10 @@ def sample(values: Sequence[float]) -> Sample:
 
 
 def paired_difference(ours: Sequence[float], base: Sequence[float], confidence: float = CONFIDENCE) -> Difference:
-    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n), n - 1 degrees.
+    """Return Student's interval of the mean of ``ours - base`` over pairs (Student 1908): mean ± t s / sqrt(n).
 
-    Pairing removes the common effect of seed and scene, which is most of the spread between runs.
+    Here t is the quantile for n - 1 degrees of freedom. Pairing removes the common effect of seed and scene, which is most of
+    the spread between runs.
 
     Args:
         ours: Measurements.

@@ -196,6 +196,8 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
             notes.append(f"{v}: no result for {', '.join(lost)}; its means and paired differences exclude these seeds")
     if request.seeds < 2:
         notes.append("one seed gives no deviations and no intervals; run more seeds before you claim a difference")
+    elif request.seeds < 3:
+        notes.append("two seeds give wide, uncertain intervals; run at least three before you claim a difference")
     last = metrics[-1].key
     lacking = sum(math.isnan(_value(o, last)) for o in runs.values() if o.metrics)
     if last == "lpips":
@@ -208,7 +210,7 @@ def _notes(request: StudyRequest, runs: Runs, metrics: tuple[Metric, ...]) -> li
 
 
 def _protocols(runs: Runs) -> list[str]:
-    """Return the protocol of each scene, and the definition of each score, as Markdown lines."""
+    """Return the protocol of each scene, the steps of each variant, and the definition of each score, as Markdown lines."""
     lines, seen = [], set()
     variants: dict[str, str] = {}
     for (scene, _, _), outcome in runs.items():
@@ -221,7 +223,12 @@ def _protocols(runs: Runs) -> list[str]:
                 words.append(f"{p['score_masks']} views scored within object masks")
             lines.append(f"- {scene}: {'; '.join(words)}")
             variants |= outcome.metrics["variants"]
-    return [*lines, *(f"- {LABELS.get(k, k)}: {v}" for k, v in variants.items())]
+    steps: dict[str, set[int]] = {}
+    for (_, name, _), outcome in runs.items():
+        if outcome.metrics:
+            steps.setdefault(name, set()).add(outcome.metrics["steps"])
+    taken = [f"{name} {' or '.join(f'{n:,}' for n in sorted(of))}" for name, of in steps.items()]
+    return [*lines, f"- steps: {', '.join(taken)}", *(f"- {LABELS.get(k, k)}: {v}" for k, v in variants.items())]
 
 
 def _runs_csv(request: StudyRequest, runs: Runs) -> str:
@@ -263,7 +270,10 @@ def write_study(request: StudyRequest, runs: Runs, places: list[Place], device: 
     parts = [f"# {table.caption}", markdown(table)]
     if len(scenes) > 1:
         parts += [f"## {s}\n\n{markdown(_table(request, runs, [s], metrics, s))}" for s in scenes]
-    parts += ["## How it was scored\n\n" + "\n".join(_protocols(runs)), "## Notes\n\n" + "\n".join(f"- {n}" for n in notes)]
+    parts += [
+        "## How it was scored\n\n" + "\n".join([*_protocols(runs), f"- device: {device_name}"]),
+        "## Notes\n\n" + "\n".join(f"- {n}" for n in notes),
+    ]
     write_text(request.out / "table.md", "\n\n".join(p.strip() for p in parts) + "\n")
     write_text(request.out / "table.csv", csv_text(table))
     write_text(request.out / "table.tex", latex(table))

@@ -1,4 +1,4 @@
-"""Colour behind a scene: that of its files, the mean of its photographs, or one that the user names; and behind each step."""
+"""Colour behind a scene: from its files, the mean of its photographs, or the user's choice; and random colours behind steps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEVELS = 2**16 - 1
 
 
 def color_of(text: str) -> Color | None:
-    """Return the colour of a text; None for a colour that depends on the scene.
+    """Return the colour that a text names; None for a colour that depends on the scene.
 
     Args:
         text: auto, mean, scene, black, white, ``#rrggbb``, or three numbers in [0, 1] as ``r,g,b``.
@@ -102,7 +102,7 @@ def over_background(scene: Scene, color: Color) -> Scene:
 
 
 def over(image: torch.Tensor, alpha: torch.Tensor, shift: torch.Tensor) -> torch.Tensor:
-    """Return an image [H, W, 3] of opacity ``alpha`` [H, W] over another background, its own plus ``shift`` [3]."""
+    """Return an image [H, W, 3] of opacity ``alpha`` [H, W] over another background: its own background plus ``shift`` [3]."""
     return image + (1 - alpha)[..., None] * shift
 
 

@@ -1,4 +1,4 @@
-"""Steps of several views: each view has a slot for its gradients; these are averaged in a fixed order, for one update.
+"""Steps of several views: each view has a slot for its gradients, and one update uses their mean, added in a fixed order.
 
 Slots are distributed over the processes of a fit. Every process does the remaining work of a step, with the same bits. On CUDA
 several steps are taken before their results are read, so that Python prepares a step while the device works on the previous

@@ -49,7 +49,7 @@ class Blocks:
 
 
 def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list[Blocks]:
-    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; more than half of each is unmasked.
+    """Sample squares of a random grid in every view, about ``fraction`` of its pixels; each square is mostly unmasked.
 
     In small images the fraction is larger, see `MAX_FRACTION`.
     """
@@ -94,7 +94,7 @@ def only(view: TrainingView, blocks: Blocks) -> TrainingView:
 def block_errors(
     gaussians: Gaussians, views: list[TrainingView], blocks: list[Blocks], options: RasterizeOptions
 ) -> torch.Tensor:
-    """Return the mean squared error of every block over the pixels that count, float64 on the CPU, shape [B] over all views.
+    """Return the mean squared error of every block over its unmasked pixels, float64 on the CPU, shape [B] over all views.
 
     Args:
         gaussians: The model.

@@ -33,7 +33,7 @@ def run(
         trainer: The fit.
         on_step: Called after each step.
         save: Saves the state.
-        stopped: Whether to end after a step.
+        stopped: Returns whether to end after the current step.
         restore: Loads the last saved state; returns False without one.
 
     Raises:

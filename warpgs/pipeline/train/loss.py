@@ -25,7 +25,7 @@ class Target:
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None
-    """1 where a pixel counts, else 0, shape [H, W]; None if all pixels count."""
+    """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     maps: Mapping[str, torch.Tensor]
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
@@ -60,7 +60,7 @@ class LossInputs:
     """The Gaussians; differentiable."""
     camera: Camera
     """Camera of the view at the size of the images: ``viewmat`` [4, 4], camera_from_world [u], and ``K`` [3, 3] [px] are
-    tensors. Where poses are refined, the pose is that of the step and differentiable."""
+    tensors. If poses are refined, this is the refined pose of the step, and it is differentiable."""
     step: torch.Tensor
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
     for later steps; `LossTerm.active` has the number on the host."""

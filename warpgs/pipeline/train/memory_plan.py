@@ -81,11 +81,11 @@ class Layout:
         return max(self.step(count, count, chunked) for chunked in (False, True))
 
     def most_instances(self, count: int, limit: int) -> int:
-        """Return the instances that a step within a limit may have at a time, in a whole image or in a chunk of it."""
+        """Return the largest number of instances, in an image or in a chunk of one, at which a step stays within a limit."""
         return _largest(1, MAX_INSTANCES, lambda n: max(self.step(count, n, chunked) for chunked in (False, True)) <= limit)
 
     def largest_count(self, limit: int, start: int, most: int) -> int:
-        """Return the Gaussians, from ``start`` up to ``most``, that steps and density events can reach within a limit."""
+        """Return the largest number of Gaussians, ``start`` to ``most``, with which steps and density events fit a limit."""
 
         def fits(count: int) -> bool:
             events = max(self.event(before, count) for before in (count // 2, count))

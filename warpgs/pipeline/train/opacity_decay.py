@@ -20,7 +20,7 @@ def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, 
     Args:
         logits: Logits of opacities, float32, shape [N].
         fraction: Fraction by which an opacity is lowered, in [0, 1); 0 changes nothing.
-        going: Whether the step is taken, bool, shape [1]; where it is not, nothing changes.
+        going: Whether the step is taken, bool, shape [1]; if False, nothing changes.
         used: Gaussians whose opacities change, bool, shape [N]; None for all.
     """
     kept = 1 - fraction

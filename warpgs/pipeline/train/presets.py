@@ -121,7 +121,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
     found = load_object("preset", name)
     if not isinstance(found, (FitConfig, Mapping)):
         raise UsageError(f"the preset {name!r} is of type {type(found).__name__}; make it a FitConfig or a mapping of settings")
-    config, origin = preset_settings(found)
+    config, origin = preset_settings(found) if isinstance(found, FitConfig) else _config_of(found, name, 0)
     digest = module_digest(module_of(name.rpartition(":")[0]))
     return config, f"{name}{f' (SHA-256 {digest[:12]})' if digest else ''}, {origin}"
 
@@ -152,7 +152,7 @@ def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
 
 
 def preset_word(preset: str) -> str:
-    """Return a short name of a user's preset for folders and tables: its own name, or that of its file or object."""
+    """Return a short name of a user's preset for folders and tables: its own name, or the name of its file or object."""
     return Path(preset).stem if preset.endswith(SUFFIX) else preset.rpartition(":")[2]
 
 

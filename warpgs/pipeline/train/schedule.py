@@ -88,7 +88,7 @@ class OptimizerConfig:
 
     @property
     def head_lrs(self) -> dict[str, float]:
-        """Learning rate of the first 3 numbers of a row, for parameters in which it differs from that of the others."""
+        """Learning rate of the first 3 numbers of a row, for parameters in which the other numbers have another rate."""
         assert self.sh_lr is not None  # `settings_by_views` has chosen
         return {"sh": self.sh_lr}
 
@@ -113,9 +113,12 @@ class PhaseConfig:
 
     def __post_init__(self):
         if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
-            raise UsageError("phases: coarse, stable and growth must be at least 0 and finite")
+            raise UsageError(
+                "phases: `coarse`, `stable` and `growth` must be at least 0 and finite, not "
+                f"{self.coarse}, {self.stable} and {self.growth}"
+            )
         if not 1 <= self.every < math.inf or not 1 <= self.least < math.inf:
-            raise UsageError("phases: every and least must be at least 1 and finite")
+            raise UsageError(f"phases: `every` and `least` must be at least 1 and finite, not {self.every} and {self.least}")
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,7 @@ class Phases:
     events: tuple[int, ...]
     """Steps done when fine Gaussians are sampled, ascending; the first is ``refine``, or 1 if ``refine`` is 0."""
     planned: int
-    """Planned number of steps; learning rates up to phase 3 decay by this number."""
+    """Planned number of steps; it determines how fast learning rates decay up to phase 3."""
     steps: int
     """Number of steps; fewer than planned if phase 3 begins early."""
 
@@ -142,7 +145,7 @@ class Phases:
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
     def stable_from(self, step: int, planned_start: int) -> Phases:
-        """Return the phases if the third begins after ``step`` instead of its planned start; it is shortened in proportion."""
+        """Return the phases if the third begins after ``step`` instead of its planned start, and is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 

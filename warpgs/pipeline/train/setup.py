@@ -54,7 +54,7 @@ def prepare(
         points: The reconstruction's points, or None.
         config: Settings.
         generator: Generator of random points.
-        device: Device to sweep on, unless there is a memory limit, since the sweep may need more memory than a step.
+        device: Device to sweep on; with a memory limit the CPU sweeps, since a sweep may need more memory than a step.
         priors: Prior of each view; None to compute them where they are needed.
         ready: Called before the device is used, and in any case before the end.
         progress: Called with a line for the user about the current work.
@@ -162,8 +162,8 @@ def prepared_views(
 ) -> tuple[list[TrainingView], list[np.ndarray]]:
     """Return the training views on the device, with their scores and the maps of loss terms.
 
-    Also returns each view's disparity, relative inverse depth in [0, 1], shape [H, W], where sampled views have priors: only
-    images of events show it.
+    Also returns each view's disparity (relative inverse depth in [0, 1], shape [H, W]) if the strategy samples and the views
+    have priors; only images of sampling events show it.
 
     Raises:
         UsageError: Two loss terms need a map of the same name.

@@ -29,7 +29,7 @@ DIVIDED_BYTES = 2**26
 """Least size of a tensor whose rows are divided among processes [bytes]: updating a smaller tensor takes less time than
 two more exchanges need to begin."""
 MAX_RENDERS = 2**24
-"""Upper bound of the number of renders of a fit: each render takes its random numbers from its number, a float32."""
+"""Upper bound of the number of renders of a fit: the random numbers of a render depend on its index, a float32."""
 
 
 def check_ranks(batch: int, ranks: Ranks) -> None:
@@ -150,7 +150,7 @@ class SlotSums:
             tree: The tree.
             shapes: Shape of each tensor.
             device: Where sums are kept.
-            means: Number of tensors, the first ones, whose sums become means over the slots.
+            means: Number of leading tensors whose sums become means over the slots.
             large: Index of the tensor whose rows are divided if it has at least `DIVIDED_BYTES`; None for no such tensor.
         """
         self.tree, self.shapes = tree, [tuple(s) for s in shapes]
@@ -161,7 +161,7 @@ class SlotSums:
         self.starts = [starts[k] for k in range(len(counts))]
         """Offset of each tensor in a sum; the large tensor comes first."""
         self.divided = 0
-        """Number of rows of the large tensor, the first ones, that are divided; the last few are treated like other tensors."""
+        """Number of leading rows of the large tensor that are divided; the last few are treated like other tensors."""
         self._width = 1
         if large is not None and tree.ranks.count > 1 and FLOAT_BYTES * counts[large] >= DIVIDED_BYTES:
             rows = self.shapes[large][0]

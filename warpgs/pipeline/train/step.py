@@ -48,7 +48,7 @@ class StepPlan:
     degree: int
     """Spherical-harmonics degree in use."""
     half_size: bool
-    """True where views are half their size."""
+    """True if views have half their size."""
     terms: tuple[LossTerm, ...]
     """Loss terms, in the order in which they are summed."""
     phase: Hashable
@@ -85,7 +85,7 @@ class StepBuffers:
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
-        """Upload view rows, learning rates and settings (7 each) of the next steps, at most one for each row."""
+        """Upload view rows, learning rates and settings (7 each) of the next steps, of which there are at most ``rows``."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
@@ -165,7 +165,7 @@ class Learned:
     strategy: Strategy
     """Density strategy."""
     dropout_seed: int | None
-    """Seed of the opacity dropout; None for none."""
+    """Seed of the opacity dropout; None without dropout."""
     cameras: TrainingCameras
     """Training cameras, to which limits of sizes refer."""
 
@@ -205,7 +205,7 @@ class Forward:
 def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPlan, render: Renderer) -> None:
     """Take one training step: render the next view, compute the loss, update all parameters.
 
-    If the render overflows or the loss is not finite, nothing changes except ``buffers.stop``, which is set.
+    If the render overflows or the loss is not finite, no parameter changes, and ``buffers.stop`` is set.
 
     Args:
         learned: Tables and strategy that the step changes.
@@ -246,7 +246,7 @@ def forward(
     Args:
         gaussians: The Gaussians.
         learned: View modules with their parameters.
-        dropout_seed: Seed of the opacity dropout; None for none.
+        dropout_seed: Seed of the opacity dropout; None without dropout.
         views: Views of one kind.
         buffers: Settings of the steps.
         plan: Choices that the step is made of.

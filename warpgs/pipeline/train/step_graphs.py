@@ -108,7 +108,7 @@ class StepGraphs:
     def capture_all(
         self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
     ) -> list[CapturedGraph]:
-        """Return the graph of each of several steps of one plan, captured if necessary.
+        """Return a graph for each of several steps with the same plan; missing graphs are captured first.
 
         Args:
             kinds: Kind of each step's view.

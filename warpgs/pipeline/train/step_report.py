@@ -12,7 +12,7 @@ class StepReport:
     loss: float
     """Loss on the view of the step; with several views, the mean."""
     psnr: float
-    """PSNR on the view of the step before the update [dB]; with several views, that of their mean squared error."""
+    """PSNR on the view of the step before the update [dB]; with several views, the PSNR of their mean squared error."""
     count: int
     """Number of Gaussians after the step."""
     seconds: float

@@ -29,7 +29,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""The gain is measured since the last measurement at which the number of steps was smaller by at least this factor."""
+"""The gain is measured since the latest measurement at which the number of steps, times this factor, was at most the present
+number."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,7 @@ class Stopping:
         self.marks: list[int] = []
         """Steps done when the blocks are measured: when growth begins, and after each interval."""
         self.earliest = 0.0
-        """Number of steps, the first ones, in which views have half size and growth does not end."""
+        """Number of first steps, in which views have half size and growth does not end."""
         self.measured: list[tuple[int, torch.Tensor]] = []
         """For every measurement, the steps done and the errors of the blocks [B]."""
 
@@ -118,7 +119,7 @@ class Stopping:
         Args:
             context: Parts of the fit, with its views.
             strategy: Density strategy.
-            half_resolution: Fraction of the planned steps, the first ones, in which views have half size.
+            half_resolution: Fraction of the planned steps, from the first step on, in which views have half size.
         """
         assert self.config.min_gain_db is not None  # `settings_by_views` has chosen
         if self.config.min_gain_db == 0:

@@ -1,4 +1,4 @@
-"""The check of a stored state of a fit, before anything of it is used."""
+"""The check of a fit's stored state, before any part of the state is used."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping,
 def check_state(
     tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema
 ) -> None:
-    """Check the parts of a stored state that do not go by row; `Table.load` checks those that do.
+    """Check the parts of a stored state that are not rows of a table; `Table.load` checks the rows.
 
     Args:
         tensors: Tensors by name, of any shape [...].

@@ -56,7 +56,7 @@ class StepTaker:
         """Take the steps whose learning rates and settings the buffers hold.
 
         Args:
-            places: Kind and row of the view of each step, or of each slot of each step of several views.
+            places: Kind and row of each step's view; in steps of several views, of the view of each slot, step by step.
             settings: Returns the settings of each slot, step by step.
             stacks: Views by kind.
             plan: Choices that the steps are made of.

@@ -25,7 +25,7 @@ STEP, SETUP = 1.6, 11.0
 on a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px. On CUDA, where
 steps are captured but probes are not, a step takes less, so the prediction is an upper limit."""
 MIN_STEPS = 100
-"""Fewest steps chosen: fewer give no usable scene. `steps_by_views` returns the most."""
+"""Fewest steps that are chosen: fewer give no usable scene. `steps_by_views` gives the upper limit."""
 
 
 def probe_seconds(width: int, height: int, device: torch.device) -> float:

@@ -40,7 +40,7 @@ from warpgs.scene import Gaussians, PointCloud, Prior, View
 
 
 class Trainer:
-    """The state of one fit: everything that changes from step to step, and nothing else."""
+    """The state of one fit, and the operations that take its steps."""
 
     chosen: list[int] | None = None
     """Indices of the views of the steps in progress; None between steps."""
@@ -88,7 +88,7 @@ class Trainer:
         self.scene_background, self.background = background, torch.tensor(background, dtype=torch.float32, device=device)
         assert config.half_resolution is not None  # `settings_by_views` has chosen
         self.half_resolution = config.half_resolution
-        """Fraction of the planned steps, the first ones, in which views have half size."""
+        """Fraction of the planned steps, from the first step on, in which views have half size."""
         self.dropout = config.dropout * min(1.0, config.dropout_views / len(train))
         """Dropout probability at the last step."""
         self.cutout = any(v.alpha is not None and not v.alpha_estimated for v in train)  # then every view gets one

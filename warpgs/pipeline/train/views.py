@@ -28,7 +28,7 @@ class TrainingView:
     image: torch.Tensor
     """Colours in [0, 1], shape [H, W, 3]."""
     mask: torch.Tensor | None = None
-    """1 where a pixel counts, else 0, shape [H, W]; None if all pixels count."""
+    """1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask."""
     semantic: torch.Tensor | None = None
     """S_semantic in [0, 1], shape [H, W]; None for a view without a semantic score."""
     geometry: torch.Tensor | None = None
@@ -79,7 +79,7 @@ class TrainingView:
 
     @property
     def countable(self) -> torch.Tensor | None:
-        """Mask of the pixels that count and are opaque, 1 or 0, shape [H, W]; None for all pixels."""
+        """Mask of the unmasked, opaque pixels, 1 or 0, shape [H, W]; None for all pixels."""
         if self.alpha is None:
             return self.mask
         opaque = (self.alpha > OPAQUE).to(self.image.dtype)
@@ -124,7 +124,7 @@ def half_size_camera(c: Camera) -> Camera:
 def half_size(view: TrainingView) -> TrainingView:
     """Return the view with both sides halved, rounded down but to at least one pixel; without scores.
 
-    Colours, opacities and maps are means over the covered pixels; a pixel counts if all covered pixels count.
+    Colours, opacities and maps are means over the covered pixels; a pixel is masked if any covered pixel is masked.
     """
     camera = half_size_camera(view.camera)
     width, height = camera.width, camera.height
@@ -160,7 +160,7 @@ class ViewStack:
     images: Rows
     """Colours in [0, 1], shape [V, H, W, 3]."""
     masks: Rows | None
-    """1 where a pixel counts, else 0, shape [V, H, W]; None if all pixels count."""
+    """1 for unmasked pixels, 0 for masked ones, shape [V, H, W]; None without masks."""
     maps: Mapping[str, Rows]
     """Maps that loss terms requested, by name, each of shape [V, H, W, ...]."""
     numbers: torch.Tensor
@@ -284,7 +284,7 @@ def show_learned(
     Args:
         views: Training views.
         stacks: Their stacks by kind.
-        places: Kind and row of each in its stack; more may follow.
+        places: Kind and row of each view in its stack; further entries are ignored.
         learned: View modules with their parameters.
     """
     if not learned.modules:

@@ -22,7 +22,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.scene import Prior
 
 MIN_ALPHA = 0.5
-"""Opacity above which a pixel shows a surface, so that its depth counts."""
+"""Opacity above which a pixel shows a surface, so that its depth is compared."""
 DEPTH_MAPS = 8
 """Number of maps with one float per pixel that the depth term and its gradient hold at the loss."""
 NORMAL_MAPS = 26
@@ -32,13 +32,13 @@ NORMAL_MAPS = 26
 def inverse_depth_difference(
     depth: torch.Tensor, alpha: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 where no pixel counts.
+    """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 if no pixel is compared.
 
     Args:
         depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
         alpha: Rendered opacity, shape [H, W].
         target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: averaging pixels keeps the weighted means.
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
     """
     shown = ~(alpha <= MIN_ALPHA)  # True for a NaN, so that it reaches the loss
     shown = shown if mask is None else shown & (mask > 0)
@@ -83,12 +83,13 @@ class GivenDepthDifference(LossTerm):
 
 
 def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Compute the mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 where no pixel has both.
+    """Compute the mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 if no pixel has both.
 
     Args:
         normals: Unit normals, 0 for missing values, shape [H, W, 3].
-        target: Given normals, 0 for missing values, shape [H, W, 3]; normals averaged over pixels are shorter, and count less.
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
+        target: Given normals, 0 for missing values, shape [H, W, 3]; normals averaged over pixels are shorter, and have less
+            weight.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
     shown = shown if mask is None else shown & (mask > 0)
@@ -102,7 +103,7 @@ def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.T
 @register("given_normals")
 @dataclass(frozen=True)
 class GivenNormalsDifference(LossTerm):
-    """The weighted 1 - cos of the angle between given and rendered normals, 0 in views without; for pinholes."""
+    """The weighted 1 - cos of the angle between given and rendered normals, for pinholes; 0 in views without given normals."""
 
     needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
     weight: float = 0.03

@@ -30,7 +30,7 @@ class AlphaDifference(LossTerm):
         return {LOSS: 3 * FLOAT * sizes.pixels}
 
     def __call__(self, inputs: LossInputs) -> torch.Tensor:
-        """Compute ``weight`` times the mean absolute difference of opacities over the pixels that count, shape []."""
+        """Compute ``weight`` times the mean absolute difference of opacities over the unmasked pixels, shape []."""
         alpha, target = inputs.outputs["alpha"], inputs.target
         if target.alpha is None:
             return alpha.new_zeros(())

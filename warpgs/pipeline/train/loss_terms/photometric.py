@@ -16,7 +16,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
     """Return the weights [2] of the sums of 1 - SSIM and of absolute differences over ``count`` numbers.
 
-    They are cached for good, as CUDA graphs refer to their memory.
+    They stay cached, because CUDA graphs refer to their memory.
     """
     with torch.inference_mode(False):  # a first call may come in inference mode, whose tensors cannot be used in training
         return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
@@ -30,12 +30,12 @@ def photometric_loss(
     Args:
         rgb: Rendered colours, shape [H, W, 3].
         target: Photographed colours in [0, 1], shape [H, W, 3].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count. Masked pixels are black in the windows of
-            SSIM around unmasked pixels.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask. Masked pixels are black in the
+            windows of SSIM around unmasked pixels.
         ssim_weight: lambda, in [0, 1].
 
     Returns:
-        The loss, shape []; 0 where no pixel counts.
+        The loss, shape []; 0 if all pixels are masked.
     """
     pixels = target.shape[0] * target.shape[1]
     if mask is not None:

@@ -1,9 +1,9 @@
 """Smoothness of rendered depth, for few views: ambiguous depth becomes planar instead of fog.
 
-On a plane, inverse depth is a linear function of the pixel. So the term is the mean of |z/z' + z/z'' - 2|, with the depths z'
-and z'' of both neighbours of a pixel in its row, and the same in its column. It has no unit. Its weight is lower at edges of
-colour and at pixels with consistent depth. A bound allows depth to jump where colour does not
-(docs/decisions/024-smooth-depth.md).
+On a plane, inverse depth is a linear function of the pixel. So the term sums |z/z' + z/z'' - 2| over the pixels, with the
+depths z' and z'' of a pixel's two neighbours in its row, adds the same for its column, and divides by the number of pixels. It
+has no unit. Weights are lower at edges of colour and at pixels with consistent depth. A bound allows depth to jump where colour
+does not (docs/decisions/024-smooth-depth.md).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from warpgs.runtime.step_sizes import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.scene import Prior
 
 MIN_ALPHA = 0.3
-"""Opacity above which depth counts."""
+"""Opacity above which the depth of a pixel is used."""
 EDGE = 0.1
 """Difference of colour between the two neighbours, as mean over the channels, at which the weight falls to 1/e."""
 BOUND = 0.1
@@ -34,14 +34,17 @@ MAPS = 12
 def depth_roughness(
     depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """Compute the weighted mean of |z/z' + z/z'' - 2| over both axes, shape [].
+    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) over the number of pixels, shape [].
+
+    z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum has only
+    pixels that, like both neighbours, are unmasked and more opaque than `MIN_ALPHA`.
 
     Args:
         depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
         alpha: Rendered opacity, shape [H, W].
         image: Photographed colours in [0, 1], whose edges weaken the term, shape [H, W, 3].
         weight: Weights of the pixels, shape [H, W].
-        mask: 1 where a pixel counts, else 0, shape [H, W]; None if all pixels count.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
     """
     shown = ~(alpha <= MIN_ALPHA)  # True for a NaN, so that it reaches the loss
     shown = shown if mask is None else shown & (mask > 0)

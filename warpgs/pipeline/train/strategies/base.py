@@ -30,7 +30,8 @@ class Strategy:
     name: ClassVar[str] = ""
     """Name in the registry."""
     Config: ClassVar[type | None] = None
-    """Frozen dataclass of the strategy's settings; None for none. They become flags, grouped under the strategy's name."""
+    """Frozen dataclass of the strategy's settings; None without settings. They become flags, grouped under the strategy's
+    name."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
     """Schema (`warpgs.schema`) of the plain values that `state` returns; stored values are checked against it before `load`."""
 
@@ -38,7 +39,7 @@ class Strategy:
         """Keep the context, which the strategy works with; nothing is trained yet.
 
         Args:
-            context: Parts of the fit. Its table exists, without columns, its views do not: see `setup`.
+            context: Parts of the fit. The table exists, without columns; the views do not exist yet (see `setup`).
         """
         self.context = context
         self.config: Any = self.Config() if context.own is None and self.Config is not None else context.own
@@ -79,7 +80,7 @@ class Strategy:
         return None
 
     def regularisation(self, phase: Hashable, gaussians: Gaussians) -> torch.Tensor | None:
-        """Return a term that is added to the loss of every step, shape []; None for none.
+        """Return a term that is added to the loss of every step, shape []; None for no term.
 
         Args:
             phase: Result of `phase`.

@@ -13,7 +13,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Camera
 
 EVERY = 2
-"""Distance between pixels for which gains are computed [px]; pixels between repeat them, since a footprint is wider."""
+"""Distance between pixels for which gains are computed [px]; the pixels between repeat these gains, since a footprint is
+wider."""
 HIDDEN = 1.05
 """A point is hidden in a view if its depth exceeds the rendered depth by this factor."""
 
@@ -30,7 +31,7 @@ class Residual(NamedTuple):
 
 
 def residual_of(view: TrainingView, rgb: torch.Tensor, depth: torch.Tensor, footprint: float) -> Residual:
-    """Return the residual of a view; it is 0 at pixels that do not count.
+    """Return the residual of a view; it is 0 at masked and transparent pixels.
 
     Args:
         view: The view.
@@ -48,9 +49,9 @@ def residual_of(view: TrainingView, rgb: torch.Tensor, depth: torch.Tensor, foot
 def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residual]) -> torch.Tensor:
     """Return the gain of Gaussians: half the slope at which their opacity lowers the squared error of all views, shape [S].
 
-    A Gaussian of colour c, opacity o and footprint w in front of a colour C changes it to C + o w (c - C). The squared error to
-    I falls by 2 o sum w (I - C) . (c - C) to first order. The sum is c times the blurred residual, minus the blurred
-    (I - C) . C. It is added over all views in which the point is not hidden.
+    A Gaussian of colour c, opacity o and footprint w in front of a colour C changes C to C + o w (c - C). The squared error to
+    the image I falls by 2 o sum w (I - C) . (c - C) to first order. The sum is c times the blurred residual, minus the blurred
+    (I - C) . C. The gain adds the sums of all views in which the point is not hidden.
 
     Args:
         points: World points [u], shape [S, 3].

@@ -50,7 +50,10 @@ class DensityConfig:
 
     def __post_init__(self):
         if self.every < 1 or self.start < 0 or self.reset_every < 0:
-            raise UsageError("density: every must be at least 1, start and reset every at least 0")
+            raise UsageError(
+                "density: `every` must be at least 1, `start` and `reset-every` at least 0, not "
+                f"{self.every}, {self.start} and {self.reset_every}"
+            )
         for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
                 raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1")
@@ -215,7 +218,7 @@ class GradientGrowth:
             t.table.columns[name].zero_()
 
     def reset_opacities(self) -> None:
-        """Lower every opacity to at most that of a reset."""
+        """Lower every opacity to at most ``reset_opacity``."""
         self.context.table.reset_opacities(self.config.reset_opacity)
         self.was_reset = True
 

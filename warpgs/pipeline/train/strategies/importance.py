@@ -31,8 +31,8 @@ class ImportanceConfig:
     geometry: float = 0.4
     """Weight of the geometric score (paper, w3)."""
     residual: str = "length"
-    """Rendering residual: length (the paper), that of the colour difference in the view; or gain, the estimated decrease of the
-    squared error over all training views by a fine Gaussian at the pixel."""
+    """Rendering residual: length, the length of the colour difference in the view (the paper); or gain, the estimated decrease
+    of the squared error over all training views by a fine Gaussian at the pixel."""
     curvature: float = 0.5
     """Weight of the second derivatives in the geometric score (lambda_curv; the paper gives no value)."""
 
@@ -41,7 +41,7 @@ class ImportanceConfig:
             raise UsageError(f"importance residual {self.residual!r} is not one of length, gain")
         for name in ("render", "semantic", "geometry", "curvature"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"importance {name} must be at least 0 and finite, not {getattr(self, name)}")
+                raise UsageError(f"importance weight `{name}` must be at least 0 and finite, not {getattr(self, name)}")
 
 
 def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
@@ -87,7 +87,7 @@ def geometry_score(disparity: torch.Tensor, curvature: float, valid: torch.Tenso
     Args:
         disparity: Relative inverse depth, shape [H, W].
         curvature: Weight of the second derivatives.
-        valid: Pixels that set the range, bool, shape [H, W]; None for all.
+        valid: Pixels that determine the range, bool, shape [H, W]; None for all.
 
     Returns:
         Score in [0, 1], shape [H, W].

@@ -59,7 +59,7 @@ class ImportanceSampling(Strategy):
         """Function that is called with the step and the event after each event."""
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes that an event keeps for each view: image, three scores and their sum."""
+        """Return the bytes that an event keeps for its views: render, three scores and their sum."""
         return {SAMPLING: 7 * FLOAT * sizes.pixels * min(sizes.views, MAX_VIEWS)} if self.method.events else {}
 
     def columns(self) -> Mapping[str, Column]:
@@ -93,11 +93,11 @@ class ImportanceSampling(Strategy):
         return step - self.context.table.columns["created_step"] <= self.method.protect.steps
 
     def is_layered(self, step: int) -> bool:
-        """Return whether only the fine layer grows and the coarse layer moves slowly: from phase 2 on."""
+        """Return whether only the fine layer grows and the coarse layer moves slowly: with two layers, from phase 2 on."""
         return bool(self.method.hier) and self.method.events and step > self.context.phases.refine
 
     def growth(self) -> Growth:
-        """Return the times of refinement and sampling; right after an event PSNR is up to 3 dB lower."""
+        """Return the times of refinement and sampling; events are listed, since they lower PSNR by up to 3 dB for a while."""
         times, phases = self.gradients.times, self.context.phases
         return Growth(phases.refine, times.until, phases.events) if self.method.events else Growth(times.after, times.until)
 
@@ -106,7 +106,7 @@ class ImportanceSampling(Strategy):
         return self.gradients.gathers(step), self.is_layered(step)
 
     def lr_factors(self, phase):
-        """Return ``method.coarse_lr_factor`` for the coarse layer and 1 for the fine one, shape [N]; None before phase 2."""
+        """Return ``method.coarse_lr_factor`` for the coarse layer and 1 for the fine one, shape [N]; None if all are 1."""
         if not phase[1]:
             return None
         return torch.where(self.fine, 1.0, self.method.coarse_lr_factor)
@@ -141,9 +141,9 @@ class ImportanceSampling(Strategy):
         return keep_contributors(t.gaussians, count, views, t.render_options())
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Refine, then sample, if either is due.
+        """Refine, reset opacities, sample and shrink the set, each if it is due.
 
-        From phase 2 on only the fine layer grows, and protected Gaussians are not pruned.
+        With two layers, only the fine layer grows from phase 2 on. Protected Gaussians are not pruned.
         """
         if self.gradients.refines(step):
             growing = self.fine if self.is_layered(step) else None

@@ -24,13 +24,14 @@ from warpgs.runtime import interop
 from warpgs.scene import Gaussians
 
 MAX_COPIES = 51
-"""Largest number of Gaussians that replace one at an event, as in the authors' program."""
+"""Largest number of Gaussians that replace one Gaussian at an event, as in the authors' program."""
 MAX_OPACITY = 1 - 2**-24
 """Largest opacity in relocation; it is below 1, so that the logit is finite."""
 NOISE_STREAM = 0x6D636D63
 """Constant mixed into the seed, so that noise and opacity dropout use different random numbers."""
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
-"""Perturbation fades above this opacity: sigmoid(-slope (opacity - this)), eq. 8 with k = 100 and t = 0.995 of 1 - opacity."""
+"""Perturbation fades above the opacity `GATE_OPACITY`: sigmoid(-slope (opacity - `GATE_OPACITY`)), eq. 8 with k = 100 and t =
+0.995 of 1 - opacity."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ class MCMCConfig:
 
     def __post_init__(self):
         if self.start < 0 or self.every < 1:
-            raise UsageError("mcmc: start must be at least 0 and every at least 1")
+            raise UsageError(f"mcmc: `start` must be at least 0, not {self.start}, and `every` at least 1, not {self.every}")
         for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
             if not 0 <= getattr(self, name) <= top:
                 raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and {top}")
@@ -69,8 +70,9 @@ class MCMCConfig:
 def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return opacity and scale factor of each of N Gaussians that replace one Gaussian in one place (eq. 9).
 
-    The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians are together as opaque at the centre. The scales shrink such
-    that the integral over a line through the centre is unchanged. It is computed in float64, since the sum alternates.
+    The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians together are as opaque at the centre as the one. The scales
+    shrink such that the integral over a line through the centre is unchanged. Both are computed in float64, since the sum
+    alternates.
 
     Args:
         opacities: o of the one Gaussian, in (0, 1), shape [M].
@@ -121,7 +123,7 @@ def make_kernel() -> wp.Kernel:
 def perturb(
     gaussians: Gaussians, settings: torch.Tensor, going: torch.Tensor, *, seed: int, noise_lr: float
 ) -> None:  # fmt: skip
-    """Add noise with each Gaussian's own covariance to its mean, in place; more opaque Gaussians get less noise (eq. 8).
+    """Add noise, multiplied by each Gaussian's covariance, to its mean, in place; opaque Gaussians get less noise (eq. 8).
 
     The noise depends only on seed, step and row, so it is the same on every device and in a resumed fit.
 

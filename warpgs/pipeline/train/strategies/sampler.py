@@ -1,4 +1,4 @@
-"""Sampling of pixels for fine Gaussians, and initial values of these (paper, section "Geometric-Aware Sampling")."""
+"""Sampling of pixels for fine Gaussians, and their initial values (paper, section "Geometric-Aware Sampling")."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SamplerConfig:
 
     depth: str = "rendered"
     """Depth of new Gaussians: rendered (the paper), or consistent, the initial depth that other views confirm. With consistent,
-    the gate lets only pixels with such depth pass, in views that have some."""
+    and with the reliability gate on, only pixels with such depth are sampled, in views that have some."""
     fraction: float = 0.005
     """Gaussians per event and view, as a fraction of the view's pixels."""
     gate_quantile: float = 0.6
@@ -43,18 +43,24 @@ class SamplerConfig:
         if self.depth not in ("rendered", "consistent"):
             raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, consistent")
         if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
-            raise UsageError("sampler: fraction must be in (0, 1], gate quantile and min alpha in [0, 1)")
+            raise UsageError(
+                "sampler: `fraction` must be in (0, 1], `gate-quantile` and `min-alpha` in [0, 1), not "
+                f"{self.fraction}, {self.gate_quantile} and {self.min_alpha}"
+            )
         if (
             not 0 < self.opacity < 1
             or not 0 < self.footprint < math.inf
             or self.border < 0
             or not 0 <= self.max_fraction < math.inf
         ):
-            raise UsageError("sampler: opacity must be in (0, 1), footprint above 0, border and max fraction at 0 or above")
+            raise UsageError(
+                "sampler: `opacity` must be in (0, 1), `footprint` above 0, `border` and `max-fraction` at least 0, not "
+                f"{self.opacity}, {self.footprint}, {self.border} and {self.max_fraction}"
+            )
 
 
 def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | None, config: SamplerConfig) -> torch.Tensor:
-    """Return the pixels with enough opacity and finite depth, away from the border and not masked out; all maps are [H, W]."""
+    """Return the unmasked pixels with enough opacity and positive, finite depth, away from the border; all maps are [H, W]."""
     valid = (alpha > config.min_alpha) & torch.isfinite(depth) & (depth > 0)
     if mask is not None:
         valid &= mask > 0
@@ -65,7 +71,7 @@ def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | 
 
 
 def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, wanted: int) -> tuple[torch.Tensor, float]:
-    """Return M_reliable, the valid pixels whose geometric score is above its quantile over the valid ones, and that quantile.
+    """Return M_reliable: the valid pixels whose geometric score is above a quantile of the valid pixels; and the quantile used.
 
     Args:
         geometry: S_geometry, shape [H, W].
@@ -125,7 +131,7 @@ def fine_gaussians(
         depth: z-depth [u], shape [H, W].
         at: Rows and columns, shape [S, 2].
         config: Opacity and footprint.
-        coefficients: Spherical-harmonics coefficients a channel.
+        coefficients: Spherical-harmonics coefficients per channel.
 
     Returns:
         Rows of the five tensors of `Gaussians`, shape [S, ...] each.

@@ -34,7 +34,7 @@ from warpgs.scene import Gaussians, Prior, ViewDepth
 FINE = 1
 """Layer of sampled Gaussians."""
 MAX_VIEWS = 8
-"""Largest number of views in which one event samples; of more views, a random choice."""
+"""Largest number of views in which one event samples; of more views, a random subset is taken."""
 MAX_WEIGHED = 32
 """Largest number of views over which blending weights are summed to choose Gaussians for eviction."""
 
@@ -51,7 +51,7 @@ class ProtectConfig:
 
     def __post_init__(self):
         if self.steps < 0 or not 0 < self.opacity < 1:
-            raise UsageError("protect: steps must be at least 0 and opacity lie in (0, 1)")
+            raise UsageError(f"protect: `steps` must be at least 0, `opacity` in (0, 1), not {self.steps} and {self.opacity}")
 
     @property
     def logit(self) -> float:
@@ -201,7 +201,7 @@ def sample_view(
         rendered: The view before the event.
         residuals: Residuals of all views of the event, to compute gains; empty if the residual is a length.
         config: Switches and settings.
-        coefficients: Spherical-harmonics coefficients a channel.
+        coefficients: Spherical-harmonics coefficients per channel.
         generator: CPU generator, the same numbers on every device.
     """
     c, (rgb, _, depth, valid) = config.sampler, rendered
@@ -285,8 +285,8 @@ def sampling_event(
 ) -> Event:
     """Sample fine Gaussians by the importance of the pixels of the training views.
 
-    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer), its unprotected Gaussians that
-    contribute least to the training views are evicted. New Gaussians beyond the limit are not added.
+    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer) or the set its capacity, the unprotected
+    fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond the limit are not added.
 
     Args:
         gaussians: The current set, N rows.

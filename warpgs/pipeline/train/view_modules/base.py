@@ -15,7 +15,8 @@ from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 
 CAMERA_BYTES = 4 * (16 + 9)
-"""Bytes per Gaussian if cameras are learned: its gradient of view matrix and intrinsics, until these are summed."""
+"""Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before these are
+summed."""
 Tensors = Mapping[str, torch.Tensor]
 """Parameters of views, or values computed from them, by name."""
 

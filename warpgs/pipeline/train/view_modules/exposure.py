@@ -1,4 +1,4 @@
-"""Exposure of training views: an affine map of the rendered colours of each, learned with the Gaussians.
+"""Exposure of training views: an affine map of rendered colours for each view, learned with the Gaussians.
 
 A camera with automatic exposure and white balance changes the colours between photographs. With exposures a step compares the
 view's image with A rgb + b of its render. The learned parameters are the 12 numbers of [A - 1 | b], which start at zero. A step
@@ -32,7 +32,7 @@ GRAY = 0.5
 
 
 def exposure_of(rows: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
-    """Return the exposure [..., 12] of views with parameters ``own`` [..., 12], among those of all views ``rows`` [V, 12].
+    """Return the exposure [..., 12] of views: their parameters ``own`` [..., 12] minus the mean of all views' ``rows`` [V, 12].
 
     No gradient flows through the mean: only the rows of ``own`` get one.
     """

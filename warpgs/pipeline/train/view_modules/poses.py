@@ -2,8 +2,8 @@
 
 A training view i > 0 is rendered from T_i viewmat_i, where T_i rotates by w_i about the camera's centre and moves by
 t_i in the camera's axes. The first camera stays fixed, so that the scene as a whole cannot rotate or drift. Its scale remains
-free, but does not change any image. The rotation is Cayley's map of w / 2, of angle 2 atan(|w| / 2): for small w that of
-exp(w), without a case for w = 0, and with the same bits on every processor.
+free, but does not change any image. The rotation is Cayley's map of w / 2; its angle is 2 atan(|w| / 2). For small w it is
+close to exp(w). It needs no special case for w = 0, and has the same bits on every processor.
 
 A focal length that is not known exactly can be learned too: fx and fy of every view of one camera are multiplied by
 s = (2 + z) / (2 - z), which is exp(z) to second order and positive for |z| < 2. Views with the same intrinsics and size count
