@@ -83,7 +83,7 @@ def test_a_name_without_a_colon_is_loaded_as_it_is_found(registry):
     [
         ("{own}:Other", "is not a strategy: it must be a class that derives from warpgs.Strategy"),
         ("{own}:number", "is not a strategy"),
-        ("{own}:Missing", "is not there: .* has no Missing"),
+        ("{own}:Missing", "does not exist: .* does not define Missing"),
         ("{own}x.py:Own", "cannot be imported .*there is no file"),
         ("no_such_module_of_anyone:Own", "cannot be imported .*path/to/file.py:Own"),
         ("{own.parent}/folder.py:Own", "cannot be imported"),

@@ -1,4 +1,4 @@
-"""Colours as coefficients of spherical harmonics: a Gaussian's colour without its changes by direction."""
+"""Colours as spherical-harmonics coefficients of degree 0: the part of a Gaussian's colour that all directions share."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ C0 = 0.28209479177387814
 
 
 def base_colors(sh: np.ndarray | torch.Tensor) -> np.ndarray | torch.Tensor:
-    """Return the colours [N, 3], not clipped, that coefficients [N, K, 3] have without the harmonics above degree 0."""
+    """Return the colours [N, 3], not clipped, that the degree-0 terms of coefficients [N, K, 3] give."""
     return 0.5 + C0 * sh[:, 0]
 
 
 def base_coefficients(colors: np.ndarray | torch.Tensor) -> np.ndarray | torch.Tensor:
-    """Return the coefficients of degree 0, of the shape [..., 3] of ``colors``, that give these colours."""
+    """Return the degree-0 coefficients that give colours [..., 3], in the same shape."""
     return (colors - 0.5) / C0

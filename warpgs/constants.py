@@ -20,25 +20,25 @@ ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
 
 LOW_PASS = 0.3
-"""Variance added to both image axes [px^2]: about the box filter of one pixel (1/12) plus margin against aliasing."""
+"""Variance added to both image axes [px^2]: the variance 1/12 of a pixel's box filter, plus a margin against aliasing."""
 
 TILE_SIZE = 16
 """Default side of a tile [px], also in fits."""
 
 K_TOLERANCE = 1e-5
-"""Largest error of the fixed entries of K. It moves the pixels of an image of 2000 px by 0.02 px."""
+"""Largest error of the fixed entries of K. Such an error moves the pixels of an image of 2000 px by 0.02 px."""
 
 POSE_TOLERANCE = 1e-3
-"""Largest entry of R R^T - 1 of a pose, and largest error of its last row, that counts as rounding. The product of a
-thousand rotations in float32 is off by at most 1000 x 3 x 2^-23 = 4e-4; within the tolerance lengths are off by 0.05 %."""
+"""Largest rounding error of a pose: of an entry of R R^T - 1, and of its last row. The product of a thousand rotations in
+float32 is off by at most 1000 x 3 x 2^-23 = 4e-4. An error as large as the tolerance changes lengths by 0.05 %."""
 
 NEAR = 0.01
 """Nearest depth that is rendered [u]."""
 
 FAR = 1e10
-"""Farthest depth that is rendered [u]. This and the next five limits are far beyond any usual scene, and narrow enough that no
-product in the backward pass overflows float32 (docs/extremes.md): every rendered Gaussian has finite gradients, and float64
-renders the same ones."""
+"""Farthest depth that is rendered [u]. This limit, the next four and `LARGEST_COEFFICIENT` are far beyond any usual scene. They
+are narrow enough that no product in the backward pass overflows float32 (docs/extremes.md). So every rendered Gaussian has
+finite gradients, and float64 renders the same Gaussians."""
 
 FARTHEST_PIXEL = 1e9
 """Largest coordinate of a projected mean [px]. Beyond it, neighbouring floats are 64 px and more apart."""
@@ -47,29 +47,29 @@ LARGEST_AXIS = 1e30
 """Largest component of a projected axis [px]."""
 
 SMALLEST_DETERMINANT = 1e-36
-"""Smallest determinant of a scaled-down covariance, and smallest of its entries (docs/project.md, section 4)."""
+"""Smallest determinant, and smallest yy entry, of a scaled-down projected covariance (docs/project.md, section 4)."""
 
 SHORTEST_QUAT = 1e-15
-"""Length of the shortest quaternion that gives a rotation; the longest has 1 / SHORTEST_QUAT. Its gradient is divided by its
-length."""
+"""Length of the shortest quaternion that gives a rotation; the longest has 1 / SHORTEST_QUAT. The gradient of a quaternion is
+divided by its length."""
 
 COVARIANCE_TOLERANCE = 1e-5
 """Largest negative eigenvalue of a covariance that counts as 0, as a fraction of its largest variance: 80 roundings of float32.
-A covariance with a lower one is culled."""
+A Gaussian with a lower eigenvalue is culled."""
 
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""
 
 SMALLEST_WEIGHT = 1e-20
-"""Smallest sum of blending weights of a pixel that has a depth. The gradient of depth is divided by the sum, and multiplied by
-depths up to `FAR`: 1e30, within float32. Smaller sums occur only with an alpha cut of 0."""
+"""Smallest sum of blending weights at which a pixel has a depth. The gradient of depth is multiplied by depths up to `FAR` and
+divided by this sum: the factor is at most 1e30, within float32. Smaller sums occur only with an alpha cut of 0."""
 
 FRUSTUM_MARGIN = 0.15
 """Margin around the image, as a fraction of its size on every side. The Jacobian is taken at the projected mean, clamped to the
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 RIM_SAMPLES = 16
-"""Number of points between the axis and a position, inclusive, at which a lens must not fold back."""
+"""Number of points on the way from the axis to a position at which a lens must not fold back; the last is the position."""
 
 
 @document_fields
@@ -102,7 +102,7 @@ class Rule:
     ceil(square_sigma * longest axis) touches, as in the first 3DGS renderer."""
 
     def __post_init__(self) -> None:
-        """Check types and ranges; those of ``near`` and ``far`` are checked where they are used.
+        """Check types and ranges; the ranges of ``near`` and ``far`` are checked where they are used.
 
         Raises:
             UsageError: A cut-off is not a number, or is outside its range.

@@ -1,8 +1,8 @@
 """The two systems of units that Gaussians and cameras come in, and the similarity between them.
 
 ``scene`` units [u] are those of a `Scene` that `load_scene` returned: recentred and rescaled, as the fit sees it. ``file``
-units are those of the scene's own files, which PLY files of a run keep. `Normalization` holds the similarity that leads from
-the second to the first: ``x_scene = scale * (x_file - offset)``.
+units are those of the scene's own files; PLY files of a run use them, too. `Normalization` holds the similarity from file to
+scene units: ``x_scene = scale * (x_file - offset)``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def check_units(units: str) -> None:
 
 
 def checked_normalization(normalization: Normalization | None, units: str, where: str) -> Normalization:
-    """Return the normalization that goes with Gaussians in ``units``: for file units without one, the identity.
+    """Check and return ``normalization``; with file units, None becomes the identity.
 
     Args:
         normalization: Similarity from file to scene units, or None.
@@ -136,7 +136,7 @@ def convert_camera(camera: Camera, normalization: Normalization, source: str, ta
     """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not.
 
     Args:
-        camera: Numpy arrays or torch tensors.
+        camera: One camera or a batch, with numpy arrays or torch tensors.
         normalization: Similarity from file to scene units.
         source: Units of the input: scene or file.
         target: Units of the result: scene or file.

@@ -46,6 +46,6 @@ class OutOfMemoryError(ResourceError):
     """A step of a fit that needed more memory than the device had."""
 
     def __init__(self, message: str, intact: bool):
-        """Take a message, and whether the state of the fit is still that before the step."""
+        """Take a message, and whether the fit's state is ``intact``: unchanged by the step."""
         super().__init__(message)
         self.intact = intact

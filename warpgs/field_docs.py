@@ -1,4 +1,4 @@
-"""The docstrings of the fields of a dataclass, which Python itself does not keep."""
+"""Docstrings of dataclass fields, which Python itself does not keep."""
 
 import ast
 import dataclasses
@@ -10,11 +10,11 @@ from typing import TypeVar
 Kind = TypeVar("Kind", bound=type)
 
 HELP_WIDTH = 76
-"""Width of a line, to which ``help`` adds a margin of four letters."""
+"""Width of a line, to which ``help`` adds a margin of four characters."""
 
 
 def field_docs(kind: type) -> dict[str, str]:
-    """Return the docstrings of the fields of a dataclass by name, each on one line; those of its bases included."""
+    """Return the docstrings of a dataclass's fields by name, each on one line, including the fields of its bases."""
     docs: dict[str, str] = {}
     for cls in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(cls):
@@ -32,7 +32,7 @@ def field_docs(kind: type) -> dict[str, str]:
 
 
 def document_fields(kind: Kind) -> Kind:
-    """Add the docstrings of a dataclass's fields to its own, so that ``help`` shows them; returns the class."""
+    """Add the docstrings of a dataclass's fields to the docstring of the class, for ``help``; return the class."""
     wrap = textwrap.TextWrapper(HELP_WIDTH, initial_indent="    ", subsequent_indent=" " * 8, break_on_hyphens=False)
     lines = [wrap.fill(f"{name}: {text}") for name, text in field_docs(kind).items()]
     kind.__doc__ = "\n".join([f"{inspect.cleandoc(kind.__doc__ or '')}\n", "Attributes:", *lines])

@@ -36,10 +36,10 @@ DESCRIPTORS = Path("/proc/self/fd")
 def replacing(
     path: Path, check: Callable[[Path], object] | None = None, *, size: int | None = None, suffix: str = ""
 ) -> Iterator[Path]:
-    """Give the path of a temporary file beside ``path``; once the block has written it, it takes the place of ``path``.
+    """Give the path of a temporary file beside ``path``; the block writes the file, which then replaces ``path``.
 
-    The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error, also one of the
-    block, the temporary file is removed and an old file stays unchanged. Where ``path`` is a link, the link is replaced.
+    The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error, including one in
+    the block, the temporary file is removed and an old file stays unchanged. If ``path`` is a link, the link is replaced.
 
     Args:
         path: File to write or to replace.
@@ -57,7 +57,7 @@ def replacing(
 
 @contextlib.contextmanager
 def writing(path: Path, size: int | None = None) -> Iterator[BinaryIO]:
-    """Give a file to write to; at the end of the block it takes the place of ``path``, as `replacing` does it."""
+    """Give a temporary file to write to; at the end of the block it replaces ``path``, as in `replacing`."""
     with _replaced(path, size) as (temporary, _), open(temporary.descriptor, "wb", closefd=False) as file:
         yield file
 
@@ -99,10 +99,10 @@ def _reachable(folder: Folder) -> Path:
 
 @contextlib.contextmanager
 def filling(folder: Path) -> Iterator[Path]:
-    """Give the path of a temporary folder beside ``folder``; once the block has filled it, it becomes that folder, whole.
+    """Give the path of a temporary folder beside ``folder``; the block fills it, and then it is renamed to ``folder``.
 
-    The temporary folder is locked during the block, and removed on any error, also one of the block. Left-overs of killed
-    writers beside it are removed.
+    The temporary folder is locked during the block, and removed on any error, including one in the block. Leftovers of killed
+    processes beside it are removed.
 
     Args:
         folder: Folder to make; it may exist if it is empty.
@@ -193,12 +193,12 @@ def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a text file (UTF-8) as `write_bytes` does; bytes of names that are not text are `readable` in it."""
+    """Replace a text file (UTF-8) as `write_bytes` does; undecodable bytes of file names are escaped by `readable`."""
     write_bytes(path, readable(text).encode())
 
 
 def readable(text: str) -> str:
-    r"""Return text with the bytes of names that are not UTF-8, and halves of characters, as codes: ``b\xe4r``."""
+    r"""Return text in which undecodable bytes of file names, and lone surrogates, are escaped: ``b\xe4r``."""
     escaped = UNDECODABLE.sub(lambda byte: f"\\x{ord(byte[0]) - 0xDC00:02x}", text)
     return escaped.encode("utf-8", "backslashreplace").decode()
 
@@ -272,7 +272,7 @@ def move_folder(folder: Path, name: str) -> Path:
 
 
 def make_folder(folder: Path) -> bool:
-    """Make a folder, and those above it, where it is missing; return whether it was made.
+    """Make a folder and its missing parents; return False if the folder existed.
 
     Raises:
         ResourceError: The folder cannot be created, or is behind a link that is not followed.
@@ -295,7 +295,7 @@ def make_folder(folder: Path) -> bool:
 
 @contextlib.contextmanager
 def writing_into(folder: Path) -> Iterator[bool]:
-    """Make a folder if it is missing, and follow no link below it in this block; yields whether it was made.
+    """Make a folder if it is missing, and follow no link below it in this block; yield whether it was missing.
 
     Raises:
         ResourceError: The folder cannot be created or opened, or is behind a link that is not followed.
@@ -324,7 +324,7 @@ def is_empty(folder: Path) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders of writers that were killed; those that a process holds stay.
+    """Remove temporary files and folders of killed processes; those that a running process has locked stay.
 
     Raises:
         ResourceError: The folder is a link that is not followed.

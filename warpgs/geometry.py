@@ -42,7 +42,7 @@ def rotation_matrices(quats: np.ndarray | torch.Tensor) -> np.ndarray | torch.Te
 
 
 def quaternions(rotations: torch.Tensor) -> torch.Tensor:
-    """Return unit quaternions wxyz [N, 4] of rotations [N, 3, 3], from their largest component, so that nothing cancels."""
+    """Return unit quaternions wxyz [N, 4] of rotations [N, 3, 3], computed from the largest component to avoid cancellation."""
     import torch
 
     m = rotations
@@ -72,7 +72,7 @@ def check_pinhole(camera: Camera) -> None:
 
 
 def pinhole_of(camera: Camera) -> Camera:
-    """Return the pinhole of the same pose, K and size, which renders without distortion; it sees less than a wide fisheye.
+    """Return a pinhole camera with the same pose, K and size, and no distortion; it sees less than a wide fisheye.
 
     Raises:
         UsageError: The camera is orthographic, or its model is only supported by the kernels.
@@ -83,7 +83,7 @@ def pinhole_of(camera: Camera) -> Camera:
 
 
 def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a [..., J] times b [J] or [J, K], the same bits on every x86-64 processor.
+    """Return a [..., J] times b [J] or [J, K], with the same bits on every x86-64 processor.
 
     ``@`` calls BLAS; its kernels, and so the order of sums, depend on the processor.
     """
@@ -91,19 +91,19 @@ def matmul(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def cofactors(m: np.ndarray) -> np.ndarray:
-    """Return the cofactor matrix of m [3, 3]: that of a rotation is the rotation itself."""
+    """Return the cofactor matrix of m [3, 3]; the cofactor matrix of a rotation is the rotation itself."""
     a, b = m[[1, 2, 0]], m[[2, 0, 1]]  # row i is the cross product of the two others
     return a[:, [1, 2, 0]] * b[:, [2, 0, 1]] - a[:, [2, 0, 1]] * b[:, [1, 2, 0]]
 
 
 def inverse(m: np.ndarray) -> np.ndarray:
-    """Return the inverse of m [3, 3] by its cofactors, without LAPACK: its kernels depend on the processor (see `matmul`)."""
+    """Return the inverse of m [3, 3] by its cofactors: LAPACK's kernels would depend on the processor (see `matmul`)."""
     c = cofactors(m)
     return c.T / (m[0] * c[0]).sum()
 
 
 def nearest_rotation(m: np.ndarray) -> np.ndarray:
-    """Return the rotation nearest to m [3, 3] of positive determinant: its polar factor by Newton's method (Higham 1986)."""
+    """Return the rotation nearest to m [3, 3], if det m > 0: its polar factor by Newton's method (Higham 1986)."""
     for _ in range(10):  # five steps suffice for a matrix that is orthogonal to 0.1; further steps change nothing
         c = cofactors(m)
         nearer = 0.5 * (m + c / (m[0] * c[0]).sum())
@@ -122,8 +122,8 @@ def relative_pose(first: Camera, second: Camera) -> tuple[np.ndarray, np.ndarray
 def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return pixels [N, 2] (pixel centres at +0.5) and depths [N] [u] of world points [N, 3].
 
-    Depths are those of a render: z, for a fisheye the distance. Depth is 0 for points that a lens other than a pinhole cannot
-    see.
+    Depths are those of a render: z, or for a fisheye the distance. Lenses other than a pinhole give depth 0 for points that
+    they cannot see.
 
     Raises:
         UsageError: The camera model is only supported by the kernels.
@@ -161,7 +161,7 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
 def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Tensor) -> torch.Tensor:
     """Return what `back_project` returns, from tensors and without a matrix product: R^T (d K^-1 [x y 1] - t) for a pinhole.
 
-    A matrix product would load another library on CUDA. Of K only focal lengths and principal point count, as in projection.
+    A matrix product would load another library on CUDA. Only focal lengths and principal point of K are used, as in projection.
 
     Args:
         camera: A camera with float32 or float64 tensors, on the device of ``pixels`` and ``depths``.
@@ -220,7 +220,7 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
     """Compute the normals of the surface of a depth map, from finite differences of its back-projected pixels.
 
     A normal is perpendicular to two differences: between the right and left neighbour, and between the lower and upper one.
-    It is exact for planes. Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` if they require
+    Normals are exact for planes. Differentiable in ``depth``, and in ``camera.viewmat`` and ``camera.K`` if they require
     gradients. Nothing is read back from the device. A NaN depth gives NaN normals.
 
     Args:
@@ -275,7 +275,7 @@ def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) 
     import torch
 
     if not isinstance(gaussians, (Gaussians, ActivatedGaussians)):
-        raise TypeError("gaussian_normals needs quats and scales: torch.linalg.eigh gives the axes of covariances")
+        raise TypeError("gaussian_normals needs quats and scales; for covariances, torch.linalg.eigh gives the axes")
 
     means, quats, scales, *_ = gaussians.tensors().values()
     axes = rotation_matrices(quats / quats.norm(dim=-1, keepdim=True))
@@ -294,7 +294,7 @@ def in_image(camera: Camera, points: np.ndarray, near: float = 0.0) -> np.ndarra
 
 
 def seen_pixels(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return which world points [N, 3] a camera sees: their indices, rows, columns and z-depths [u], of shape [S] each."""
+    """Return indices, rows, columns and depths [u], shape [S] each, of the world points [N, 3] that a camera sees."""
     pixels, z = project_points(camera, points)
     seen = np.nonzero(_inside(camera, pixels) & (z > 0))[0]
     columns, rows = np.floor(pixels[seen]).astype(int).T
@@ -307,7 +307,7 @@ def _inside(camera: Camera, pixels: np.ndarray) -> np.ndarray:
 
 
 def camera_extent(cameras: list[Camera]) -> float:
-    """Return 1.1 times the largest distance of a camera centre from their mean [u] (Kerbl et al. 2023); 0 for one camera."""
+    """Return 1.1 times the largest distance from a camera to the mean centre [u] (Kerbl et al. 2023); 0 for one camera."""
     centers = np.array([c.center for c in cameras])
     return 1.1 * float(np.linalg.norm(centers - centers.mean(0), axis=1).max())
 

@@ -32,8 +32,8 @@ def open_input(path: str | os.PathLike[str], below: Path | None = None) -> Binar
             user names, which may be a link.
 
     Raises:
-        OSError: The file is missing, unreadable, a folder, a link that is not followed, or no regular file (a pipe, a socket, a
-            device).
+        OSError: The file is missing, unreadable, a folder, a link that is not followed, or not a regular file (a pipe, a
+            socket, a device).
     """
     if below is not None:
         return open_file(Path(path), below)

@@ -1,4 +1,4 @@
-"""Camera models outside of the kernels: positions in the camera to the image plane and back, as arrays or tensors.
+"""Camera models outside of the kernels: from positions in camera axes to the image plane and back, for arrays or tensors.
 
 The image plane holds points (u, v) that K takes to pixels: x / z and y / z for a pinhole. The kernels have their own formulas.
 """
@@ -116,8 +116,8 @@ def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
 def on_lens(model: str, distortion: Array | None, positions: Array, samples: int = 64) -> Array:
     """Return a mask [...], True where the lens is not folded between its axis and positions in the camera [..., 3].
 
-    The lens is tested at ``samples`` points along the way. Positions behind a pinhole count as folded, positions in an
-    orthographic camera never do.
+    The lens is tested at ``samples`` points along the way. Positions behind a pinhole or opencv camera count as folded;
+    positions in an orthographic camera never do.
     """
     library, z = _library(positions), positions[..., 2]
     if model == "orthographic":
@@ -147,7 +147,7 @@ def _rim(distortion: Array) -> float:
 
 
 def _bent(angle: Array, distortion: Sequence[float] | Array) -> tuple[Array, Array]:
-    """Return the radius in the plane of an angle [rad] from the axis of a fisheye, and its derivative."""
+    """Return the radius in the image plane at an angle [rad] from a fisheye's axis, and its derivative."""
     t, value, slope = angle * angle, 1.0, 1.0
     powers = t
     for i in range(4):

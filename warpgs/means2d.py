@@ -25,7 +25,7 @@ class ProjectedMeans(torch.Tensor):
         raise AttributeError("means2d has no absgrad yet: it needs RasterizeOptions(absgrad=True) and a backward pass")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> ProjectedMeans:
-        """Return the means with their gradients so far, in memory of their own; later passes do not add to them."""
+        """Return a copy of the means and of their gradients so far; later backward passes do not change the copy."""
         copied = memo[id(self)] = self.detach().clone().as_subclass(ProjectedMeans)
         for name in ("grad", "absgrad"):
             if (found := getattr(self, name, None)) is not None:
@@ -42,7 +42,7 @@ class ProjectedMeans(torch.Tensor):
 def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> None:
     """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`.
 
-    ``passes`` is a list that gets an entry for each pass, which autograd nodes append; with None a slower hook does this.
+    Autograd nodes append an entry to the list ``passes`` in each pass; if it is None, a slower hook counts instead.
     """
     if not projected.requires_grad:
         return

@@ -1,8 +1,8 @@
 """Folders that this process writes into: the folder that the user names may be a link; below it no link is followed.
 
 `output_folder` opens such a folder for a block. Everything below it is then reached from its descriptor, folder by folder,
-without following links, so that no other program can redirect a write or a read. Of nested folders the outermost counts.
-Windows has no descriptors of folders: there each part of a path is checked for links before it is used.
+without following links, so that no other program can redirect a write or a read. Below nested open folders, a path is followed
+from the outermost one. Windows has no descriptors of folders: there each part of a path is checked for links before it is used.
 """
 
 from __future__ import annotations
@@ -142,11 +142,11 @@ class Folder:
         os.unlink(self._name(name), dir_fd=self.descriptor)
 
     def replace(self, old: str, new: str) -> None:
-        """Give an entry another name; a file of that name, or a link, is replaced."""
+        """Rename an entry; a file or link with the new name is replaced."""
         os.replace(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def rename(self, old: str, new: str) -> None:
-        """Give a folder another name, which must be free, or that of an empty folder."""
+        """Rename a folder; the new name must be free, or an empty folder must have it."""
         os.rename(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def remove_tree(self, name: str) -> None:
@@ -184,9 +184,9 @@ _LOCK = threading.RLock()
 
 @contextlib.contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
-    """Write everything below a folder, in this block, through its descriptor and without following links.
+    """Let this block write below a folder only through its descriptor and without following links.
 
-    The folder itself may be reached through links, unless it is below another open one. If another folder takes its place
+    The path of the folder itself may contain links, unless it is below another open folder. If another folder takes its place
     during the block, the next write is rejected.
 
     Raises:
@@ -210,16 +210,16 @@ def output_folder(folder: Path) -> Iterator[None]:
 
 
 def is_below(path: Path) -> bool:
-    """Return whether a path is below an open folder, so that no link to it is followed."""
+    """Return whether a path is below an open folder; then no link on the way to it is followed."""
     return _outermost(path.absolute().parent) is not None
 
 
 def open_folder(path: Path, make: bool = False) -> Folder:
-    """Open a folder, to use its entries: below an open `output_folder` without following links, elsewhere with links.
+    """Open a folder, to use its entries; links on the way are followed, except below an open `output_folder`.
 
     Args:
         path: The folder.
-        make: True to create missing parent folders, only below an open folder.
+        make: True to create the folder and its missing parents; used only below an open folder.
 
     Raises:
         OSError: The folder cannot be opened, or a parent folder is a link.
@@ -241,7 +241,7 @@ def open_folder(path: Path, make: bool = False) -> Folder:
 
 
 def open_file(path: Path, below: Path) -> BinaryIO:
-    """Open a regular file below a folder to read; the way from there to the file must have no link.
+    """Open a regular file for reading; the path from the folder ``below`` to the file must have no link.
 
     Args:
         path: The file.

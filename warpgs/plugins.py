@@ -112,7 +112,7 @@ class Registry(Generic[T]):
             return self._classes[name]
         if isinstance(name, str) and ":" in name:
             own = name.rpartition(":")[2]
-            in_study = f'; in a study: a preset in a .py file, with "strategy": {own}' if self.kind == "strategy" else ""
+            in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
                 f"the {self.kind} {name!r} is a class of your own. Files cannot import code: give the class again, on the "
                 f"command line or in Python{in_study}"
@@ -120,7 +120,7 @@ class Registry(Generic[T]):
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 
     def load(self, spec: str) -> type[T]:
-        """Return the class of a name, importing ``module:Class`` or ``path/to/file.py:Class``: runs that code.
+        """Return the class of a name; ``module:Class`` or ``path/to/file.py:Class`` is imported, which runs its code.
 
         Raises:
             UsageError: The module, file or class is missing, or the class is of another kind.
@@ -145,7 +145,7 @@ LOADED: set[str] = set()
 
 
 def load_object(kind: str, spec: str) -> object:
-    """Return the object of ``module:NAME`` or ``path/to/file.py:NAME``, importing it: runs that code.
+    """Import ``module:NAME`` or ``path/to/file.py:NAME``, which runs its code; return the object.
 
     Args:
         kind: Kind of object, for messages.
@@ -160,15 +160,15 @@ def load_object(kind: str, spec: str) -> object:
     except (ImportError, OSError) as e:
         raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); give path/to/file.py:{name or 'NAME'}") from e
     if not hasattr(module, name):
-        raise UsageError(f"the {kind} {spec!r} is not there: {where} has no {name}; give a name that it defines")
+        raise UsageError(f"the {kind} {spec!r} does not exist: {where} does not define {name}; give a name that it defines")
     LOADED.add(module.__name__)
     return getattr(module, name)
 
 
 def own_code(classes: Iterable[type]) -> dict[str, str]:
-    """Return the SHA-256 of the source file of each class that is not of warpgs, by its registered name.
+    """Return the SHA-256 of the source file of each class from outside warpgs, by its registered name.
 
-    A class without a file, as of a notebook, is left out.
+    A class without a file, such as one of a notebook, is left out.
     """
     digests = {str(getattr(c, "name", c.__qualname__)): _digest(c) for c in classes if not is_ours(c)}
     return {name: digest for name, digest in sorted(digests.items()) if digest}
@@ -176,12 +176,12 @@ def own_code(classes: Iterable[type]) -> dict[str, str]:
 
 @functools.cache
 def _digest(cls: type) -> str:
-    """Return the SHA-256 of the file of a class when first requested, as it may be edited later; empty without one."""
+    """Return the SHA-256 of the file of a class when first requested, as it may be edited later; empty if it has no file."""
     return module_digest(sys.modules.get(cls.__module__))
 
 
 def own_places(classes: Iterable[type]) -> list[str]:
-    """Return where `module_of` finds the modules of classes that are not of warpgs; the running script is left out."""
+    """Return where `module_of` finds the modules of classes from outside warpgs; the running script is left out."""
     modules = {c.__module__ for c in classes if not is_ours(c)} - {"__main__"}
     files = {m: getattr(sys.modules.get(m), "__file__", None) if m.startswith(_PREFIX) else m for m in modules}
     return sorted(str(place) for place in files.values() if place)
@@ -211,13 +211,13 @@ def _line_about(cls: type) -> str:
 
 
 def flag_group(name: str) -> str:
-    """Return the name of the flags of a plug-in's own settings: ``my.module:MyStrategy`` has the group ``my_strategy``."""
+    """Return the group name of the flags of a plug-in's settings: ``my_strategy`` for ``my.module:MyStrategy``."""
     word = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.rpartition(":")[2])
     return re.sub(r"\W", "_", word).lower()
 
 
 def own_frame(error: BaseException) -> str:
-    """Return file and line of the last frame of a user's own code in an error's traceback; empty where it has none."""
+    """Return file and line of the last frame of a user's own code in an error's traceback; empty if it has no such frame."""
     place, traceback = "", error.__traceback__
     while traceback is not None:
         if traceback.tb_frame.f_globals.get("__name__") in LOADED:
@@ -227,7 +227,7 @@ def own_frame(error: BaseException) -> str:
 
 
 def module_of(where: str) -> ModuleType:
-    """Return the module of a dotted name or of the path of a .py file, importing it: runs that code.
+    """Import the module of a dotted name, or the .py file of a path, which runs its code; return the module.
 
     Raises:
         ImportError: The module is missing.

@@ -37,8 +37,8 @@ class Camera:
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
     """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv k1 k2 p1 p2 k3 k4 k5 k6, for fisheye k1 to
-    k4, zeros for an ideal lens; None for models without coefficients. They have no gradient; tensors that require one are an
-    error."""
+    k4, zeros for an ideal lens; None for models without coefficients. Their gradients are not supported: a tensor that requires
+    gradients is an error."""
 
     @property
     def center(self) -> np.ndarray:
@@ -59,7 +59,7 @@ class GivenDepth:
     values: np.ndarray
     """z-depth or, for kind disparity, inverse z-depth; float32, shape [H, W]; 0 for missing values."""
     kind: str = "metric"
-    """Unit of the values, one of `DEPTH_KINDS`: metric [u], or an unknown scale and shift of each view."""
+    """Meaning of the values, one of `DEPTH_KINDS`: metric in [u]; the others with an unknown scale and shift for each view."""
     confidence: np.ndarray | None = None
     """Confidence in each value, in [0, 1], float32, shape [H, W]; None for 1 everywhere."""
 
@@ -75,20 +75,20 @@ class View:
     image: np.ndarray
     """Colours in [0, 1], float32, shape [H, W, 3]."""
     mask: np.ndarray | None = None
-    """True where the pixel counts, bool, shape [H, W]; None if all pixels count."""
+    """True for pixels that are used, bool, shape [H, W]; None to use all."""
     score_mask: np.ndarray | None = None
     """True where a render is scored, bool, shape [H, W]; the fit does not use it. None to score by ``mask``."""
     alpha: np.ndarray | None = None
     """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None if the
     image is opaque."""
     alpha_estimated: bool = False
-    """True if ``alpha`` was estimated from a black background. It then selects the pixels that start Gaussians and are scored.
+    """True if ``alpha`` was estimated from a black background: it then selects pixels that start Gaussians and are scored.
     The loss does not use it, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
-    """Given depth, for the start and the loss of a fit; None without."""
+    """Given depth, for the start and the loss of a fit; None if there is none."""
     normals: np.ndarray | None = None
-    """Given normals: unit vectors towards the camera in its axes (+x right, +y down, +z forward), float32, shape [H, W, 3]; 0
-    for missing values. None without normals."""
+    """Given normals: unit vectors towards the camera, in camera axes (+x right, +y down, +z forward), float32, shape [H, W, 3];
+    0 for missing values. None without normals."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class Scene:
     normalization: Normalization = field(default_factory=Normalization)
     """Similarity from file to scene coordinates."""
     notes: tuple[str, ...] = ()
-    """Messages about choices made while reading (skipped images, undistortion, the image folder taken)."""
+    """Messages about choices made while reading (skipped images, undistortion, the chosen image folder)."""
     fingerprint: str = ""
     """SHA-256 over names, cameras and pixels, hexadecimal: the same data gives the same fingerprint."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -212,9 +212,9 @@ class ViewDepth:
     notes: tuple[str, ...] = ()
     """Messages for the user: pairs left out, files missing, nothing found."""
     searched: bool = True
-    """False where the depth of the view was not estimated, because enough other views have depth."""
+    """False if the depth of the view was not estimated, because enough other views have depth."""
     given: np.ndarray | None = None
-    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None without a map."""
+    """Given z-depth [u] that no other view contradicts, float32, shape [H, W], 0 for missing values; None if none was given."""
 
     @property
     def coverage(self) -> float:
@@ -257,7 +257,7 @@ class Gaussians:
 
 @dataclass(frozen=True)
 class ActivatedGaussians:
-    """A set of N Gaussians by scales and opacities, only for `rasterize`; fits and files use `Gaussians`.
+    """A set of N Gaussians given by scales and opacities, for `rasterize`; fits and files use `Gaussians`.
 
     Opacity 1 and scale 0 are allowed and have finite gradients: the rule clamps alpha, and the pixel filter keeps a flat
     Gaussian visible edge-on.
@@ -284,7 +284,7 @@ class ActivatedGaussians:
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` of None as zeros [N, 1, 3]."""
+        """Return the five tensors by field name, in the order of `Gaussians`; zeros [N, 1, 3] if ``sh`` is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
         return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
 
@@ -299,14 +299,14 @@ class ActivatedGaussians:
 
 @dataclass(frozen=True)
 class CovarianceGaussians:
-    """A set of N Gaussians by covariance matrices and opacities, only for `rasterize`; fits and files use `Gaussians`."""
+    """A set of N Gaussians given by covariances and opacities, for `rasterize`; fits and files use `Gaussians`."""
 
     means: torch.Tensor
     """World positions [u], shape [N, 3]."""
     covars: torch.Tensor
     """Covariances [u^2], positive semi-definite, shape [N, 3, 3]. Only the symmetric part of a matrix is used. Eigenvalues
-    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite one is not rendered. Zeros
-    render as a point with the width of the pixel filter."""
+    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite one is not rendered. A
+    covariance of zeros renders as a point with the width of the pixel filter."""
     opacities: torch.Tensor
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
@@ -322,7 +322,7 @@ class CovarianceGaussians:
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the four tensors by field name, in a fixed order; ``sh`` of None as zeros [N, 1, 3]."""
+        """Return the four tensors by field name, in a fixed order; ``sh`` is zeros [N, 1, 3] if it is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
         return {"means": self.means, "covars": self.covars, "opacities": self.opacities, "sh": sh}
 
@@ -346,7 +346,7 @@ class Render:
     """Expected z-depth [u] (for a fisheye the distance): the mean under the blending weights; 0 where nothing is blended. Shape
     [..., H, W]."""
     projected: torch.Tensor
-    """Projected Gaussians in the layout of kernels/project.py, shape [C, N, 12]; keeps gradients after ``retain_grad()``."""
+    """Projected Gaussians, laid out as in kernels/project_inputs.py, shape [C, N, 12]; ``retain_grad()`` keeps gradients."""
     tile_counts: torch.Tensor
     """Number of tiles that a Gaussian touches, int32, shape [C, N]; 0 where it is culled."""
     weight_sums: torch.Tensor | None = None

@@ -23,9 +23,9 @@ MAX_DEPTH = 50
 MAX_PARTS = 2**19
 """Largest number of lists and objects; each takes some thirty times as much memory as its text."""
 MAX_WHOLE = 2**63 - 1
-"""Largest integer: that of 64 bits."""
+"""Largest integer: that of 64 bits with a sign."""
 MAX_NUMBER = 1e300
-"""Largest magnitude of an integer that stands for a number: a larger one could overflow a float."""
+"""Largest magnitude of a finite number, and of an integer in the place of a number: a larger one could overflow a float."""
 
 Schema = Callable[[Any, str], None]
 
@@ -92,7 +92,7 @@ def read(path: Path, below: Path | None = None) -> Any:
             the user names.
 
     Raises:
-        OSError: The file cannot be read, is a link that is not followed, no regular file, or larger than `MAX_BYTES`.
+        OSError: The file cannot be read, is a link that is not followed, not a regular file, or larger than `MAX_BYTES`.
         SchemaError: `parse` rejects its content.
     """
     return parse(read_input(path, MAX_BYTES, below))
@@ -182,7 +182,7 @@ def items(schema: Schema, count: int | None = None) -> Schema:
 
 
 def mapping(schema: Schema, names: Schema = text) -> Schema:
-    """Return the schema of objects with names by ``names`` and values by ``schema``."""
+    """Return the schema of objects: ``names`` must allow each name, ``schema`` each value."""
 
     def check(value: Any, place: str) -> None:
         if not isinstance(value, dict):
@@ -200,7 +200,7 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
     Args:
         needed: Schema of each name that must be there.
         more: Schema of each name that may be there.
-        others: Whether names beside these are allowed.
+        others: Whether other names are allowed, too.
     """
     known = {**needed, **(more or {})}
 

@@ -1,4 +1,4 @@
-"""Temporary files and folders, each locked by its owner: any process removes one without a lock.
+"""Temporary files and folders, each locked by its owner: any process may remove those that are not locked.
 
 The system releases a lock when its holder ends, killed or not. So a temporary file of a running process is never removed as a
 leftover, and the next command removes the files of a killed process.
@@ -134,7 +134,7 @@ class TemporaryFolder:
 
 
 def temporary_folder() -> TemporaryFolder:
-    """Make a folder that only this user can read or write, where the system has temporary files; use it with ``with``.
+    """Make a folder that only this user can read or write, in the `system_folder`; use it with ``with``.
 
     Leftovers of killed commands of this user are removed there.
 
@@ -153,7 +153,7 @@ def sweep_temporary_files() -> None:
 
 
 def system_folder() -> Path:
-    """Return the folder that TMPDIR, TEMP or TMP names, else the system's temporary folder; also set it for `tempfile`."""
+    """Return the first usable folder of TMPDIR, TEMP and TMP, else the system's temporary folder; set it in `tempfile`, too."""
     if tempfile.tempdir is None and sys.platform != "win32":
         # Python would write a file to try each of these, which a command that is killed then leaves behind
         named = [os.environ.get(name) for name in ("TMPDIR", "TEMP", "TMP")]
@@ -166,7 +166,7 @@ def sweep(folder: Folder, own: bool = False) -> None:
     """Remove unlocked temporary files and folders; those that cannot be removed or locked stay.
 
     Args:
-        folder: Their folder.
+        folder: Folder to remove them from.
         own: True to remove only entries of this user.
     """
     with contextlib.suppress(OSError):

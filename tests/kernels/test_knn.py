@@ -46,7 +46,7 @@ def test_clusters_lines_and_duplicates(device):
 
 def test_bad_input_is_refused():
     """NaN positions, a wrong shape and an impossible k are errors."""
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match="non-finite"):
         mean_square_distances(torch.tensor([[0.0, 0, 0], [float("nan"), 0, 0]]))
     with pytest.raises(ValueError, match="points"):
         mean_square_distances(torch.zeros(4, 2))

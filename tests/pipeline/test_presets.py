@@ -94,7 +94,7 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ("depth-mean = [0.1, nan, 0.2]", "must be a finite number"),
         ('strategy = "best"', "my.toml: unknown strategy 'best'"),
         ("strategy = 3", "3 is not a strategy"),
-        ('strategy = "json:JSONDecoder"', 'in a study: a preset in a .py file, with "strategy": JSONDecoder'),
+        ('strategy = "json:JSONDecoder"', 'in a study, use a preset in a .py file with "strategy": JSONDecoder'),
         ('loss-terms = "json:JSONDecoder"', "Files cannot import code"),
         ('base = "json:dumps"', "is code; a preset file never loads code"),
         ('base = "best"', "base 'best' is not one of"),
@@ -140,7 +140,7 @@ def test_objects_and_mappings_are_presets(own):
     assert preset_settings({"base": "quick", "init.opacity": 0.5})[0] == config
     for wrong, said in (
         (f"{own}:NUMBER", "is of type int"),
-        (f"{own}:NONE", "is not there"),
+        (f"{own}:NONE", "does not exist"),
         ("no.such:X", "cannot be imported"),
     ):
         with pytest.raises(UsageError, match=said):

@@ -44,7 +44,7 @@ def test_keypoints_are_in_pixels_of_the_photograph(tmp_path):
         ((AT[:2], SCORES, UNIT), {}, r"returned keypoints \[2, 2\], scores \[3\]"),
         ((AT, SCORES, UNIT[:, :0]), {}, "have 0 numbers, not 1 to 256"),
         ((AT, SCORES, np.ones((3, 300))), {}, "have 300 numbers"),
-        ((AT * np.nan, SCORES, UNIT), {}, "hold NaN"),
+        ((AT * np.nan, SCORES, UNIT), {}, "contain NaN"),
         ((AT * 100, SCORES, UNIT), {}, "are outside the image"),
         ((AT, SCORES, UNIT * 2), {}, "do not have length 1"),
     ],

@@ -164,7 +164,7 @@ def test_arguments_of_another_type_or_shape_are_named():
         (ValueError, r"camera.K must be \[\[fx, 0, cx\]", (gaussians, dataclasses.replace(cam, K=2 * cam.K))),
         (
             ValueError,
-            "skew is not rendered",
+            "skew is not supported",
             (gaussians, dataclasses.replace(cam, K=skewed)),
         ),
         (
@@ -229,7 +229,7 @@ def test_arguments_of_another_type_or_shape_are_named():
             )
             for dtype in (torch.float16, torch.bfloat16, torch.int64)
         ),
-        (UsageError, "detach them", (gaussians, cam, learned)),
+        (UsageError, "give opacity_factors.detach", (gaussians, cam, learned)),
         (
             ResourceError,
             r"need 28,000,000,000,000 bytes, and [\d,]+ are free on cpu",

@@ -1,4 +1,4 @@
-"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more per harmonic and channel.
+"""The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
 
 Chunks of 256 Gaussians share the bounds between which positions (11, 10, 11 bits), log scales (11, 10, 11) and colours (8 each)
 are fractions; rotations have 2 bits for the largest component and 10 for each other. The loss is least when Gaussians that are
@@ -70,7 +70,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def start_of(path: Path) -> bytes:
-    """Return the bytes of a PLY file up to the longest header, which is checked.
+    """Return the first bytes of a PLY file, as many as the longest allowed header has; its own header is checked.
 
     Raises:
         DataError: The file cannot be read, or is not a PLY file.
@@ -111,7 +111,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     bounds = [_bounds(path, chunk, group) for group in _GROUPS]
 
     def values(i: int, packed: np.ndarray, bits: tuple[int, ...], part: slice) -> np.ndarray:
-        """Return the numbers of the i-th group [P, 3], between the bounds of their chunks."""
+        """Return the unpacked values of the i-th group [P, 3], scaled to the bounds of their chunks if there are bounds."""
         fractions = _unpack(packed[part].astype(np.int64), bits)[:, :3]
         if (ends := bounds[i]) is None:
             return fractions
@@ -220,6 +220,6 @@ class CompressedPLY(Format):
         """Return whether the header declares antialiasing.
 
         Raises:
-            DataError: The file is missing or no PLY.
+            DataError: The file is missing or not a PLY file.
         """
         return is_antialiased(start_of(path))

@@ -37,7 +37,7 @@ GLB, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
 MAX_PARTS = 100_000
 """Largest number of lists and objects in a document; each takes some thirty times as much memory as its text."""
 MAX_VALUES = 300_000
-"""Most commas in a document: each separates two values, which take up to a hundred bytes."""
+"""Largest number of commas in a document: each separates two values, which take up to a hundred bytes."""
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TINY = 1e-37

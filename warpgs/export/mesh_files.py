@@ -1,4 +1,4 @@
-"""Meshes as files: PLY, binary, and glTF 2.0 in one binary file."""
+"""Meshes as files: binary PLY, and glTF 2.0 in one binary file."""
 
 from __future__ import annotations
 

@@ -237,7 +237,7 @@ def _columns(
 
 @register("ply")
 class PLY(Format):
-    """The PLY format; a file of it may be compressed."""
+    """The PLY format; such a file may be compressed."""
 
     suffix = ".ply"
     description = "layout of Kerbl et al. 2023, float32; every tool"
@@ -263,6 +263,6 @@ class PLY(Format):
         """Return whether the header declares antialiasing.
 
         Raises:
-            DataError: The file is missing or no PLY.
+            DataError: The file is missing or not a PLY file.
         """
         return is_antialiased(start_of(path))

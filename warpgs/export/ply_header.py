@@ -1,4 +1,4 @@
-"""Headers of binary PLY files: elements, their properties, and comments on the training of Gaussians."""
+"""Headers of binary PLY files: elements, their properties, and comments that declare antialiasing."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ from warpgs.input_files import open_input, unread_reason
 LEVELS = 256
 """Entries of a codebook."""
 PALETTE = 65536
-"""Most rows of harmonics."""
+"""Largest number of rows of harmonics."""
 COLUMNS = 64
 """Rows of the palette side by side in its image."""
 ROUNDS = 12
@@ -48,12 +48,12 @@ MAX_META_BYTES = 2**20
 MAX_CONTENTS_BYTES = 2**16
 """Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
+"""Largest number of Gaussians per byte of a file, of pixels per Gaussian, and a number added to both limits: real files have
+one Gaussian per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
 MAX_PIXEL_BYTES = 8
 """Largest number of bytes per pixel of a lossless WebP image; incompressible pixels take little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
-"""Most pixels of the palette's image: 65,536 rows of 15 coefficients."""
-"""Most Gaussians per byte of a file, most pixels per Gaussian, and a number added to both limits: real files have one Gaussian
-per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
+"""Largest number of pixels of the palette's image: 65,536 rows of 15 coefficients."""
 _DATE = (1980, 1, 1, 0, 0, 0)
 
 
@@ -106,7 +106,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a codebook of 256 values, ascending, and the index of the nearest entry, as uint8 in the shape of ``values``.
+    """Return a codebook of 256 ascending entries, and the index of the entry nearest to each of ``values``, uint8, equal shape.
 
     Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that results repeat.
     """
@@ -128,7 +128,7 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return at most 65,536 rows that represent all rows, and for each row the index of its representative, int64 [N].
 
-    If there are more rows, cells are halved repeatedly at the median of their widest column; the mean represents a cell.
+    If there are more, cells of rows are halved at the median of their widest column; the mean of a cell represents it.
     """
     n = len(rows)
     if n <= PALETTE:
@@ -218,7 +218,7 @@ def _colors(book: np.ndarray, pixels: np.ndarray, sh: np.ndarray) -> np.ndarray:
 
 
 def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -> np.ndarray:
-    """Return the means [N, 3] of the lower and the upper bytes of their levels [P, 4]."""
+    """Return the means [N, 3] from the lower and the upper bytes of their levels, [P, 4] each."""
     low, high = (np.array(part[key], np.float64).reshape(3) for key in ("mins", "maxs"))
 
     def rows(p: slice) -> np.ndarray:
@@ -320,7 +320,7 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
 
 
 def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarray:
-    """Return labels of Gaussians from ``first`` on that all lie below ``count``; DataError where one does not."""
+    """Return the labels of the Gaussians from number ``first`` on; DataError if one is not below ``count``."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
         raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")

@@ -1,4 +1,4 @@
-"""Niantic's SPZ format, versions 2 to 4, in fixed point: about 20 bytes a Gaussian, and one more per harmonic and channel.
+"""Niantic's SPZ format, versions 2 to 4, in fixed point: about 20 bytes a Gaussian, and one byte per harmonic and channel.
 
 Versions 2 and 3 are one gzip stream; version 4 has a plain header and one zstd stream per attribute (package zstandard). Axes
 are RUB (x right, y up, z back), a half turn about x from those of PLY.
@@ -57,7 +57,7 @@ bomb 1000."""
 
 
 def fractional_bits(means: np.ndarray) -> int:
-    """Return the finest resolution, 2^-bits, at which all coordinates [N, 3] fit into 24 signed bits; at most 2^-24.
+    """Return the number of fractional bits, at most 24, at which all coordinates [N, 3] just fit into 24 signed bits.
 
     Raises:
         DataError: A coordinate is beyond 2^23, which the format cannot hold.
@@ -192,7 +192,7 @@ def _checked(path: Path, size: int, header: tuple[int, ...], versions: tuple[int
     if degree > 3:
         raise malformed(path, f"harmonics of degree {degree} are not supported (supported: 0 to 3)")
     if bits > MAX_FRACTIONAL_BITS:
-        raise malformed(path, f"its coordinates have {bits} fractional bits of 24")
+        raise malformed(path, f"its coordinates have {bits} fractional bits, more than {MAX_FRACTIONAL_BITS}")
     sizes = [9 * n, n, 3 * n, 3 * n, (3 if version == 2 else 4) * n, 3 * (SH_SIZES[degree] - 1) * n]
     if sum(sizes) > MAX_RATIO * size + SMALL:
         raise malformed(path, f"it announces {n} Gaussians in only {size} bytes")
@@ -212,7 +212,9 @@ def _streams(path: Path, data: bytes, sizes: list[int], count: int, place: int) 
             continue
         packed, plain = struct.unpack_from("<QQ", data, place + 16 * i)
         if plain != size or start + packed > len(data):
-            raise malformed(path, f"stream {i} announces {packed} bytes that become {plain}, not {size}")
+            raise malformed(
+                path, f"stream {i} announces {packed} packed and {plain} unpacked bytes, but should unpack to {size}"
+            )
         with decompressor.stream_reader(view[start : start + packed]) as reader:
             yield functools.partial(_decompressed, path, reader, i, size)
             if _decompressed(path, reader, i, size, 1, end=True):

@@ -13,7 +13,7 @@ from warpgs.runtime.cuda_source import source
 BETAS = (0.9, 0.999)
 """Decay rates of the two moments (Kingma and Ba 2015)."""
 EPS = 1e-15
-"""Number added to the root, as in Kerbl et al. 2023, since gradients are tiny."""
+"""Number added to the root of the second moment, as in Kerbl et al. 2023, since gradients are tiny."""
 LANES = 16
 """Elements that are updated together on a CPU, in a loop that vectorises."""
 SEGMENT = 4096
@@ -126,7 +126,7 @@ def make_scheduled_kernel():
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
-    """Return what `adam_scheduled` reads from memory: two corrected learning rates and the root of the second correction."""
+    """Return the corrected learning rates of a row's first numbers and of the others, and the root of the second correction."""
     correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
     return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
 
@@ -141,10 +141,10 @@ def adam_scheduled(
         param: Parameter, contiguous, shape [N, ...].
         grad: Its gradient, same shape.
         exp_avg: Running mean of the gradient, same shape, contiguous.
-        exp_avg_sq: Running mean of its square, same shape, contiguous.
+        exp_avg_sq: Running mean of the squared gradient, same shape, contiguous.
         lrs: Result of `scheduled_lrs`, float32, shape [3].
         skip: Flag, int32, shape [1]; nothing is updated if it is not 0.
-        head: Count of numbers of a row that take the first learning rate; 0 for none.
+        head: How many numbers, from the start of a row, take the first learning rate; 0 for none.
         betas: Decay of the two running means.
         eps: Number added to the root.
     """
@@ -196,13 +196,13 @@ def adam_step(
         param: Parameter, contiguous, shape [N, ...].
         grad: Its gradient, same shape.
         exp_avg: Running mean of the gradient, same shape, contiguous.
-        exp_avg_sq: Running mean of its square, same shape, contiguous.
+        exp_avg_sq: Running mean of the squared gradient, same shape, contiguous.
         lr: Learning rate.
         step: Number of this step, from 1.
         betas: Decay rates of the two moments.
         eps: Number added to the root.
-        head_lr: Learning rate of the first ``head`` numbers of each of the N rows.
-        head: Count of numbers of a row that take ``head_lr``; 0 for none.
+        head_lr: Learning rate of the first ``head`` numbers of each of the N rows; None for ``lr``.
+        head: How many numbers, from the start of a row, take ``head_lr``; 0 for none.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

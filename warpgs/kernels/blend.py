@@ -35,7 +35,7 @@ def step_bytes(sizes: StepSizes) -> Needs:
 
 
 SUMMED = 16
-"""Gaussians whose gradients a task sums."""
+"""Number of Gaussians for which one task sums gradients."""
 
 
 @functools.cache
@@ -44,8 +44,8 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
 
     Args:
         real: wp.float32 or wp.float64.
-        values: Values of a gradient.
-        width: Values of a projected Gaussian, of which those without gradient come last.
+        values: Number of values of a gradient.
+        width: Number of values of a projected Gaussian; those without gradient come last.
     """
     reals = wp.types.vector(values, real)
     record = wp.types.vector(width, real)
@@ -216,7 +216,7 @@ def composite_gradients(
         settings: Settings as given to `composite`.
         saved: Results of `composite` without ``alpha``. Only the channels of ``rgb`` that ``v_images`` has are read.
         v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The first
-            may be a slice of the channels of an image, and on CUDA in float32 have fewer than D: the others are 0.
+            may be a slice of the channels of an image, and on CUDA in float32 have fewer than D: the other gradients are 0.
         allocator: Provider of the gradient's memory.
     """
     v_rgb, v_alpha, v_depth = v_images
@@ -226,7 +226,7 @@ def composite_gradients(
 
 
 def background_gradient(transmittances: torch.Tensor, v_rgb: torch.Tensor | None, channels: int = 3) -> torch.Tensor:
-    """Return the gradient of the backgrounds, shape [C, D] with D ``channels``; ``v_rgb`` None is zero."""
+    """Return the gradient of the backgrounds, shape [C, D] with D ``channels``; zeros if ``v_rgb`` is None."""
     # a product of matrices would sum the pixels one by one, and err several times as much
     if v_rgb is None:
         return transmittances.new_zeros(len(transmittances), channels)
@@ -302,10 +302,11 @@ def blend(
     origin: tuple[int, int] = (0, 0),
     absgrad: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3; ``rule`` sets order and early stop).
+    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3), with the cut-offs of ``rule``.
 
     Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
-    Derivation of the backward pass: docs/blend.md. Results repeat bit for bit, on CUDA and on any number of CPU threads.
+    Derivation of the backward pass: docs/blend.md. Images repeat bit for bit, on CUDA and on any number of CPU threads;
+    gradients do if ``deterministic`` is True.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
@@ -314,15 +315,15 @@ def blend(
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
-        deterministic: Sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less memory
-            but is not repeatable to the bit; elsewhere it has no effect.
+        deterministic: True to sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less
+            memory but is not repeatable to the bit; elsewhere it has no effect.
         origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: Sum magnitudes of the mean's gradient over pixels, too. They are the gradient of the last two values of
-            ``projected``, the half sides of the box.
+        absgrad: True to also sum magnitudes of the mean's gradient over pixels. They are the gradient of the last two values
+            of ``projected``, the half sides of the box.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
-        blending weights, 0 where less than `SMALLEST_WEIGHT` was blended in all.
+        blending weights, 0 where these sum to less than `SMALLEST_WEIGHT`.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

@@ -29,7 +29,7 @@ from warpgs.runtime import interop
 from warpgs.runtime.derivatives import first_order, keep, kept
 
 GEOMETRY = 6
-"""Values of a projected Gaussian before its colour; its depth and its box follow that."""
+"""Number of values of a projected Gaussian before its colour; its depth and its box follow the colour."""
 
 
 def width_of(channels: int, widths: tuple[int, ...] = WIDTHS) -> int:
@@ -215,9 +215,9 @@ def blend_channels(
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.
-        deterministic: Sum gradients in a fixed order, see `blend`.
+        deterministic: True to sum gradients in a fixed order, see `blend`.
         origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: Sum magnitudes, see `blend`; with more than 11 channels, magnitudes of each pass are summed.
+        absgrad: True to also sum magnitudes, see `blend`; with more than 11 channels, the magnitudes of the passes are added.
 
     Returns:
         The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.

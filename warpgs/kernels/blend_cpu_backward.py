@@ -257,7 +257,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
     @wp.func(inline=True)
     def hold(j: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
-        """Keep the sums of a Gaussian until a group is complete; half of the places in a strip are added here."""
+        """Keep the sums of a Gaussian until a group is complete; the two halves of a strip are added here."""
         o = (j & group_bits) * (values * half)
         for lane in range(half):
             held.halves[o + lane] = at(s.e1[lane]) + at(s.e1[half + lane])
@@ -271,7 +271,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
     @wp.func(inline=True)
     def fold(held: wp.ref[r.Held]):
-        """Add up the other places in a strip, always in one order, for all Gaussians whose sums are held."""
+        """Add up the sums that `hold` keeps of each Gaussian, always in the same order."""
         for n in range(together_values):
             o = n * half
             held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))

@@ -31,10 +31,10 @@ STATE = 5
 WARPS = 2
 """Independent warps in a block."""
 LARGE_GAUSSIAN = 8
-"""Tiles per visible Gaussian from which on a warp of the forward pass takes two blocks of pixels instead of one. This halves
-the instances that are loaded and tested, and few of them touch only one block (docs/decisions/005-cuda-blending.md)."""
+"""Mean number of tiles per visible Gaussian at which a warp of the forward pass takes two blocks of pixels instead of one. This
+halves the instances that are loaded and tested; few of them touch only one block (docs/decisions/005-cuda-blending.md)."""
 RANKS = 33
-"""Ranks of tiles by the number of binary digits of their list's length, 0 to 32."""
+"""Number of ranks of tiles; the rank of a tile is the number of bits of its list's length, 0 to 32."""
 ORDER_THREADS = 256
 """Threads of a block of the kernel that puts tiles in order."""
 STRIDE = 12
@@ -226,7 +226,7 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk; without a fixed order, not the smallest number, which takes the most memory."""
+    """Return the instances per chunk: more for larger images, and not the fewest unless the order is fixed, to save memory."""
     larger = sum(tiles > most for most in MAX_TILES)
     return CHUNKS[larger if deterministic else max(larger, 1)]
 
@@ -336,7 +336,7 @@ def backward(
 
 
 def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor) -> torch.Tensor:
-    """Return sum and maximum over a tile's pixels of the blending weight, for each instance at its slot, shape [M, 2].
+    """Return sum and maximum of each instance's blending weight over the pixels of its tile, in slot order, shape [M, 2].
 
     Args:
         projected: Projected Gaussians as given to `forward`, shape [C, N, 12].

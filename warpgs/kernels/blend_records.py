@@ -11,7 +11,7 @@ from warpgs.kernels.falloff import ABREAST, STRIP
 COLORS = 3
 """Channels of a projected Gaussian as `project` makes it: a colour."""
 VALUES = 10
-"""Gradient values of an instance with a colour: those of a projected Gaussian but for its last two, which are the box."""
+"""Number of gradient values of an instance with a colour: all values of a projected Gaussian but the last two, its box."""
 WIDTHS = (COLORS, 7, 11)
 """Numbers of channels for which kernels are compiled: with nine other values a projected Gaussian fills whole 16-byte loads."""
 

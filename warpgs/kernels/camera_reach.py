@@ -33,7 +33,7 @@ def make_kernel():
 
 
 def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return the logarithm of a fraction of the distance from each mean to the nearest camera, at least that of `SMALLEST`.
+    """Return log(``fraction`` times the distance from each mean to the nearest camera), at least log(`SMALLEST`).
 
     Args:
         means: Positions [u], float32, shape [N, 3]; squared distances do not overflow up to 1e18 u.

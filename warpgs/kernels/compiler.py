@@ -15,4 +15,4 @@ ROLLED = {
 """Module options, for kernels with ``module="unique"`` (elsewhere Warp ignores them)."""
 
 EXACT = {"max_unroll": 0, "cpu_compiler_flags": f"{_MACHINE} -ffp-contract=off {_STACK}"}
-"""The same options without fused multiply-add: every operation rounds alike on all processors."""
+"""The options of `ROLLED` without fused multiply-add: every operation rounds alike on all processors."""

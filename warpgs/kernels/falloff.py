@@ -1,4 +1,4 @@
-"""Functions that all CPU blending passes share, to the bit: tiles, the pixels that a Gaussian reaches, its falloff."""
+"""Functions that all CPU blending passes share, so that their bits agree: tiles, a Gaussian's pixels and its falloff."""
 
 import functools
 from types import SimpleNamespace

@@ -1,7 +1,7 @@
 """The k heaviest Gaussians of each pixel with their blending weights, and the number of Gaussians that were blended.
 
 This is a separate pass, so that `blend` does not become slower. It computes alpha by the same operations as `blend`. The list
-of a pixel is kept sorted in the result itself; a Gaussian that is heavier than the last one is inserted.
+of a pixel is kept sorted in the result itself. A Gaussian is inserted if it is heavier than the k-th entry of the list.
 """
 
 import functools
@@ -132,7 +132,7 @@ def make_native(tile_size: int):
 def heaviest(
     projected: torch.Tensor, tiles: Tiles, k: int, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the k Gaussians of largest blending weight alpha * T in each pixel, heaviest first, of equal ones nearest first.
+    """Return the k Gaussians of largest blending weight alpha * T in each pixel, heaviest first; equal weights nearest first.
 
     Not differentiable. Results repeat bit for bit with any number of threads.
 

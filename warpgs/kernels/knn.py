@@ -10,8 +10,8 @@ import warp as wp
 from warpgs.runtime import interop
 
 BOX = 32
-"""Number of points in a box, of boxes in a box of the level above, and at most of boxes of the highest level. A query enters a
-box only if the box is closer than the neighbours found so far."""
+"""Number of points in a box, and of boxes in a box of the next level; the highest level has at most this number of boxes. A
+query enters a box only if the box is closer than the farthest of the nearest neighbours found so far."""
 
 MAX_NEIGHBORS = 8
 """Largest number of neighbours of a query."""
@@ -132,7 +132,7 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
     if not 1 <= k <= MAX_NEIGHBORS:
         raise ValueError(f"k must be 1 to {MAX_NEIGHBORS}, not {k}")
     if not bool(torch.isfinite(points).all()):
-        raise ValueError("points holds positions that are not finite")
+        raise ValueError("points has non-finite positions")
     if count < 2:
         return points.new_zeros(count)
     real, device = interop.real_of(points), points.device

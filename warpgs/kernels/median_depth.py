@@ -124,8 +124,8 @@ def median_depth(
     """Return the depth of the Gaussian at which a pixel's transmittance falls to one half or below. Not differentiable.
 
     This is the median of depth under the weights of blending and of the background. At an edge it does not mix both surfaces,
-    unlike the mean depth of `blend`. There is none where alpha, the result of `blend`, is below 1/2. Results repeat bit for bit
-    with any number of threads.
+    unlike the mean depth of `blend`. A pixel has no median depth if its alpha in `blend` is below 1/2. Results repeat bit for
+    bit with any number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

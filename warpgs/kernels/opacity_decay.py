@@ -48,7 +48,7 @@ def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
     """
     interop.check(logits=(logits, "N"))
     if not 0 < factor < 1:
-        raise ValueError(f"factor {factor} does not lie in (0, 1)")
+        raise ValueError(f"factor must be above 0 and below 1, not {factor}")
     decayed = torch.empty_like(logits)
     inputs = [interop.view(logits, wp.float32), float(factor), interop.view(decayed, wp.float32)]
     interop.launch(make_kernel(), len(logits), inputs, logits.device)

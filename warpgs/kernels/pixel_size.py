@@ -1,4 +1,4 @@
-"""Sizes of a pixel at Gaussians: a fraction of the pixel of the training camera that samples a Gaussian most finely."""
+"""Pixel sizes at Gaussians: for each, a fraction of the size [u] of the smallest pixel of the training cameras that see it."""
 
 import functools
 
@@ -41,7 +41,7 @@ def make_kernel():
 
 
 def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return the logarithm of a fraction of the smallest pixel that sees each mean, at least that of `SMALLEST`.
+    """Return log(``fraction`` times the size of the smallest pixel that sees each mean), at least log(`SMALLEST`).
 
     A pixel of a camera measures depth over focal length, or distance over focal length for a fisheye (Yu et al. 2024,
     Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.

@@ -1,4 +1,4 @@
-"""Matching costs of a plane sweep on a CPU: other images by a plane's homography, correlated in windows.
+"""Matching costs of a plane sweep on a CPU: other images are warped by a plane's homography and correlated in windows.
 
 A task owns some rows and some planes. Colours and the sums over windows are integers, and no multiplication is fused with
 a sum, so that costs are the same bits on any processor and number of threads. Loops over `LANES` pixels vectorise.
@@ -258,7 +258,7 @@ def _window_sums(values: np.ndarray, radius: int) -> np.ndarray:
 def plane_costs(
     gray: np.ndarray, others: Sequence[np.ndarray], homographies: np.ndarray, window: int, noise: float, unit: int
 ) -> torch.Tensor:
-    """Return the disagreement of an image with others, each seen by the homographies of D planes.
+    """Return the matching costs of an image against others, which are warped to it by the homographies of D planes.
 
     The cost of one other image is 0.5 (1 - correlation). The result is half the mean of these costs plus half the smallest: an
     image that does not see the point contributes, but cannot outvote one that does.
@@ -266,21 +266,21 @@ def plane_costs(
     Args:
         gray: Brightness in [0, 1], float32, shape [H, W].
         others: Brightness of N other images, of any size.
-        homographies: H from pixel centres at integers to those of each other image, positive in front of its camera,
-            shape [D, N, 3, 3].
+        homographies: Homographies from pixels of the image to pixels of each other image, both with centres at integers, with
+            a sign that makes the third coordinate positive in front of the other camera, shape [D, N, 3, 3].
         window: Side of the square in which pixels are correlated [px], odd, at most 2 `MAX_RADIUS` + 1.
-        noise: Variance that is added to that of a window.
-        unit: Cost 1 as an integer, below 2^15.
+        noise: Number that is added to the variance of a window.
+        unit: Integer that stands for cost 1, below 2^15.
 
     Returns:
         Costs, int16, shape [H, W, P]: P is D rounded up to a multiple of `LANES`, and costs past D are ``unit``.
 
     Raises:
-        ValueError: The window is too large.
+        ValueError: The window is too small or too large.
     """
     radius = window // 2
     if not 1 <= radius <= MAX_RADIUS:
-        raise ValueError(f"window {window} must be 3 to {2 * MAX_RADIUS + 1} px")
+        raise ValueError(f"window must be 3 to {2 * MAX_RADIUS + 1} px, not {window}")
     height, width = gray.shape
     pitch, padded = (-(-n // LANES) * LANES for n in (width, len(homographies)))
     centred = (_whole(gray) - MIDDLE).astype(np.int64)

@@ -124,14 +124,15 @@ def check_round_trip(
     first: Camera, second: Camera, own: np.ndarray, found: np.ndarray, sensitivity: np.ndarray, *, most: float,
     min_parallax: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return where the round trip through another view's depth returns to the pixel.
+    """Return a mask of the pixels that a round trip through another view's depth returns to, with enough parallax.
 
     Args:
         first: Camera of the view.
         second: Camera of the other view.
         own: Inverse depths of the view [1/u], float64, shape [H, W].
         found: Inverse depths of the other view [1/u], float64, at its size.
-        sensitivity: Change of depth per pixel [u/px], float64, shape [H, W]; lowered to that of this pair where smaller.
+        sensitivity: Change of depth per pixel [u/px], float64, contiguous, shape [H, W]; lowered in place where this pair of
+            views has a smaller one.
         most: Largest distance [px] between the pixel and the end of the round trip.
         min_parallax: Smallest angle between the two rays [deg].
 

@@ -113,7 +113,7 @@ def project_gradients(
         settings: The settings of the forward pass.
         projected: First result of `project_tensors`, shape [C, N, 12].
         tile_counts: Second result of `project_tensors`, int32, shape [C, N].
-        v_projected: Gradient of ``projected``, shape [C, N, 12]; None for zero.
+        v_projected: Gradient of ``projected``, shape [C, N, 12]; None for zeros.
         wants_camera: True to compute the gradients of viewmats and Ks; else they are None.
         allocator: Provider of the gradients' memory.
 
@@ -236,10 +236,10 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
         distortion=(inputs.distortion, f"C {model.coefficients}"),
     )  # fmt: skip
     if inputs.distortion.requires_grad:
-        raise UsageError("the coefficients of a camera's distortion have no gradient; detach them")
+        raise UsageError("gradients of distortion coefficients are not supported: give distortion.detach()")
     if sizes["K"] < settings.sh_count:
         degree = math.isqrt(settings.sh_count) - 1
-        raise ValueError(f"sh holds {sizes['K']} coefficients a channel, degree {degree} needs {settings.sh_count}")
+        raise ValueError(f"sh has {sizes['K']} coefficients per channel, but degree {degree} needs {settings.sh_count}")
     width, height = settings.size
     if width < 1 or height < 1:
         raise ValueError(f"the image must be at least 1 x 1 px, not {width} x {height}")

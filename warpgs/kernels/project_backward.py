@@ -13,7 +13,7 @@ from warpgs.kernels.project_inputs import PROJECTED_SIZE
 
 @functools.cache
 def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int, lanes: bool = False):
-    """Make the functions that take the gradients of one projected Gaussian to those of its parameters.
+    """Make the functions that compute the gradients of a Gaussian's parameters from those of the projected Gaussian.
 
     Args:
         real: wp.float32 or wp.float64.

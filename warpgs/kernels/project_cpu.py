@@ -17,7 +17,7 @@ from warpgs.kernels.project_lanes import LANES, make_lanes
 
 @functools.cache
 def make_forward(real, camera_model: str, parameters: str, antialiased: bool, bases: int):
-    """Make the kernel; arguments are those of `project_cuda.make_forward`, and the scalar type."""
+    """Make the kernel; arguments are those of `project_cuda.make_forward`."""
     one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
     s = make_spans(real, lanes=True)

@@ -15,7 +15,7 @@ from warpgs.runtime import interop
 from warpgs.runtime.derivatives import first_order
 
 PROJECTED_SIZE = 12
-"""Numbers of a projected Gaussian, 16-byte aligned in float32:
+"""Number of values of a projected Gaussian, whose rows are 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
 10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
 
@@ -32,7 +32,7 @@ class ProjectSettings:
     window: tuple[int, int, int, int]
     """Left, top, width and height [px] of the part that is rendered; left and top are multiples of ``tile_size``."""
     sh_count: int
-    """Spherical-harmonics coefficients a channel that are used."""
+    """Number of spherical-harmonics coefficients per channel that are used."""
     rule: Rule
     """Cut-offs."""
     tile_size: int
@@ -100,7 +100,10 @@ def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.
         return nothing((0,), means.dtype, means.device)
     interop.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
     if factors.requires_grad and torch.is_grad_enabled():
-        raise UsageError("opacity_factors have no gradient: detach them, or multiply the opacities themselves")
+        raise UsageError(
+            "gradients of opacity_factors are not supported: give opacity_factors.detach(), or multiply the opacities "
+            "themselves"
+        )
     return factors.detach()
 
 

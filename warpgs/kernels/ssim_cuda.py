@@ -66,7 +66,7 @@ def _shape(image: torch.Tensor) -> tuple[int, int, int]:
 
 
 def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
-    """Return similarities [B, H, W, 3] and three partials; or, ``summed``, first the two sums per block [blocks, 2]."""
+    """Return similarities [B, H, W, 3] or, if ``summed``, two sums per block [blocks, 2]; then three partial derivatives."""
     blocks, height, columns = _shape(image)
     result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
     partials = [torch.empty_like(image) for _ in range(3)]
@@ -77,7 +77,7 @@ def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[to
 
 
 def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
-    """Return the gradient of the image, from that of the similarities or of the two sums [2]."""
+    """Return the gradient of the image from the gradient of the similarities [B, H, W, 3] or of the two sums [2]."""
     blocks, height, columns = _shape(image)
     v_image = torch.empty_like(image)
     arrays = [interop.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]

@@ -1,4 +1,4 @@
-"""Bookkeeping of a captured step, which reads its settings at the start and stores its loss at the end.
+"""Bookkeeping of a captured step: its settings are read at the start, and its loss is stored at the end.
 
 Torch would launch about twenty kernels on a few numbers each, which would take a tenth of a step's time.
 """
@@ -14,7 +14,7 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.runtime import interop
 
 NOT_FINITE = 2
-"""Value of the stop flag after a loss that is not finite; 1 after more instances than the capacity."""
+"""Value of the stop flag after a non-finite loss; the flag is 1 if the instances exceeded the capacity."""
 
 
 class Setting(IntEnum):
@@ -152,10 +152,10 @@ def begin_step(
     counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
     viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:  # fmt: skip
-    """Return the inputs of the step whose number is in device memory. Tensors are float32 by default.
+    """Return the inputs of the step whose number is in device memory. Tensors are float32 unless another type is given.
 
     Args:
-        counter: The step's number in its batch, int64, shape [1].
+        counter: Number of the step among the B steps that were prepared, int64, shape [1].
         view_rows: Number of each step's view, int64, shape [B].
         lr_rows: Learning rates of each step, shape [B, R].
         setting_rows: Settings of each step (`Setting`), shape [B, S].
@@ -181,17 +181,17 @@ def begin_step(
 def end_step(
     loss: torch.Tensor, mse: torch.Tensor, counter: torch.Tensor, stop: torch.Tensor, history: torch.Tensor
 ) -> torch.Tensor:
-    """Store a step's result, and count the step, unless something stops the batch: then the step is repeated.
+    """Store a step's result, then increase the counter if ``stop`` is 0; else the step is not counted, and can be repeated.
 
     Args:
         loss: Loss, float32, shape []. If it is not finite, ``stop`` becomes NOT_FINITE.
         mse: Mean squared error, float32, shape [].
-        counter: Number of the step, int64, shape [1]; increased by one if the batch continues.
+        counter: Number of the step, int64, shape [1]; increased by one if ``stop`` is 0.
         stop: 0, or the reason to stop, int32, shape [1].
         history: Loss and mean squared error of each step, float32, shape [B, 2].
 
     Returns:
-        True if the batch continues, bool, shape [1].
+        True if ``stop`` is 0, bool, shape [1].
     """
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
     inputs = [

@@ -21,7 +21,7 @@ from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, 
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
-"""Bytes of an instance with the gradient slot and the part of the saved states (blend_cuda.CHUNKS) on CUDA."""
+"""Bytes of an instance with its gradient slot and its part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
 MAX_INSTANCES = interop.MAX_SIZE // 2
 """Largest number of instances: a radix sort needs one array of twice that size."""
@@ -31,7 +31,7 @@ MAX_INSTANCES = interop.MAX_SIZE // 2
 class Tiles:
     """(Gaussian, tile) instances, sorted by tile and within a tile by depth; equal depths are in the order of Gaussian numbers.
 
-    ``i`` below is a flat Gaussian number in [0, C N), a tile number is ``camera * tiles + row * columns + column``.
+    A flat Gaussian number is ``camera * N + n`` for Gaussian n, a tile number is ``camera * tiles + row * columns + column``.
     """
 
     size: int
@@ -48,7 +48,7 @@ class Tiles:
     counts: torch.Tensor
     """Number of slots of each Gaussian, int32, shape [C * N]."""
     tile_ids: torch.Tensor
-    """Tile of each instance, int32, shape [M]; the number of tiles if the kernel found no such tile."""
+    """Tile of each instance, int32, shape [M]; C * tiles for an entry that belongs to no tile."""
     total: torch.Tensor
     """M, int64, shape [1], where kernels can read it."""
     visible: int = 0
@@ -77,7 +77,7 @@ class InstanceMemory:
     """Bytes; None for four fifths of the free memory."""
     capacity: int | None = None
     """Number of instances to allocate for. The actual number is then not read from the device, so the work can be captured as a
-    CUDA graph. None for the actual number. Unused entries have a number that no tile has."""
+    CUDA graph. None for the actual number. Unused entries have a tile number that no tile has."""
     overflow: torch.Tensor | None = None
     """Set to 1 where there are more instances than the capacity: the lists are then cut short and must not be used. Int32,
     shape [1]; needed with a capacity."""
@@ -220,9 +220,9 @@ def bin_tiles(
         rule: Cut-offs, the same as given to `project`.
         tile_size: Side of a tile [px].
         origin: Left and top [px] of the window given to `project`, multiples of ``tile_size``.
-        memory: Memory of the instances; M is its capacity where it has one.
+        memory: Memory of the instances; if it has a capacity, M is the capacity.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
-        listed: Tiles that get their instances, bool, shape [C * tiles]: the others stay empty. None for all.
+        listed: True for the tiles that get instances, bool, shape [C * tiles]; the others stay empty. None for all tiles.
 
     Raises:
         ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or

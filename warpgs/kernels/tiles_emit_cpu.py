@@ -15,7 +15,7 @@ from warpgs.kernels.tiles_emit import make_write
 
 @functools.cache
 def make_emit(real, slotted: bool):
-    """Make the kernel; arguments are those of `tiles_emit.make_emit`, and the scalar type."""
+    """Make the kernel; arguments are those of `tiles_emit.make_emit`."""
     s = make_spans(real, lanes=True)
     vec3 = wp.types.vector(3, real)
     lane_reals = wp.types.vector(LANES, real)

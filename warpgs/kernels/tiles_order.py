@@ -137,7 +137,7 @@ def running_counts(
         counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
         real: Scalar type of the Gaussians, of Warp.
         allocator: Provider of the sums' memory, which is workspace.
-        out: Sums of an earlier call with S counts, shape [S]; their memory is reused. None for new memory.
+        out: Result of an earlier call, shape [S], for reuse of its memory; None for new memory.
     """
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = sum_entries(count, native)

@@ -29,7 +29,7 @@ class DistanceGrid:
     truncation: float
     """Largest distance from a surface that is stored [u]."""
     distances: torch.Tensor
-    """Mean distance in front of the surface, in truncations, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
+    """Mean distance in front of the surface over ``truncation``, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
     weights: torch.Tensor
     """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
 

@@ -23,7 +23,7 @@ TOLERANCE = 0.02
 NEIGHBOURS = 16
 """Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
 MAX_PIXELS = 2**26
-"""Most pixels of all stored maps, 256 MiB; with more, every map is thinned alike."""
+"""Largest number of pixels of all stored maps, 256 MiB; with more, every map is thinned alike."""
 BOUNDS = (0.02, 0.98)
 """Quantiles of a view's depths that are taken as the depths of its nearest and farthest surface."""
 
@@ -68,7 +68,7 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     """Return a view without the depths that no other view confirms.
 
     A depth is kept if at least one other view has a surface within `TOLERANCE` of that point. It is also kept if no other view
-    has a surface in that direction, as outside of all other images. So a single view keeps all its depths.
+    has a surface in that direction, such as outside of all other images. So a single view keeps all its depths.
 
     Args:
         view: The view.

@@ -30,7 +30,7 @@ class MeshOptions:
     """Options of `fuse`."""
 
     voxel: float | None = None
-    """Distance of the grid points [u]; None to derive it from ``resolution``."""
+    """Distance between neighbouring grid points [u]; None to derive it from ``resolution``."""
     resolution: int | None = None
     """Voxels along the longest side of the grid; None for 256, or fewer if the images resolve less."""
     max_faces: int = 200_000
@@ -65,7 +65,7 @@ class FusedMesh:
     plan: GridPlan
     """Grid that it was made with."""
     unseen: float
-    """Fraction of the grid that no view saw."""
+    """Fraction of the grid points that no view saw."""
     extracted: int
     """Number of triangles before small parts were removed and the rest was simplified."""
     removed: int
@@ -103,7 +103,7 @@ def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
     stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
-    """Make a mesh of the surfaces that cameras see of a model.
+    """Make a mesh of the surfaces of a model that cameras see.
 
     Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
     for distances and for colours. Up to 16 million pixels in all are rendered once and kept. With more, each use renders one

@@ -22,7 +22,7 @@ FENCE = 3.0
 """Distance outside the quartiles, in interquartile ranges, beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
 Data Analysis)."""
 QUANTILES = (0.005, 0.995)
-"""Quantiles of the surface points along an axis that bound the grid, where `FENCE` allows a wider one."""
+"""Quantiles of the surface points along an axis that bound the grid, unless `FENCE` gives a tighter bound."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14
@@ -74,7 +74,7 @@ def plan_grid(
     Args:
         points: Points of the surfaces [u], shape [N, 3].
         footprints: Width of a pixel at each [u], shape [N].
-        voxel: Distance of the grid points [u]; None to derive it from ``resolution``.
+        voxel: Distance between neighbouring grid points [u]; None to derive it from ``resolution``.
         resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
             the median footprint.
 
@@ -103,7 +103,7 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     """Return how much memory a grid takes, as text, before it is allocated.
 
     Raises:
-        ResourceError: The device or the machine has less to spare, or the points are more than kernels can index.
+        ResourceError: The device or the machine has less free memory, or the points are more than kernels can index.
     """
     cpu = torch.device("cpu")
     needs = {device: plan.points * GRID_BYTES}

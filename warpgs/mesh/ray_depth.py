@@ -30,8 +30,8 @@ def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch
         camera: Camera, arrays of numpy.
 
     Returns:
-        Matrices, shape [N, 3, 3], with entries of at most 1: each row is divided by the ratio of its axis to the shortest axis.
-        And the means in camera space [u], shape [N, 3].
+        Matrices, shape [N, 3, 3], and the means in camera space [u], shape [N, 3]. Each row of a matrix is a unit axis of the
+        Gaussian, times the shortest scale over the scale of that axis.
     """
     view = torch.as_tensor(camera.viewmat, dtype=gaussians.means.dtype, device=gaussians.means.device)
     axes = rotation_matrices(torch.nn.functional.normalize(gaussians.quats, dim=1))
@@ -44,6 +44,8 @@ def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch
 
 def densest_depths(matrices: torch.Tensor, means: torch.Tensor, rays: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
     """Return the z-depth [u] at which each of k Gaussians is densest along a ray, shape [P, k].
+
+    If that depth is not above 0 or not finite, the depth of the mean is returned.
 
     Args:
         matrices: Matrices of `whitening`, shape [N, 3, 3].

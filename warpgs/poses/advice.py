@@ -12,7 +12,7 @@ from warpgs.poses.mapping import Mapping
 MIN_KEYPOINTS = 100
 """Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
 MIN_MATCHES = 15
-"""Number of matches that a pair needs; they agree with one motion of the camera."""
+"""Number of matches that a pair needs, all in agreement with one motion of the camera."""
 WEAK_MATCHES = 60
 """Matches below which the link between two photographs is called weak: a few wrong ones bend the poses."""
 WIDE_ANGLE = 30.0
@@ -82,6 +82,6 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     for i in found.views:
         best = [(n, j) for j, n in partners(found, i) if j in found.views]
         if best and best[0][0] < WEAK_MATCHES:
-            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}: they share {best[0][0]} matches only")
+            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}: they share only {best[0][0]} matches")
     more = len(said) - MAX_ADVICE
     return said[:MAX_ADVICE] + ([f"and {more} more; do these first"] if more > 0 else [])

@@ -35,7 +35,7 @@ MIN_PHOTOGRAPHS = 3
 FRAMES = 60
 """Default number of frames from a video."""
 LINKS = 6
-"""Pairs of photographs to report if no poses are found, those with the fewest matches first."""
+"""Number of pairs of photographs to report if no poses are found, those with the fewest matches first."""
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 """Files of a COLMAP model; the first three make a scene."""
 
@@ -84,10 +84,10 @@ def find_poses(
     matcher: str | Path | None = None,
     progress: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Find the poses of photographs or of a video's sharpest frames, and write a scene folder that holds those registered.
+    """Find the poses of photographs or of a video's sharpest frames, and write a scene folder with the registered ones.
 
-    The folder appears whole or not at all: ``images`` upright and without metadata, ``sparse/0`` as COLMAP has it, and the
-    record of which photographs have a pose and why (poses.json, poses.txt).
+    The folder appears whole or not at all. It contains ``images``, upright and without metadata; ``sparse/0``, a COLMAP model;
+    and a record of which photographs have a pose, with reasons (poses.json, poses.txt).
 
     Args:
         source: Folder of images, or a video file.

@@ -68,19 +68,20 @@ class Mapping:
     views: dict[int, FoundView]
     """Views of the largest model."""
     cameras: tuple[FoundCamera, ...]
-    """Cameras of its views."""
+    """Cameras of these views."""
     groups: tuple[tuple[int, ...], ...]
     """Photographs of each model, the largest first: photographs of different models share too little."""
     points: int
     """Number of points of the largest model."""
     error: float
-    """Mean reprojection error of its points [px of the photograph]; 0 without a model."""
+    """Mean reprojection error of these points [px of the photograph]; 0 without a model."""
     method: str
     """Mapper that made the model: incremental or global."""
     version: str
     """Version of pycolmap."""
     kept_focal: bool | None = None
-    """True if the focal length of EXIF is kept, because so few photographs cannot improve it; False if they contradict it."""
+    """True if the focal length of EXIF is kept, because so few photographs cannot improve it; False if they contradict it; None
+    if this was not tested."""
 
     @cached_property
     def links(self) -> dict[int, list[tuple[int, int]]]:

@@ -114,7 +114,7 @@ class Matcher:
         if not 0 < descriptors.shape[1] <= MAX_CHANNELS:
             raise DataError(f"{self.path}: its descriptors have {descriptors.shape[1]} numbers, not 1 to {MAX_CHANNELS}")
         if not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors)):
-            raise DataError(f"{self.path}: its outputs hold NaN, infinity or no floating-point numbers; check its weights")
+            raise DataError(f"{self.path}: its outputs contain NaN or infinity, or are not floating-point; check its weights")
         there = scores > 0
         inside = (keypoints >= 0) & (keypoints <= [w, h])
         if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
@@ -138,7 +138,8 @@ def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
         threads: CPU threads; 0 for as many as the process may use.
 
     Raises:
-        DataError: The file is missing, no ONNX model, needs other files or foreign operators, or has other inputs or outputs.
+        DataError: The file is missing, not an ONNX model, needs other files or foreign operators, or has other inputs or
+            outputs.
         ResourceError: onnxruntime is missing.
     """
     path = Path(path)
@@ -161,7 +162,7 @@ def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
 
 
 def mutual_matches(a: Features, b: Features) -> np.ndarray:
-    """Return the pairs of keypoints that are each other's most similar ones, uint32 [M, 2]."""
+    """Return the pairs of keypoints that are each other's most similar, with a cosine above `MIN_COSINE`, uint32 [M, 2]."""
     if not (len(a.pixels) and len(b.pixels)):
         return np.zeros((0, 2), np.uint32)
     products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T

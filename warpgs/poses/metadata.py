@@ -14,7 +14,7 @@ KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
 
 
 def without_jpeg_metadata(data: bytes) -> bytes:
-    """Return a JPEG file that decodes to the same pixels, without comments and application segments.
+    """Return a JPEG file that decodes to the same pixels, without comments and application segments (JFIF and Adobe stay).
 
     Data after the end of the image are removed, too: phones store films and depth maps there.
 

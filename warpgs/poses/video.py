@@ -23,7 +23,7 @@ MAX_FRAMES = 100_000
 MAX_FRAME_PIXELS = 2**26
 """Largest frame that is read [px]: 8K has half of that."""
 MAX_TOTAL_PIXELS = 2**40
-"""Most pixels of all frames that are read: an hour and a half of 4K at 25 frames a second."""
+"""Largest number of pixels of all frames that are read: an hour and a half of 4K at 25 frames a second."""
 START = 12
 """First bytes of a file, which identify its container."""
 BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")

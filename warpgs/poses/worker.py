@@ -34,7 +34,7 @@ CAMERA_MODEL = "SIMPLE_RADIAL"
 """One focal length and one coefficient of distortion, which a few photographs can determine."""
 
 KEEP_FOCAL = 4
-"""Most photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""
+"""Largest number of photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""
 MAX_RATIO = 1.05
 """Largest ratio of mean reprojection errors, with EXIF's focal length and with a free one, at which EXIF's is kept (decision
 017)."""

@@ -16,7 +16,8 @@ def check_arrays(camera: Camera) -> None:
     """Check types and shapes of a camera's arrays, the type of its size, and the values of arrays in main memory.
 
     Raises:
-        TypeError: An array is neither of numpy nor a tensor, sparse, or not of real numbers; or the size is not of integers.
+        TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real; or width or
+            height is not an integer.
         ValueError: A shape is wrong; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
             scales or shears, or has another last row than 0, 0, 0, 1.
     """
@@ -69,7 +70,7 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     (_, skew, _), (below, _, _), (left, middle, last) = matrix
     if max(map(abs, (skew, below, left, middle, last - 1))) > K_TOLERANCE:
         raise ValueError(
-            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not rendered; divide K by K[2, 2], and "
+            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: divide K by K[2, 2]; skew is not supported, so "
             "undistort images with skew"
         )
 
@@ -112,4 +113,4 @@ def _check_finite(matrix: list[list[float]], where: str) -> None:
 MATRICES = (
     ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
 )  # fmt: skip
-"""Matrices of a camera: name, rows, tolerance, function of the error, and check of a matrix with a larger error."""
+"""Matrices of a camera: name, rows, tolerance, function that computes the error, and check for matrices with a larger error."""

@@ -28,7 +28,7 @@ class ChunkedFrame:
 
 
 def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
-    """Split a window at a border of tiles into upper and lower half, or a row of tiles into two; None for one tile."""
+    """Split a window between rows of tiles into two halves, or a single row into left and right; return None for one tile."""
     x, y, width, height = window
     if height > tile_size:
         first = -(-height // (2 * tile_size)) * tile_size

@@ -1,7 +1,7 @@
 """Project, bin, blend: the steps from Gaussians to images.
 
-`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. Camera
-model, channels, cut-offs and window of a render are in `RenderSettings` and `ProjectInputs`, and nowhere else.
+`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. The camera
+model, the degree, the cut-offs and the window of a render are in `RenderSettings`, and nowhere else.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Composed:
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return an array as a tensor [C, ...] of the type of ``like``; the array of a single camera has ``axes`` axes."""
+    """Return an array as a tensor [C, ...] of the type and device of ``like``; for a single camera, it has ``axes`` axes."""
     tensor: torch.Tensor = array
     if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
         tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
@@ -74,7 +74,7 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
         opacity_factors: Factors of the opacities, shape [N]; None for 1.
 
     Raises:
-        TypeError: The scalar types of means and covariances, or of the factors, differ.
+        TypeError: The covariances or the factors have another scalar type than the means.
         ValueError: The covariances or the factors have another shape, or are on another device; or the camera's
             number of intrinsics or lenses is neither 1 nor that of its poses.
     """
@@ -119,7 +119,7 @@ def bin_projected(
         settings: Settings of the render.
         memory: Memory of the instances.
         slotted: True for gradients and `weights_of`; False is faster (`bin_tiles`).
-        listed: Tiles that get their instances, bool, shape [C * tiles]; None for all.
+        listed: True for the tiles that get instances, bool, shape [C * tiles]; None for all tiles.
 
     Raises:
         ResourceError: There are more instances than memory allows.
@@ -135,7 +135,7 @@ def compose(
     """Render the window of a batch of cameras. Differentiable as `project` and `blend` are.
 
     Args:
-        inputs: The tensors.
+        inputs: Tensors of Gaussians and cameras.
         backgrounds: Colour behind everything, shape [C, 3].
         settings: Settings of the render.
         memory: Memory of the instances.
@@ -213,7 +213,7 @@ def composite_into(
     projected: torch.Tensor, tile_counts: torch.Tensor, backgrounds: torch.Tensor, settings: RenderSettings,
     memory: InstanceMemory, save: bool = True,
 ) -> tuple[Tiles, Sequence[torch.Tensor]]:  # fmt: skip
-    """Bin and blend without autograd, in memory of the allocator; return what the backward pass needs, too.
+    """Bin and blend without autograd, in memory of the allocator; also return the tensors that the backward pass needs.
 
     Args:
         projected: Projected Gaussians, contiguous, shape [C, N, 12].

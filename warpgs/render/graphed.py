@@ -1,9 +1,9 @@
 """Rasterizer calls that repeat: on CUDA their kernels are captured as graphs, and replayed.
 
 At training sizes, launching twenty kernels takes the host longer than running them takes the GPU. A training loop calls the
-rasterizer with the same tensors, new values and another camera. Its memory requests repeat as well, so torch allocates at the
-same addresses. A captured graph is replayed if a call has the addresses of the capture; otherwise the kernels are launched one
-by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
+rasterizer with the same tensors, new values and another camera. The loop's memory requests repeat as well, so torch allocates
+at the same addresses. A captured graph is replayed if a call has the addresses of the capture; otherwise the kernels are
+launched one by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
 """
 
 from __future__ import annotations
@@ -36,22 +36,23 @@ from warpgs.runtime.device_memory import available_bytes
 MIN_CALLS = 3
 """Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and instances, as multiples of the largest numbers seen in such calls."""
+"""Capacity for visible Gaussians and for instances, as multiples of the numbers that a call needs, or that an equal call before
+needed when it exceeded its capacity, if these are larger."""
 SPARE = 1024
 """Number that is added to both capacities."""
 MAX_PROJECTED = 2**23
 """Largest number of projected Gaussians of a captured call. Larger calls take the GPU so long that a graph has no gain."""
 MAX_MEMORY_FRACTION = 0.05
-"""Largest fraction of the free memory that lists and saved states may take; calls that need more are not captured."""
+"""Largest fraction of the free memory that instances may take; calls that need more are not captured."""
 
 
 class Capacity(NamedTuple):
     """Numbers of a render that memory is allocated for."""
 
     visible: int
-    """Gaussians that touch a tile."""
+    """Number of Gaussians that touch a tile."""
     instances: int
-    """(Gaussian, tile) instances."""
+    """Number of (Gaussian, tile) instances."""
 
     def within(self, other: Capacity) -> bool:
         """Return whether neither number exceeds that of ``other``."""
@@ -84,7 +85,7 @@ class GraphedRasterizer:
         self.rendered = 0
         """Number of renders within the capacity."""
         self.needed = Capacity(0, 0)
-        """Numbers of the last call."""
+        """Numbers that the last call needed."""
         on_gpu = self.device.type == "cuda"
         self._host_total = wp.zeros(1, dtype=wp.int64, device="cpu", pinned=on_gpu)
         self._total, self._stream = self._host_total.numpy(), graphs.stream
@@ -183,7 +184,7 @@ class GraphedRasterizer:
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
-        """Return the gradients of projected Gaussians [C, N, 12] and backgrounds [C, 3], the latter None where not wanted."""
+        """Return gradients of projected Gaussians [C, N, 12], and of backgrounds [C, 3] or None if the latter is not wanted."""
         v_images = [None if v is None else v.contiguous() for v in v_images]
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:
@@ -334,8 +335,8 @@ def call_key(
     """Return the values that calls must have in common to use one rasterizer.
 
     None for calls that cannot be captured, and for those that need not be: very large ones. ``backgrounds`` [C, 3] may be None.
-    Calls without ``gradients`` are captured in the main thread alone: a viewer renders beside a loop that may wait for the
-    whole device.
+    Calls without ``gradients`` are captured only in the main thread: a viewer renders in another thread, beside a loop that may
+    wait for the whole device.
     """
     means, viewmats = inputs.means, inputs.viewmats
     cameras = viewmats.shape[0]  # len of a tensor takes ten times as long

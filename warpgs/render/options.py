@@ -36,7 +36,7 @@ class RasterizeOptions:
     """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     near: float | None = None
     """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. Whole
-    Gaussians are culled by the depth of their mean: along the camera's z axis or, for a fisheye, the distance."""
+    Gaussians are culled by the depth of their mean: z in camera axes or, for a fisheye, the distance."""
     far: float | None = None
     """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the rule's, 1e10."""
     sh_degree: int | None = None
@@ -93,14 +93,14 @@ class RasterizeOptions:
     """Largest number of (Gaussian, tile) instances at a time. An image with more is rendered in chunks, and each chunk again
     for its gradients. This gives the same image with less memory and more time. None for no limit. Not with ``capacity``."""
     record: bool = True
-    """True to replay repeated calls of a loop as CUDA graphs, with the same bits in half the time. It applies to calls with
-    gradients in a fixed order and, in the main thread, to calls without gradients. It does not apply with colors, features,
-    opacity factors, contributions, median depth, heaviest, error bound, absgrad, pixels and limits
-    (docs/decisions/010-recorded-calls.md). Use False if other threads wait for the whole device, as torch.cuda.synchronize
-    does."""
+    """True to replay repeated calls of a loop as CUDA graphs, with the same bits in half the time. Only calls with
+    ``deterministic`` are replayed, and calls without gradients only in the main thread. Calls with colors, features, opacity
+    factors, contributions, median depth, heaviest, error bound, absgrad, pixels, or a limit on memory or instances are not
+    replayed (docs/decisions/010-recorded-calls.md). Use False if other threads wait for the whole device, as
+    torch.cuda.synchronize does."""
 
     def __post_init__(self) -> None:
-        """Check the types of switches and numbers; other ranges are checked in `rasterize`.
+        """Check the types of switches and numbers, and the signs of some; other ranges are checked in `rasterize`.
 
         Raises:
             UsageError: An option has the wrong type, or is negative.
@@ -140,6 +140,6 @@ class RasterizeOptions:
 
 
 def image_settings(camera: Camera, degree: int, options: RasterizeOptions) -> RenderSettings:
-    """Return the settings by which a fit renders whole images: cut-offs and antialiasing are those of the options."""
+    """Return the settings by which a fit renders whole images; rule and antialiasing are those of the options."""
     rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
     return settings_of(camera, degree, rule, antialiased=options.antialiased)

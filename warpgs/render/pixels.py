@@ -52,7 +52,7 @@ def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
 
 
 def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -> torch.Tensor:
-    """Return for each tile of C cameras whether pixels [1, P, 2] or [C, P, 2] lie in it, as `bin_tiles` takes it, shape [T]."""
+    """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
     places = (pixels[..., 1] - y) // size * columns + (pixels[..., 0] - x) // size  # the edge of a window lies on tiles
@@ -63,6 +63,6 @@ def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -
 
 
 def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torch.Tensor:
-    """Return the values [C, P, ...] of images [C, H, W, ...] of a window at pixels [1, P, 2] or [C, P, 2]. Differentiable."""
+    """Read a window's images [C, H, W, ...] at pixels [1, P, 2] or [C, P, 2]; return values [C, P, ...]. Differentiable."""
     cameras = torch.arange(len(image), device=image.device)[:, None]
     return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]

@@ -74,7 +74,10 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
     if options.heaviest < 0:
         raise UsageError(f"heaviest must be at least 0, not {options.heaviest}")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
-        raise UsageError("max_instances must be at least 1, and cannot be combined with capacity")
+        raise UsageError(
+            "max_instances must be at least 1, and cannot be combined with capacity; found "
+            f"max_instances={options.max_instances}, capacity={options.capacity}"
+        )
     if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
         raise UsageError("pixels cannot be combined with window, contributions or capacity: leave those out")
     if options.capacity is not None and options.capacity > MAX_INSTANCES:
@@ -97,7 +100,7 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             listed = isinstance(given, (list, tuple))
-            order = "a list needs a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
+            order = "lists require a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
             wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be an instance of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
@@ -164,7 +167,7 @@ def _check_memory(window: Window, layers: list[_Layer], heaviest: int, like: tor
     if needed > free:
         raise ResourceError(
             f"images of {window[2]} x {window[3]} px need {needed:,} bytes, and {free:,} are free on {like.device}: render "
-            "smaller images, fewer cameras at once, or parts of an image by RasterizeOptions(window=...)"
+            "smaller images, fewer cameras at once, or parts of an image with RasterizeOptions(window=...)"
         )
 
 
@@ -268,7 +271,9 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     colors = _checked_channels("colors", options.colors, inputs)
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
-        raise UsageError(f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: use two calls")
+        raise UsageError(
+            f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render the others in a second call"
+        )
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
         gradients = needs_slots((*inputs, backgrounds))

@@ -27,7 +27,7 @@ def select_rule(
     gaussians: Gaussians, cameras: Iterable[Camera], *, max_error: float, measure: str = "mean",
     options: RasterizeOptions = DEFAULTS,
 ) -> tuple[str, float]:  # fmt: skip
-    """Return the fastest of the rules `fast`, `balanced` and `exact` that keeps a limit in every given view.
+    """Return the fastest of the rules `fast`, `balanced` and `exact` whose error is at most ``max_error`` in every given view.
 
     Each view is rendered with `RasterizeOptions.error_bound`, so the limit covers cut-offs and float32, and holds only for
     these Gaussians, cameras and options. Each view takes up to three renders in float32 and three in float64.
@@ -36,14 +36,14 @@ def select_rule(
         gaussians: The scene, N Gaussians.
         cameras: Views to measure.
         max_error: Largest error against rule `exact`, in units of the colours, usually [0, 1].
-        measure: ``mean`` over the pixels of a view, or ``max``; of each pixel the channel with the largest error counts.
+        measure: ``mean`` or ``max`` over the pixels of a view; the error of a pixel is the largest of its channels.
         options: Options of the renders, such as the background; their rule is not used.
 
     Returns:
-        The name of the rule, and its measured error: the largest of the views.
+        The name of the rule, and its largest measured error over the views.
 
     Raises:
-        UsageError: No rule keeps the limit, ``cameras`` is empty or not a list, the limit is not a positive number, or the
+        UsageError: No rule keeps the limit, ``cameras`` is empty or one camera, the limit is not a positive number, or the
             measure is unknown.
     """
     if not (isinstance(max_error, Real) and 0 < max_error < math.inf):
@@ -66,6 +66,6 @@ def select_rule(
         else:
             return rule, error
     raise UsageError(
-        f"no rule keeps a {measure} error of {max_error:g}: float32 alone errs by {error:.1e} under rule exact; raise "
-        "max_error, or render float64 tensors"
+        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, float32 rounding alone gives {error:.1e}; "
+        "raise max_error, or render float64 tensors"
     )

@@ -10,7 +10,7 @@ MAX_POINTS = 300
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return three to six round numbers that span a range."""
+    """Return three to six round numbers, evenly spaced, inside a range."""
     rough = (high - low) / 4
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough)

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 STATES = ("waiting", "running", "elsewhere", "done", "failed")
 STYLES = {"running": "bold", "elsewhere": "dim", "done": "green", "failed": "bold red"}
 LAST = 6
-"""Rows of jobs that ended last."""
+"""Number of rows for the jobs that ended last."""
 MOST_RUNNING = 12
-"""Rows of running jobs."""
+"""Largest number of rows for running jobs."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class JobRow:
 
     name: str
     state: str
-    """waiting, running, elsewhere, done or failed."""
+    """waiting, running, elsewhere (in another process), done or failed."""
     step: int = 0
     """Steps done; 0 if unknown."""
     seconds: float = 0.0
@@ -53,7 +53,7 @@ class FarmTable:
     """Context manager that shows the numbers of jobs by state, the running jobs, the last finished jobs, and the time left."""
 
     def __init__(self, *, live: bool | None = None):
-        """Prepare; ``live`` None shows the table where stdout is a terminal."""
+        """Prepare; ``live`` None shows the table only in a terminal."""
         self.live = is_live() if live is None else live
         self.began = self.printed = time.monotonic()
         self.rows: list[JobRow] = []

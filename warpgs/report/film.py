@@ -22,9 +22,9 @@ SUFFIXES = (*VIDEOS, *ANIMATIONS)
 def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names.
 
-    A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; its odd sides lose a row or column. An
-    animated image (.webp, .gif) runs in a loop. The film is decoded before it takes the place of an older one: the encoder does
-    not report a full disk.
+    A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; an odd height loses a row, an odd width
+    a column. An animated image (.webp, .gif) runs in a loop. The film is decoded before it takes the place of an older one: the
+    encoder does not report a full disk.
 
     Returns:
         The number of frames.

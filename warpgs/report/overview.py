@@ -112,7 +112,10 @@ def framing(shown: np.ndarray, direction: np.ndarray, up: np.ndarray, aspect: fl
 
 
 def within(points: np.ndarray, margin: float) -> np.ndarray:
-    """Return a mask [N] of points in the box of nine tenths of all points, enlarged by ``margin`` of its size at each side."""
+    """Return a mask [N] of the points in the box between the 5th and 95th percentiles, enlarged by ``margin`` at each side.
+
+    The margin is a fraction of the box's size.
+    """
     low, high = np.percentile(points, [5, 95], axis=0)
     return ((points >= low - margin * (high - low)) & (points <= high + margin * (high - low))).all(1)
 

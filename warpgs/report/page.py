@@ -171,7 +171,7 @@ class Page:
     title: str
     """Headline."""
     subtitle: str
-    """Line under it."""
+    """Line under the headline."""
     figures: list[tuple[str, str]]
     """Label and value of each key figure."""
     notes: list[str]
@@ -193,7 +193,7 @@ class Page:
     coverage: CoverageReport | None = None
     """Scores of held-out views by coverage, or None."""
     held_out: bool = True
-    """True where the views are held out; False where the fit was trained on them."""
+    """True if the views are held out; False if the fit was trained on them."""
 
 
 def write_page(path: Path, page: Page) -> None:

@@ -103,7 +103,7 @@ class Stages:
     """
 
     def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
-        """Show plain lines by ``show``; ``live`` None writes in place where ``show`` is left out and stdout is a terminal."""
+        """Print plain lines with ``show``; ``live`` None writes lines in place, but only without ``show`` and in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
 
@@ -149,7 +149,7 @@ class Progress:
     """
 
     def __init__(self, total: int, done: int = 0, *, live: bool | None = None):
-        """Prepare for ``total`` steps of which ``done`` are done; ``live`` None shows the panel where stdout is a terminal."""
+        """Prepare for ``total`` steps, of which ``done`` are already done; ``live`` None shows the panel only in a terminal."""
         self.total, self.told, self.step = total, done, done
         self.live = is_live() if live is None else live
         self.loss = self.psnr = self.seconds = None
@@ -183,7 +183,7 @@ class Progress:
             say(self._line())
 
     def update(self, *, step: int, loss: float, psnr: float, count: int, seconds: float | None = None) -> None:
-        """Show the numbers of one finished step; ``seconds`` is its time, None if the time says nothing about later steps."""
+        """Show the numbers of one finished step; ``seconds`` is its time, None if later steps will take another time."""
         self.step, self.count, self.doing = step, count, ""
         self.loss, self.psnr = _mean(self.loss, loss), _mean(self.psnr, psnr)
         self.seconds = self.seconds if seconds is None else _mean(self.seconds, seconds)

@@ -120,7 +120,7 @@ def render_plot(plot: ScenePlot, size: tuple[int, int], background: str) -> byte
     """Render a plot as PNG bytes.
 
     Args:
-        plot: The contents; of the points, those far outside are left out.
+        plot: The contents; points far outside are left out.
         size: Width and height [px].
         background: white or black.
 

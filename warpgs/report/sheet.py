@@ -53,7 +53,7 @@ def sheet(headings: list[str], strips: list[Strip]) -> bytes:
         strips: Rows; each has a cell per heading.
 
     Returns:
-        An 8-bit RGB PNG; images are scaled to one column width, crops below them to half of it.
+        An 8-bit RGB PNG; images are scaled to the width of a column, and the crops below them share this width.
     """
     from PIL import Image, ImageDraw, ImageFont
 

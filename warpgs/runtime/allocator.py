@@ -143,7 +143,7 @@ def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
     Args:
         table: Address of a table of three addresses of float32 numbers, in memory that the device of ``out`` can read.
         first: Count of numbers at the first address.
-        second: Count of numbers at the first two; the rest is at the third.
+        second: Count of numbers at the first two addresses together; the rest is at the third.
         out: Result, float32, contiguous, any shape.
     """
     interop.launch(make_fetch(), out.numel(), [table, first, second, interop.flat(out, wp.float32)], out.device)

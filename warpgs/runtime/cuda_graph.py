@@ -1,4 +1,4 @@
-"""CUDA graphs: capture of torch's and Warp's kernels, replay, the memory of graphs, and functions that are graphed by address.
+"""CUDA graphs of torch's and Warp's kernels: capture, replay, memory, and functions with a graph for each set of addresses.
 
 `CapturedGraph` is one graph. `GraphedFunction` captures a function of tensors wherever it meets the same addresses again.
 """
@@ -19,7 +19,8 @@ from warpgs.runtime import interop
 from warpgs.runtime.allocator import Arena, SizingAllocator, part
 
 MAX_GRAPHS = 8
-"""Most graphs of one function, each for one set of addresses: a loop that keeps its last result alternates between two sets."""
+"""Largest number of graphs of a function, one for each set of addresses; a loop that keeps its last result alternates between
+two sets."""
 MIN_REPLAYS = 30
 """Replays that pay for one capture."""
 FREE_CAPTURES = 16
@@ -44,7 +45,7 @@ def _no_collection():
 
 
 class CapturedGraph:
-    """A CUDA graph of the kernels that torch and Warp launch in one call, and everything that must live as long as it does."""
+    """A CUDA graph of the kernels that torch and Warp launch in one call, and the objects that it needs."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
         """Capture the work; nothing runs yet.
@@ -130,7 +131,7 @@ class GraphPool:
         return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
 
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
-        """Return a graph of ``work``, captured on a stream aside.
+        """Return a graph of ``work``, captured on a separate stream.
 
         Raises:
             RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
@@ -220,7 +221,7 @@ class GraphedFunction:
             return None
         except RuntimeError as error:  # of the driver, or of an allocator without support for graphs
             self.graphs.failed = True
-            message = f"rasterizer calls are no longer captured as CUDA graphs, so small ones are slower: {error}"
+            message = f"rasterizer calls are no longer captured as CUDA graphs, so small calls are slower: {error}"
             warnings.warn(message, stacklevel=2)
             return None
         if len(self._graphs) == MAX_GRAPHS:

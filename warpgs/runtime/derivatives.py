@@ -1,4 +1,4 @@
-"""Derivatives that the kernels do not have: second ones, and those of torch.func. They are rejected, never wrong."""
+"""Errors for derivatives that the kernels do not have: second derivatives, and transforms of torch.func."""
 
 from __future__ import annotations
 
@@ -77,7 +77,9 @@ class _WithoutGradient(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: torch.Tensor) -> None:
-        raise UsageError(f"{ctx.name} has no gradient: detach it, or differentiate rgb, alpha, depth or features")
+        raise UsageError(
+            f"{ctx.name} has no gradient: use {ctx.name}.detach(), or a loss of rgb, alpha, depth or features instead"
+        )
 
 
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:

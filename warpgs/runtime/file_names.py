@@ -1,4 +1,4 @@
-"""Names of files that are not UTF-8: any bytes are a name on Linux, and Python holds those that are not text as surrogates.
+"""File names that are not UTF-8: Linux allows any bytes in a name, and Python stores undecodable bytes as surrogates.
 
 Python opens such files. Libraries that expect UTF-8 fail on such names, and some end the process.
 """

@@ -36,8 +36,8 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
 
     The system releases the lock when its holder ends, killed or not. The lock also excludes processes in other containers. The
     lock file names the holder. Leftovers of killed writers are removed from the folder and from the system's temporary files.
-    In the block nothing below the folder is written through a link (`output_folder`). A folder that was made here and is still
-    empty when an error ends the block is removed as well; other folders are never removed.
+    In the block nothing below the folder is written through a link (`output_folder`). If an error ends the block, a folder that
+    was made here is removed if it is still empty; other folders are never removed.
 
     Args:
         folder: The folder.

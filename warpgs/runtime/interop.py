@@ -44,7 +44,7 @@ FEW_THREADS = 4
 """Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
 
 SERIAL_WORK = 20_000
-"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. A range has at least half."""
+"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. A range has at least half this."""
 
 MAX_SIZE = 2**31 - 1
 """Largest number of entries of an axis, and of items of a launch: Warp indexes them with signed 32-bit integers."""
@@ -133,7 +133,7 @@ def rows(tensor: torch.Tensor, dtype) -> View:
 
 
 def span(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, with the gaps between rows.
+    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, gaps between rows included.
 
     Rows are contiguous, and `View.row_stride` leads from each to the next.
     """
@@ -280,7 +280,7 @@ def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
 
 
 class _OfThread(threading.local):
-    """Recorded launches of a thread on the CPU by kernel: threads launch one kernel at the same time, with other arguments."""
+    """Recorded launches on the CPU by kernel, for each thread: two may launch a kernel at once, with different arguments."""
 
     def __init__(self):
         self.recorded: dict[object, _Recorded] = {}
@@ -292,7 +292,7 @@ _OF_THREAD = _OfThread()
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
 
-    On a CPU, torch's number of threads share the items; results are repeatable, since each item has its own output memory.
+    On a CPU, as many threads as torch uses share the items; results are repeatable, since each item has its own output memory.
 
     Args:
         kernel: Warp kernel whose item number is ``begin + wp.tid()``.

@@ -25,7 +25,7 @@ _LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
 def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]]:
     """Call ``listener`` within the block with the name of each module that the cache lacks, before it is compiled.
 
-    ``listener`` may be called from any thread. Yields a list that grows by the time of each module once it is compiled [s].
+    ``listener`` may be called from any thread. Yields a list, to which the compile time [s] of each module is added.
     """
     entry: tuple[Callable[[str], object], list[float]] = listener, []
     _LISTENERS.append(entry)
@@ -64,7 +64,7 @@ def exclusive(path: Path) -> Iterator[None]:
     """Hold a file, which is made if it is missing, so that one thread of one process at a time runs the body.
 
     The system releases the file when its holder ends, killed or not. On a file system without locks the body runs
-    without one: Warp renames a compiled module into place, so two processes that compile it only lose time.
+    unlocked: Warp renames a compiled module into place, so two processes that compile it only lose time.
 
     Raises:
         ResourceError: The file cannot be opened.

@@ -55,7 +55,7 @@ def _message(data: memoryview) -> Message:
                 raise ValueError(f"a field of wire type {wire} runs over the end")
             value, at = data[at : at + length], at + length
         if not 0 < number <= MAX_FIELD:
-            raise ValueError(f"field number {number}")
+            raise ValueError(f"invalid field number {number}")
         fields.append((number, value))
     return fields
 

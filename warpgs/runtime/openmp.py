@@ -23,7 +23,7 @@ def let_idle_threads_sleep() -> None:
 
 @functools.cache
 def warn_if_spinning() -> None:
-    """Warn, in the first call, where torch was imported first. The warning names the line that called the package."""
+    """Warn once if torch was imported before warpgs. The warning names the line that called the package."""
     if SPINNING:
         frame, level = sys._getframe(), 1
         while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in ("warpgs", "torch"):

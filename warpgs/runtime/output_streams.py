@@ -24,7 +24,7 @@ NAMES = ("stdin", "stdout", "stderr")
 def open_missing_descriptors() -> None:
     """Open the null device instead of a closed stdin, stdout or stderr.
 
-    Otherwise the next file that is opened gets that number, and output is written into it.
+    Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
     """
     for number in range(len(NAMES)):
         try:
@@ -57,7 +57,7 @@ def reason(error: BaseException) -> str:
 
 
 class CarefulStream:
-    """A text stream that never raises: the first error is kept, and later writes are dropped."""
+    """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
 
     def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
         """Wrap a stream.

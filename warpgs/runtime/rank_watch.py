@@ -1,4 +1,4 @@
-"""Watch of each process of a fit over the others: a lost rank stops all ranks with one error."""
+"""Mutual watch of the processes of a fit: if one rank is lost, all ranks stop and one prints the error."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def is_gone(process: int) -> bool:
 
 
 class RankWatch:
-    """Signs of life in a store, and a thread that reads those of the others.
+    """Signs of life in a store, and a thread that reads the signs of the other processes.
 
     Calls through one connection wait for each other, so the thread has its own connection.
     """
@@ -85,7 +85,7 @@ class RankWatch:
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
-        """Return the text that each process gives here, once all have; the thread ends this process if one is lost."""
+        """Return the text ``own`` of each process, once all have called this; if one is lost, the thread ends this process."""
         names = [f"text/{r}" for r in range(self.count)]
         self.store.set(names[self.rank], own)
         while not self.store.check(names):

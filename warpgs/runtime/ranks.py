@@ -31,7 +31,7 @@ EXCHANGE_TIME = timedelta(days=1)
 
 
 class Ranks:
-    """The processes of a fit; this class itself for a single process."""
+    """The processes of a fit; this class itself stands for a single process."""
 
     rank = 0
     """Number of this process."""
@@ -46,7 +46,7 @@ class Ranks:
         return self.rank == 0
 
     def to_each(self, sent: torch.Tensor) -> torch.Tensor:
-        """Return what every process has sent to this one, ``sent[r]`` being what goes to process r; shape [R, ...] both.
+        """Send ``sent[r]`` to each process r; return what this process receives, by rank; both have the shape [R, ...].
 
         Raises:
             ResourceError: A process is gone.
@@ -54,7 +54,7 @@ class Ranks:
         return sent
 
     def gather(self, own: torch.Tensor, found: torch.Tensor) -> None:
-        """Put what each process has, [S], one behind the other into ``found`` [R * S].
+        """Concatenate the tensors ``own`` [S] of all processes into ``found`` [R * S].
 
         Raises:
             ResourceError: A process is gone.
@@ -62,7 +62,7 @@ class Ranks:
         found.copy_(own)
 
     def texts(self, own: str) -> list[str]:
-        """Return the text that each process gives here, in the order of ranks; all call this once."""
+        """Return the text ``own`` of each process, in the order of ranks; every process must call this once."""
         return [own]
 
     def part(self) -> None:
@@ -85,7 +85,7 @@ class Group(Ranks):
         self.rank, self.count, self.backend, self.watch = rank, count, backend, watch
 
     def to_each(self, sent):
-        """Return what every process has sent to this one; shape [R, ...] both."""
+        """Send ``sent[r]`` to each process r; return what this process receives, shape [R, ...]."""
         import torch
         import torch.distributed as dist
 
@@ -95,7 +95,7 @@ class Group(Ranks):
         return received
 
     def gather(self, own, found):
-        """Put what each process has, [S], one behind the other into ``found`` [R * S]."""
+        """Concatenate the tensors ``own`` [S] of all processes into ``found`` [R * S]."""
         import torch.distributed as dist
 
         with self._watched():
@@ -115,7 +115,7 @@ class Group(Ranks):
             ) from e
 
     def texts(self, own):
-        """Return the text that each process gives here."""
+        """Return the text ``own`` of each process, in the order of ranks."""
         with self._watched():
             return self.watch.texts(own)
 
@@ -255,7 +255,7 @@ def last_words(line: str, code: int) -> int:
 
 
 def place_or_first() -> tuple[int, int]:
-    """Return `place`, or that of the first process if the variables are unusable."""
+    """Return the result of `place`, or 0 and 1 if the variables are unusable."""
     try:
         return place()
     except UsageError:

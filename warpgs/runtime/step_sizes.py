@@ -1,4 +1,4 @@
-"""Sizes of a training step, and the bytes that each of its parts declares for its moments.
+"""Sizes of a training step, and the bytes that its parts need at each moment.
 
 Each part declares its bytes beside its allocations, in a function of `StepSizes`; the memory plan only adds them up.
 """

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP end the program in one way; signals that it was started to ignore stay ignored."""
+"""Ctrl-C, SIGTERM and SIGHUP end the program in the same way; signals that it was started to ignore stay ignored."""
 
 from __future__ import annotations
 
@@ -96,6 +96,6 @@ def noted_signals() -> Iterator[Callable[[], bool]]:
 
 @contextlib.contextmanager
 def ignored_signals() -> Iterator[None]:
-    """Let signals pass while the body prints the last lines of a program that is already ending."""
+    """Drop signals while the body prints the last lines of a program that is already ending."""
     with _handled(signal.SIG_IGN):
         yield

@@ -22,13 +22,13 @@ ENDS_WITH_PARENT = (
 
 
 def end_with_parent() -> None:
-    """Have this process end when its parent ends, killed or not: its stdin ends then."""
+    """Have this process end with its parent, even if that is killed: the stdin of this process ends then."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
 
 
 @contextlib.contextmanager
 def _stdin_until_our_end() -> Iterator[int]:
-    """Give a stdin for a process that ends with this process or with the block, and holds nothing."""
+    """Give a child an empty stdin; the child ends once that closes, with the block or with this process."""
     read, write = os.pipe()
     try:
         yield read
@@ -90,7 +90,7 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
     """Run a module of this package in another process, and yield the lines of its stdout as they come.
 
-    Like that of `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
+    As in `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
     The module calls `end_with_parent`, so that the process ends when this one is killed.
 
     Args:
@@ -152,7 +152,7 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
 class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
-    Like that of `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
+    As in `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
     stops at the end of its stdin, which also follows if the parent is killed.
     """
 
@@ -191,7 +191,7 @@ class PythonWorker:
         yield from self._process.stdout
 
     def end(self, seconds: float) -> tuple[int, str]:
-        """Ask it to stop, then end it; return its exit code, and the end of its stderr."""
+        """Close the stdin of the process, kill it after ``seconds``; return its exit code and the end of its stderr."""
         with contextlib.suppress(OSError):
             if self._process.stdin is not None:
                 self._process.stdin.close()

@@ -93,7 +93,7 @@ def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: 
 
 
 def accept_all_letters() -> None:
-    """Let other libraries' output to stdout and stderr hold letters that the terminal does not have: as their codes."""
+    """Print letters that the terminal does not have as codes, also in the output of other libraries to stdout and stderr."""
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)
         if reconfigure is not None:

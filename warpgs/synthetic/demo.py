@@ -27,7 +27,7 @@ TAU = 2 * np.pi
 
 
 def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-    """Return a smoothed checker with five tinting waves between half and twice its pitch.
+    """Return a smoothed checker with five tinting waves, whose wavelengths are 0.6 to 2.2 times its period.
 
     Args:
         rng: Generator of directions, tints and phases.
@@ -137,8 +137,8 @@ def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Return True for points that a camera sees well enough for a feature detector.
 
-    A point counts where the rays through its projection and 1.5 px around it all hit the point's own shape, and the one
-    in the middle hits the point itself. Points on a silhouette, where a pixel mixes two surfaces, do not count.
+    A point counts if the rays through its projection and 1.5 px around it all hit the point's own shape, and the middle
+    ray hits the point itself. Points on a silhouette, where a pixel mixes two surfaces, do not count.
 
     Args:
         shapes: Shapes of the scene.
@@ -279,7 +279,7 @@ def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str],
 
 
 def write_files(folder: Path, size: tuple[int, int], contents: Callable[[], dict[str, bytes]]) -> None:
-    """Write the files of a demo as a new or empty folder, whole or not at all.
+    """Write the files of a demo into a new or empty folder, all or none.
 
     Args:
         folder: Target folder.

@@ -1,4 +1,4 @@
-"""A small ray caster in numpy: closed shapes with smooth solid textures under one soft light, no GL, no mesh.
+"""A small ray caster in numpy: shapes with smooth solid textures under one soft light, without OpenGL and without meshes.
 
 With it the demo scene needs no download and no graphics driver. Every shape computes the first hit of a ray in its own frame,
 the normal there and its radius. So an image, the exact depth of a pixel and the visibility of a point all come from the same
@@ -176,7 +176,7 @@ class Cylinder(Shape):
     size: float = 1.0
     """Radius of the shape [u]."""
     half_height: float = 1.0
-    """Half its height [u]."""
+    """Half the height of the shape [u]."""
 
     @property
     def radius(self) -> float:

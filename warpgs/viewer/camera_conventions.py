@@ -1,4 +1,4 @@
-"""Cameras between our conventions and the viewer's: poses as camera-to-world, fields of view, an upward direction."""
+"""Conversion of cameras to the viewer's conventions and back: poses as camera-to-world, fields of view."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
 
 
 def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
-    """Return a pinhole camera from that of a browser: camera-to-world rotation, position [u], vertical angle."""
+    """Return a pinhole camera from a browser's: camera-to-world rotation, position [u], vertical field of view [rad]."""
     rotation = rotation_matrices(np.asarray(wxyz, np.float64)).T
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, np.asarray(position, np.float64))
@@ -62,6 +62,6 @@ def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> 
 
 
 def stands_at(camera: Camera, other: Camera, near: float) -> bool:
-    """Return whether two cameras are within ``near`` [u] of each other and look the same way to a thousandth."""
+    """Return whether two cameras are within ``near`` [u] of each other, and their axes within 1.8 degrees."""
     turned = float(np.trace(matmul(camera.viewmat[:3, :3], other.viewmat[:3, :3].T)))
     return bool(np.linalg.norm(camera.center - other.center) <= near) and turned > 3 - 1e-3

@@ -31,7 +31,7 @@ class Content:
     model: FittedModel
     """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
     stem: Path
-    """Beginning of the paths of files that are saved from the viewer: RUN/ for a run, x. for x.ply."""
+    """Beginning of the paths of files that are saved from the viewer: RUN for RUN/crop.json, x for x-crop.json beside x.ply."""
     fine: torch.Tensor | None = None
     """True for Gaussians of the fine layer, bool, shape [N]; None without layers."""
     views: Mapping[str, View] = field(default_factory=dict)
@@ -73,7 +73,7 @@ def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, Vie
     try:
         _, train, test = scene_of(content.model, reader)
     except WarpgsError as e:
-        return {}, [f"cameras come without photographs, since the scene cannot be read: {e}"]
+        return {}, [f"cameras are shown without photographs, since the scene cannot be read: {e}"]
     return {v.name: v for v in [*train, *test]}, []
 
 

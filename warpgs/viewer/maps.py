@@ -40,7 +40,7 @@ class Maps:
         self._depths: list[DepthView] | None = None
 
     def view_at(self, camera: Camera) -> str | None:
-        """Return the name of the model's camera at the same position as a camera; None without one."""
+        """Return the name of the model's camera at nearly the same pose as a camera; None without one."""
         cameras = self.content.model.scene_cameras.items()
         return next((n for n, c in cameras if stands_at(camera, c, NEAR * self.extent)), None)
 

@@ -41,8 +41,8 @@ def packed(gaussians: Gaussians) -> Packed:
     """Return Gaussians for the browser.
 
     Half precision is too coarse for covariances in scene units: an axis of 0.001 u has the square 1e-6, of which four bits
-    remain; the square of an axis below 0.00017 u becomes 0. Units in which the median axis is 1 keep eleven bits of nearly all
-    squares.
+    remain; the square of an axis below 0.00017 u becomes 0. In units in which the median of the longest axes is 1, nearly all
+    squares keep eleven bits.
 
     Args:
         gaussians: N Gaussians, on any device.

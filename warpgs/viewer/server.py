@@ -81,7 +81,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
 
 
 def address(server: viser.ViserServer) -> str:
-    """Return the address to open in a browser, with the secret that lets it in."""
+    """Return the address to open in a browser, with the secret that grants access."""
     return str(server.rules.guard.address(server.get_port()))
 
 

@@ -125,15 +125,15 @@ class Window:
             self._frusta[name] = frustum
 
     def step_into(self, name: str, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or by default all, to a camera of the model, with its field of view."""
+        """Give a browser, or all browsers if ``client`` is None, the pose and field of view of a camera of the model."""
         self._move(self.content.model.scene_cameras[name], client)
 
     def reset(self, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or by default all, back to where pages start."""
+        """Move the camera of a browser, or of all browsers if ``client`` is None, back to where it started."""
         self._move(self.first, client)
 
     def _move(self, camera: Camera, client: viser.ClientHandle | None) -> None:
-        """Move a browser's camera, or all, to a camera; its whole image is in the window."""
+        """Give a browser, or all browsers if ``client`` is None, the pose of ``camera``, and show its whole image."""
         forward, up = np.asarray(camera.viewmat[2, :3]), -np.asarray(camera.viewmat[1, :3])
         ahead = distance_ahead(camera, self.content.model.gaussians())
         for c in [client] if client is not None else list(self.server.get_clients().values()):
@@ -167,7 +167,7 @@ class Window:
                 frustum.visible = not frustum.visible
 
     def _eyes(self) -> list[np.ndarray]:
-        """Return the position [3] of each browser's camera; where pages start, before a browser has sent its own."""
+        """Return the position [3] of each browser's camera: that of the first view until a browser sends its own."""
         eyes = []
         for client in self.server.get_clients().values():
             try:

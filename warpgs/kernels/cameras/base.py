@@ -72,6 +72,7 @@ def check_camera(camera: Camera) -> type[CameraModel]:
         )
     if getattr(camera.distortion, "requires_grad", False):
         raise UsageError(
-            "distortion coefficients have no gradient: detach Camera.distortion; gradients of the pose and of K are supported"
+            "gradients of distortion coefficients are not supported, only those of the pose and of K: give "
+            "Camera.distortion.detach()"
         )
     return model
