@@ -71,5 +71,6 @@ def test_a_fit_ends_with_its_score_its_size_its_time_and_what_to_do_next(tmp_pat
         )
     ]  # fmt: skip
     unscored = result_lines(metrics | {"test": {}, "seconds": {"total": 5.0}}, None)
-    assert unscored[0].startswith("training PSNR 30.25 dB (no view is held out") and unscored[1].endswith("1.0 MiB, in 5 s")
+    assert unscored[0] == "training PSNR 30.25 dB (no score of new views: no view is held out)"
+    assert unscored[1].endswith("1.0 MiB, in 5 s")
     assert "held-out" not in " ".join(unscored) and "next:" not in unscored
