@@ -114,8 +114,8 @@ class Registry(Generic[T]):
             own = name.rpartition(":")[2]
             in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
-                f"the {self.kind} {name!r} is a class of your own. Files cannot import code: give the class again, on the "
-                f"command line or in Python{in_study}"
+                f"the {self.kind} {name!r} is a class of your own. The file of a preset or run does not load its code: "
+                f"name the class on the command line, or pass it in Python{in_study}"
             )
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpgs.field_docs import document_fields
+
 if TYPE_CHECKING:
     import torch
 
@@ -331,6 +333,7 @@ RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
 """All that `rasterize` takes as Gaussians."""
 
 
+@document_fields
 @dataclass(frozen=True)
 class Render:
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C).

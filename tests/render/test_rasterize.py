@@ -161,11 +161,21 @@ def test_arguments_of_another_type_or_shape_are_named():
         (TypeError, "means must be a tensor, not ndarray", (dataclasses.replace(gaussians, means=np.zeros((3, 3))), cam)),
         (ValueError, r"camera.K must have shape \[3, 3\] or", (gaussians, dataclasses.replace(cam, K=torch.eye(4)))),
         (ValueError, r"camera.viewmat .*not \[3, 4\]", (gaussians, dataclasses.replace(cam, viewmat=cam.viewmat[:3]))),
-        (ValueError, r"camera.K must be \[\[fx, 0, cx\]", (gaussians, dataclasses.replace(cam, K=2 * cam.K))),
         (
             ValueError,
-            "skew is not supported",
-            (gaussians, dataclasses.replace(cam, K=skewed)),
+            "camera.K must have the last row 0, 0, 1, not 0, 0, 2;",
+            (gaussians, dataclasses.replace(cam, K=2 * cam.K)),
+        ),
+        (ValueError, "camera.K has a skew of 0.1 px, which is not", (gaussians, dataclasses.replace(cam, K=skewed))),
+        (
+            ValueError,
+            "focal lengths other than 0, not 0 and 9",
+            (gaussians, dataclasses.replace(cam, K=skewed * [[0], [1], [1]])),
+        ),
+        (
+            TypeError,
+            "camera.K must be float32 or float64, not torch.float16",
+            (gaussians, dataclasses.replace(cam, K=cam.K.half())),
         ),
         (
             TypeError,

@@ -200,7 +200,7 @@ def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str
     others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
     if not others:
         unread = unread_note(full)
-        raise DataError(f"{full}: {unread}" if unread else f"{root}: no folder '{base}' with images; put the images there")
+        raise DataError(f"{full}: {unread}" if unread else f"{full}: missing, or without images; put the images into it")
     largest = others[min(others)]
     how = f", area-resampled by {downscale}" if downscale > 1 else ""
     return largest, downscale, f"no full-size folder '{base}': images taken from {largest.name}{how}"

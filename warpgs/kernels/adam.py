@@ -206,7 +206,7 @@ def adam_step(
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device disagrees, a tensor to be updated is not contiguous, or ``step`` is below 1.
+        ValueError: A shape or device is wrong, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)
     interop.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))

@@ -279,7 +279,7 @@ def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device disagrees, or the tiles belong to another image size.
+        ValueError: A shape or device is wrong, or the tiles belong to another image size.
     """
     sizes = interop.check(projected=(projected, "C N 12"), **backgrounds)
     columns, rows = grid(width, height, tiles.size)
@@ -327,7 +327,7 @@ def blend(
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device disagrees, or the tiles belong to another image size.
+        ValueError: A shape or device is wrong, or the tiles belong to another image size.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
     settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)

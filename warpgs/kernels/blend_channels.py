@@ -224,7 +224,7 @@ def blend_channels(
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device disagrees, there is no channel, or the tiles belong to another image size.
+        ValueError: A shape or device is wrong, there is no channel, or the tiles belong to another image size.
     """
     shared = "1" if len(colors) == 1 else "C"
     check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))

@@ -202,7 +202,7 @@ def project(
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera model is unknown.
-        ValueError: A shape or device disagrees; the message names argument, expected and found.
+        ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
     """
     if distortion is None:
         distortion = viewmats.new_empty(len(viewmats), 0)
@@ -225,7 +225,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
-        ValueError: A shape or device disagrees; the message names argument, expected and found.
+        ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
     """
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")

@@ -230,7 +230,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device disagrees.
+        ValueError: A shape or device is wrong.
     """
     _check(image, target)
     target = target.detach()
@@ -257,7 +257,7 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device disagrees.
+        ValueError: A shape or device is wrong.
     """
     _check(image, target)
     target = target.detach()

@@ -20,7 +20,7 @@ from warpgs.scene import Camera
 
 @dataclass(frozen=True)
 class DistanceGrid:
-    """A grid of X x Y x Z points along the world axes, with the fused depths."""
+    """A grid of X x Y x Z points, parallel to the world axes, with truncated signed distances fused from depth maps."""
 
     origin: tuple[float, float, float]
     """Position of the first point [u]."""
@@ -230,7 +230,7 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
         ResourceError: The grid has more points than kernels can index.
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera is not a pinhole.
-        ValueError: A shape or device disagrees.
+        ValueError: A shape or device is wrong.
     """
     check_pinhole(camera)
     interop.check(
@@ -266,7 +266,7 @@ def gather_colors(
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
         UsageError: The camera is not a pinhole.
-        ValueError: A shape or device disagrees.
+        ValueError: A shape or device is wrong.
     """
     check_pinhole(camera)
     interop.check(

@@ -215,7 +215,7 @@ def write_matches(
         progress: Called with lines for the user.
 
     Returns:
-        The photographs that the network saw rotated, because they match others that way.
+        Indices of the photographs that were rotated before the network saw them, because they match others better so.
     """
     found = []
     for i, image in enumerate(images):

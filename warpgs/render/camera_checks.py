@@ -16,10 +16,10 @@ def check_arrays(camera: Camera) -> None:
     """Check types and shapes of a camera's arrays, the type of its size, and the values of arrays in main memory.
 
     Raises:
-        TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real; or width or
-            height is not an integer.
-        ValueError: A shape is wrong; a number is not finite; K has a skew or another last row than 0, 0, 1; or a viewmat
-            scales or shears, or has another last row than 0, 0, 0, 1.
+        TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real or have half
+            precision; or width or height is not an integer.
+        ValueError: A shape is wrong; a number is not finite; K has a focal length of 0, a skew or another last row than
+            0, 0, 1; or a viewmat scales or shears, or has another last row than 0, 0, 0, 1.
     """
     for name, rows, tolerance, off, check in MATRICES:
         given: Any = getattr(camera, name)
@@ -53,25 +53,33 @@ def _check_type(name: str, array: Any) -> None:
         )
     if isinstance(array, torch.Tensor) and array.layout != torch.strided:
         raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
+    if str(array.dtype).removeprefix("torch.") in ("float16", "bfloat16"):
+        raise TypeError(f"camera.{name} must be float32 or float64, not {array.dtype}: its rounding would shift the image")
     real = not array.is_complex() if isinstance(array, torch.Tensor) else array.dtype.kind in "fiub"
     if not real:
         raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
 
 
 def _skew_of(matrix: list[list[float]]) -> float:
-    """Return the sum of the errors of the fixed entries of K; non-finite if an entry of K is."""
+    """Return the sum of the errors of the fixed entries of K; non-finite if an entry of K is, or if a focal length is 0."""
     (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
+    if not (fx and fy):
+        return math.inf
     return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
 
 
 def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     """Raise ValueError where the intrinsics are not those of a camera without skew."""
     _check_finite(matrix, where)
-    (_, skew, _), (below, _, _), (left, middle, last) = matrix
-    if max(map(abs, (skew, below, left, middle, last - 1))) > K_TOLERANCE:
+    (fx, skew, _), (below, fy, _), (left, middle, last) = matrix
+    if not (fx and fy):
+        raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
+    if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
+        raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide it by its [2, 2]")
+    if max(abs(skew), abs(below)) > K_TOLERANCE:
         raise ValueError(
-            f"{where} must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: divide K by K[2, 2]; skew is not supported, so "
-            "undistort images with skew"
+            f"{where} has a skew of {skew or below:g} px, which is not supported: K must be [[fx, 0, cx], [0, fy, cy], "
+            "[0, 0, 1]]; undistort the images"
         )
 
 

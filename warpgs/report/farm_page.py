@@ -1,4 +1,4 @@
-"""Index of a farm: one HTML page with a card for each job, and its failures by message."""
+"""Index of a farm: one HTML page with a card for each job, and all failures, grouped by message."""
 
 from __future__ import annotations
 

@@ -372,7 +372,7 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
 
     Raises:
         TypeError: An argument is not a tensor, or sparse, or its scalar type is neither float32 nor float64, or types differ.
-        ValueError: A shape or a device disagrees; the message names the argument, expected and found.
+        ValueError: A shape or a device is wrong; the message names the argument and both values, expected and found.
     """
     sizes: dict[str, int] = {}
     first_name, first = "", None

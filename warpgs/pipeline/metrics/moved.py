@@ -141,7 +141,7 @@ def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[
 
 
 def moved_notes(fractions: dict[str, float]) -> list[str]:
-    """Return notes that name views with moved regions, by the fraction of their pixels."""
+    """Return a note that names the views with moved regions, the largest fraction of moved pixels first; empty without any."""
     named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
     if not named:
         return []

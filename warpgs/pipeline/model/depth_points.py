@@ -151,8 +151,8 @@ def coarse_points(
             `complete`. No filled point is in space that another view sees through, or in the cell of a consistent point. Views
             without estimated depth get none, so that the work for each view is bounded.
         source: Name of the source in the notes, such as sweep or flow.
-        known: Points of a reconstruction. Points that at least two of the views saw are used where no depth is consistent, and
-            their depths are filled in around them.
+        known: Points of a reconstruction. A point is used if at least two of the views see it and no depth is consistent there;
+            depth around such points is interpolated from them.
 
     Returns:
         The cloud: consistent points first, then points of the reconstruction, then filled points. And notes: one per view

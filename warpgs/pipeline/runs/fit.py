@@ -238,7 +238,7 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
     with background_warmup(c, job.device) as ready:
         if job.other_models:
             models = " and ".join(job.other_models)
-            job.notes.append(f"camera model {models}: photographs cannot be compared, so coverage is not measured")
+            job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
         else:
             job.photographs = check_photos([*job.train, *job.test], job.progress)
         of = job.train, job.scene.points, c, job.device, job.scene.background

@@ -95,8 +95,8 @@ class LossTerm:
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes that the term needs at the moments of a step.
 
-        The default is four maps at the loss for a term that reads depth, which suffices for a correlation of two maps with
-        its gradient, and none for other terms. Override it in a term that needs more.
+        By default, a term that reads depth needs four maps when the loss is computed, and other terms need none. Four maps
+        suffice to correlate two maps and to compute the gradient. Override this in a term that needs more.
         """
         return {LOSS: 4 * FLOAT * sizes.pixels if "depth" in self.needs_outputs else 0}
 

@@ -79,7 +79,7 @@ class TrainingView:
 
     @property
     def countable(self) -> torch.Tensor | None:
-        """Mask of the unmasked, opaque pixels, 1 or 0, shape [H, W]; None for all pixels."""
+        """1 at pixels that are opaque and not masked out, else 0, shape [H, W]; None if all pixels count."""
         if self.alpha is None:
             return self.mask
         opaque = (self.alpha > OPAQUE).to(self.image.dtype)
