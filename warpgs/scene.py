@@ -359,8 +359,7 @@ class Render:
     """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only with ``RasterizeOptions.contributions``. It has
     no gradient: a backward pass through it is an error."""
     overflow: torch.Tensor | None = None
-    """1 if the instances exceeded ``RasterizeOptions.capacity``; then do not use the images. Else 0. Int32, shape [1]; only
-    with a capacity."""
+    """1 if the instances exceeded ``RasterizeOptions.capacity``, so that the images are unusable; else 0. Int32, shape [1]."""
     median_depth: torch.Tensor | None = None
     """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. Only
     if requested. It has no gradient: a backward pass through it is an error."""
@@ -369,7 +368,6 @@ class Render:
     ``RasterizeOptions.error_bound``. Only if requested. It has no gradient: a backward pass through it is an error."""
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only with features."""
-
     heaviest_ids: torch.Tensor | None = None
     """Indices of the k Gaussians of largest blending weight in each pixel, heaviest first, the nearer first if equal; -1 if
     there are fewer. Int32, shape [..., H, W, k]; only with ``RasterizeOptions.heaviest``."""
@@ -377,8 +375,7 @@ class Render:
     """Blending weights of ``heaviest_ids``, 0 for missing ones, shape [..., H, W, k]. They have no gradient: a backward pass
     through them is an error."""
     blend_counts: torch.Tensor | None = None
-    """Number of Gaussians blended in each pixel; their weights sum to ``alpha``. Int32, shape [..., H, W]; only with
-    ``RasterizeOptions.heaviest``."""
+    """Number of Gaussians blended in each pixel, int32, shape [..., H, W]; only with ``RasterizeOptions.heaviest``."""
     absgrad: bool = False
     """True where ``RasterizeOptions.absgrad`` was set."""
 
