@@ -13,7 +13,7 @@ from warpgs.pipeline.train.by_views import OPAQUE_STEPS
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`, without its extrapolated points; the degree follows from the number of views."""
 NO_EXTRAPOLATION = "init.extrapolate=false"
-STEPS = (500, 1000, 2000)
+STEPS = (125, 250, 500, 1000, 2000)
 """Numbers of steps, of which one is chosen by scores on left-out training views."""
 SCORES = "method.s_render=true,method.s_semantic=true,method.s_geometry=true"
 NO_GROWTH = "density.gradient=1e9"
@@ -41,7 +41,7 @@ RIVALS = (
     Arm("`default` without extrapolated points", f"default:{NO_EXTRAPOLATION}"),
     Arm("`default`", "default"),
     Arm("`3dgs`", f"3dgs:{ONE_RULE}", STEPS),
-    Arm("CoR-GS", COR_GS, (1500, 3000)),
+    Arm("CoR-GS", COR_GS, (750, 1500, 3000, 6000)),
     Arm("gsplat", GSPLAT, STEPS),
     Arm("gsplat, as many steps as `default`", f"{GSPLAT},steps={OPAQUE_STEPS}"),
     Arm("gsplat, 7,000 steps", f"{GSPLAT},steps=7000"),
