@@ -1,5 +1,6 @@
 """Presets side by side: rows and what is left out of them, the worker processes, one fit, and the tables."""
 
+import functools
 import math
 import sys
 from dataclasses import dataclass
@@ -59,6 +60,12 @@ def test_failures_are_results_and_no_task_begins_after_the_limit():
     found = dict(finished(eval, ["1 / 0", died, good], 1, math.inf))  # built in: workers import nothing
     assert found["1 / 0"]["error"].startswith("ZeroDivisionError") and found[good] == {"square": 4}
     assert "Broken" in found[died]["error"]
+
+
+def test_an_error_before_the_first_task_is_not_lost():
+    """Without compiled kernels, every worker would compile them again."""
+    with pytest.raises(ZeroDivisionError):
+        list(finished(eval, ["{}"], 1, math.inf, functools.partial(divmod, 1, 0)))
 
 
 def test_a_fit_gives_a_row_and_the_peer_starts_from_the_same_points(demo, gsplat, monkeypatch):  # noqa: F811

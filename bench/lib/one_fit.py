@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import gc
 import json
-import re
 import statistics
 import tempfile
 import time
@@ -19,10 +18,11 @@ import torch
 import warpgs
 from bench.lib import gsplat_trainer
 from bench.lib.scenes import folds, scene_at
-from bench.lib.training import compile_kernels, finish, full_bytes, make_trainer, model_bytes
+from bench.lib.training import finish, full_bytes, make_trainer, model_bytes
 from warpgs.errors import UsageError
 from warpgs.io.splits import split_views
 from warpgs.pipeline.metrics.evaluate import render_view, score
+from warpgs.pipeline.runs.precompile import precompile_kernels
 from warpgs.pipeline.runs.prune import prune
 from warpgs.pipeline.runs.request import SceneRequest
 from warpgs.pipeline.train.background import mean_color
@@ -129,12 +129,11 @@ def _change(values: dict, preset: str, changes: str) -> None:
 
 
 def compile_all(presets: tuple[str, ...], device: str) -> None:
-    """Compile the kernels of fits of these presets, including gsplat's; presets that differ only in steps share kernels."""
-    for preset in dict.fromkeys(re.sub(r"(?<=[:,])steps=\d+,?", "", p) for p in presets):
-        if is_peer(preset):
-            gsplat_trainer.compile_kernels(torch.device(device))
-        else:
-            compile_kernels(config_of(preset), torch.device(device))
+    """Compile the kernels of fits on a device, and those of gsplat if one of the presets is gsplat's."""
+    for _ in precompile_kernels([torch.device(device)]):
+        pass
+    if any(map(is_peer, presets)):
+        gsplat_trainer.compile_kernels(torch.device(device))
 
 
 def plan(row: str, preset: str, seed: int, folder: str, place: tuple[str, int], count: int, device: str) -> list[Fit]:

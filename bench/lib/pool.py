@@ -30,12 +30,15 @@ def finished(
         jobs: Tasks at a time.
         seconds: Time after which no further task begins [s].
         first: Function of a module, called in one worker before any task begins, to compile kernels once for all.
+
+    Raises:
+        Exception: ``first`` raised it.
     """
     began, waiting = time.monotonic(), deque(tasks)
     while waiting and time.monotonic() - began < seconds:
         with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
             running: dict[Future, object] = {}
-            broken = first is not None and isinstance(pool.submit(first).exception(), BrokenProcessPool)
+            broken = first is not None and _died(pool.submit(first))
             first = None
             while not broken:
                 while waiting and len(running) < jobs and time.monotonic() - began < seconds:
@@ -49,6 +52,14 @@ def finished(
                     yield task, {"error": f"{type(error).__name__}: {error}"} if error else future.result()
             for future, task in running.items():
                 yield task, {"error": f"{type(future.exception()).__name__}: {future.exception()}"}
+
+
+def _died(started: Future) -> bool:
+    """Return whether the worker died; raise what the function raised."""
+    error = started.exception()
+    if error is None or isinstance(error, BrokenProcessPool):
+        return error is not None
+    raise error
 
 
 def stored_rows(path: Path | None, **facts) -> list[dict]:

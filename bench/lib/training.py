@@ -24,7 +24,6 @@ from warpgs.pipeline.train.step_graphs import StepGraphs
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import ViewStack
-from warpgs.pipeline.train.warmup import warm_up
 from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.ranks import ALONE
 from warpgs.scene import Camera, Gaussians, PointCloud, View
@@ -53,11 +52,6 @@ def set_gaussians(trainer: Trainer, gaussians: Gaussians) -> None:
 def state_tensors(trainer: Trainer) -> list[torch.Tensor]:
     """Return parameters, moments and columns of the Gaussians, in a fixed order."""
     return [t for _, t in sorted(trainer.table.state().items())]
-
-
-def compile_kernels(config: FitConfig, device: torch.device) -> None:
-    """Compile all kernels that a fit with these settings uses, by a tiny fit."""
-    warm_up(config, device)
 
 
 def finish(trainer: Trainer) -> None:
