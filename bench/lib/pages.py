@@ -23,11 +23,12 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "formats.md": lambda: {"formats": use_pages.formats()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
     "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
-    "method.md": lambda: {"placement": method_page.placement()},
+    "method.md": lambda: {"placement": method_page.placement(), "scores": method_page.scores()},
     "performance.md": performance_page.parts,
     "results.md": lambda: {
         **results_page.parts(),
         "rivals": rivals_page.rivals(),
+        "other steps": rivals_page.other_steps(),
         "ladder of default": rivals_page.ladder_of_default(),
     },
     "trade.md": trade_page.parts,

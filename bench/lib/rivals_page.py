@@ -12,7 +12,7 @@ from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.statistics import family_confidence, paired_difference
 
-SEEDS = 2
+SEEDS = 3
 """Fewest seeds of an interval."""
 
 
@@ -79,3 +79,28 @@ def rivals() -> str:
 def ladder_of_default() -> str:
     """Return the table of the method's steps from plain 3DGS, each beside the one above it."""
     return _page_table("ladder", LADDER, above=True)
+
+
+def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str]) -> str:
+    """Return held-out PSNR of the arms with numbers of steps that were not chosen; arguments are those of `arms_table`."""
+    found, body = by_seed([r for r in rows if not r.get("left_out")]), []
+    for name in names:
+        for arm in arms:
+            for preset in (arm.with_steps(n) for n in arm.steps):
+                own = found.get((name, preset))
+                if own and preset != preset_in(rows, name, arm):
+                    psnr = [r["psnr"] for r in own.values()]
+                    body.append(
+                        [name.split(":")[0], arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"]
+                    )
+    return markdown(["scene", "method", "steps", "PSNR"], body, ["scene", "method"])
+
+
+def other_steps() -> str:
+    """Return the table of the kept results of rivals with numbers of steps that were not chosen."""
+    tables = []
+    for machine, result in result_file.stored("rivals").items():
+        rows = result["rows"]
+        names = [n for n in ROWS if any(r["row"] == n for r in rows)]
+        tables.append(other_steps_table(RIVALS, rows, names) + f"\nSource: `rivals_{machine}.json`.\n")
+    return "\n".join(tables)
