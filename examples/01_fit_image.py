@@ -2,7 +2,8 @@
 
     python examples/01_fit_image.py --image image.jpg --out fitted.png
 
-Without --image, a pattern of coloured rings is fitted. Prints the PSNR before and after; writes the target beside the result.
+Without --image, a pattern of coloured rings is fitted. Prints the PSNR before and after; writes target and result side by
+side.
 """
 
 import argparse

@@ -24,10 +24,10 @@ from PIL import Image
 
 
 def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return the mean absolute difference of inverse depth between neighbours, weighted down at edges of the image, shape [].
+    """Return the mean absolute difference of inverse depth between neighbours, with less weight at colour edges, shape [].
 
-    The means along x and y are added. A pair of neighbours counts if both are covered. Inverse depth is divided by its mean,
-    so that the unit of length does not matter (Godard et al. 2017, eq. 5). ``depth`` and ``alpha`` have shape [H, W],
+    The means along x and y are added. A pair of neighbours counts if both have alpha above 0.5. Inverse depth is divided by its
+    mean, so that the unit of length does not matter (Godard et al. 2017, eq. 5). ``depth`` and ``alpha`` have shape [H, W],
     ``image`` [H, W, 3].
     """
     covered = alpha > 0.5

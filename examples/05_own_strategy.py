@@ -4,8 +4,8 @@
     warpgs fit path/to/scene --out run --strategy examples/05_own_strategy.py:Sprout --sprout.growth 0.2
 
 The class below is the whole strategy. The second command loads the class from this file, with its settings as flags. The first
-command fits a scene with the strategy and without growth. It prints the numbers of Gaussians and the PSNR of both fits, and
-writes the image and the two renders side by side.
+command fits a scene with the strategy and without growth. It prints the number of Gaussians and the training PSNR of both
+fits, and writes the image and the two renders side by side.
 """
 
 import argparse
@@ -44,7 +44,7 @@ class Sprout(warpgs.Strategy):
     Config = SproutConfig
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the one value that is stored for each Gaussian: the sum of its gradient norms since the last update."""
+        """Return the one column of the strategy: the sum of each Gaussian's gradient norms since the last update."""
         return {"pull": Column(0.0, inherited=False)}
 
     def statistics(
@@ -52,8 +52,8 @@ class Sprout(warpgs.Strategy):
     ) -> Mapping[str, torch.Tensor]:
         """Return the gradient norms of the projected means, shape [N], which the trainer adds to the column.
 
-        ``v_projected`` [1, N, 12] is the gradient with respect to the projected Gaussians; the means are its first two columns.
-
+        ``v_projected`` [1, N, 12] is the gradient with respect to the projected Gaussians; its first two columns belong to the
+        means.
 
         On CUDA the whole step is captured as a graph, so this method may only use tensors.
         """

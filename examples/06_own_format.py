@@ -4,13 +4,14 @@ The made-up format of this example is a folder with shots.csv, one line per imag
 
     name, x, y, z, target_x, target_y, target_z, focal_px
 
-with the camera position, the point it looks at (both in any unit, +y down) and the focal length. Images lie beside the file.
+with the position of the camera, the point that it looks at (both in any unit, +y down) and the focal length. Images are in the
+same folder.
 
 Run without arguments to write a small scene of that format, read it back and check it (a few seconds on a CPU):
 
     python examples/06_own_format.py
 
-Fit it from the command line:
+Write the scene to a folder, and fit it from the command line:
 
     python examples/06_own_format.py --out shots
     warpgs fit shots --reader examples/06_own_format.py:ShotsReader --out run

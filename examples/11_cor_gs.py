@@ -70,7 +70,7 @@ def nearest(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
 
 
 def random_cameras(views: list[TrainingView], noise: float, count: int, generator: torch.Generator) -> torch.Tensor:
-    """Return camera_from_world of random cameras, float64, shape [count, 4, 4].
+    """Return the view matrices (camera_from_world) of random cameras, float64, shape [count, 4, 4].
 
     Each has the position of a training camera, with noise, and the mean orientation of that camera and its nearest neighbour.
     """

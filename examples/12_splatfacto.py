@@ -26,7 +26,7 @@ C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
 
 def initial_parameters(scene: warpgs.Scene, count: int, cameras: int) -> dict[str, torch.Tensor]:
-    """Return a Gaussian at each of at most ``count`` points of a scene, and a pose correction of 0 for each camera."""
+    """Return Gaussians at up to ``count`` points of a scene, and a pose correction of 0 for each camera."""
     assert scene.points is not None, "the scene has no points to start from"
     chosen = np.random.default_rng(0).permutation(len(scene.points))[:count]
     points = torch.tensor(scene.points.points[chosen], dtype=torch.float32)
@@ -53,7 +53,7 @@ def moved(viewmat: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
 
 
 def degrees_off(poses: torch.Tensor, true_poses: torch.Tensor) -> float:
-    """Return the mean angle [degrees] between view matrices [V, 4, 4], without their common rotation."""
+    """Return the mean angle [degrees] between poses and true poses [V, 4, 4], after removal of their common rotation."""
     turns = poses[:, :3, :3].mT @ true_poses[:, :3, :3]  # in world axes: the Gaussians follow a common rotation
     u, _, v = torch.linalg.svd(turns.mean(0))
     return float(torch.rad2deg(2 * torch.arcsin((turns - u @ v).norm(dim=(1, 2)).div(8**0.5).clamp_max(1))).mean())

@@ -1,10 +1,10 @@
-"""A loss term on normals: neighbours on a smooth surface face the same way, except at edges of the image.
+"""A loss term on normals: neighbouring pixels have similar normals, except at colour edges.
 
     warpgs fit scene --out run --loss-terms examples/loss_terms/depth_normals.py:NormalSmoothness --normal-smoothness.weight 0.1
 
-The normals come from rendered depth (`warpgs.geometry.depth_normals`). The term is the mean of 1 - cos of the angle between
-neighbours, weighted down at edges of the image as in Godard et al. 2017, eq. 5. The weight of the term grows
-over the first steps, because depth is noisy at first.
+The normals come from rendered depth (`warpgs.geometry.depth_normals`). The term is the mean of 1 - cos of the angle between the
+normals of neighbours, with less weight at colour edges, as in Godard et al. 2017, eq. 5. The weight of the term grows over the
+first steps, because depth is noisy at first.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ import torch
 MIN_ALPHA = 0.5
 """Opacity above which a pixel shows a surface."""
 EDGE = 10.0
-"""Factor of the colour difference between neighbours in the exponent of the weight."""
+"""Factor of the colour difference between neighbours, in the exponent of a pair's weight."""
 
 
 def unevenness(normals: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return the weighted mean of 1 - cos of the angle between neighbours, shape [], in [0, 2]; 0 without neighbours.
+    """Return the weighted mean of 1 - cos of the angle between neighbours' normals, shape [], in [0, 2]; 0 without any.
 
     ``normals`` have length 1, or 0 where there is none, shape [H, W, 3]; ``image`` has shape [H, W, 3].
     """
