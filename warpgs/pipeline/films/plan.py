@@ -25,7 +25,7 @@ from warpgs.suggestion import did_you_mean
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
 """Names of paths; a path may also be a JSON file of keyframes."""
 SECONDS = 3.0
-"""Default duration of a film."""
+"""Default duration of a film [s]."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 """Duration of a film through training views [s]: per view, and at most in all."""
 MIN_FRAMES_PER_VIEW = 4
@@ -49,11 +49,11 @@ class FilmSettings:
     fps: int = 30
     """Frames per second."""
     size: tuple[int, int] | None = None
-    """Width and height [px]; None for those of the photographs."""
+    """Width and height [px]; None for the size of the photographs."""
     fov_y: float | None = None
-    """Vertical field of view [rad]; None for that of the photographs."""
+    """Vertical field of view [rad]; None for the field of view of the photographs."""
     background: tuple[float, float, float] | None = None
-    """Colour behind the scene, in [0, 1]; None for that of the fit."""
+    """Colour behind the scene, in [0, 1]; None for the background of the fit."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work.

@@ -51,7 +51,7 @@ class InitConfig:
     near_views: int = 4
     """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps one for every pixel."""
+    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps a point for every pixel."""
     fill_px: float = 16.0
     """sweep, flow: cell width [px] for filling in points where depth is not consistent; 0 fills in none."""
     extrapolate: bool | None = False
@@ -79,7 +79,7 @@ class InitConfig:
         if not 1e-3 <= self.scale_factor <= 10:
             raise UsageError(f"init scale-factor {self.scale_factor} must be between 0.001 and 10")
         if not 0 < self.opacity < 1:
-            raise UsageError(f"init opacity {self.opacity} must be between 0 and 1")
+            raise UsageError(f"init opacity {self.opacity} must be in (0, 1)")
         if self.random_count < 1:
             raise UsageError(f"init random-count {self.random_count} must be at least 1")
 
@@ -228,7 +228,7 @@ def initial_points(
     ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines about the current work.
 
     Raises:
-        DataError: Points were requested and the scene has none that the training views saw.
+        DataError: The training views saw no points, and ``config`` needs them; or masks leave no pixel for a random start.
     """
     check_points(views, points, config)
     if config.source == "hull":

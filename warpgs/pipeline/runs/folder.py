@@ -57,7 +57,7 @@ def versions() -> dict[str, str]:
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
     """Lock a run folder for a fit: a new or empty one, or one with a run to continue; yields notes for the user.
 
-    A folder with found poses only, from a fit that ended before its first step, is accepted in both cases.
+    A folder with found poses only, from a fit that ended before its first step, is accepted with and without ``resume``.
 
     Raises:
         FolderHeldError: Another process writes into the folder.
@@ -297,7 +297,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
 
     Args:
         folder: The run folder.
-        device: Device of the tensors: auto, cpu, cuda, or one of torch's.
+        device: Device of the tensors: auto, cpu, cuda, or a torch device.
 
     Raises:
         DataError: The folder is not a run folder, another version of warpgs wrote it, or its checkpoint is incomplete.

@@ -79,10 +79,10 @@ def prune(
 
     Args:
         folder: The run folder, which is not changed.
-        keep_psnr: Allowed loss, above 0.
+        keep_psnr: Allowed loss [dB], above 0.
         out: Folder to write; None for the run's name with ``-pruned``.
         device_name: auto, cpu or cuda.
-        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        reader: User-defined reader, as given to `warpgs fit --reader`.
         tell: Called with a line for the user about the current work.
 
     Returns:

@@ -119,7 +119,7 @@ def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry:
 
 
 def importance(scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor], by: tuple[float, float, float]) -> torch.Tensor:
-    """Compute S_importance = w . s of the render, semantic and geometric score, each [H, W] in [0, 1].
+    """Compute S_importance, the sum of the render, semantic and geometric score (each [H, W] in [0, 1]) with weights ``by``.
 
     If all weights are 0, S_importance is 1 everywhere, so that sampling is uniform.
     """
