@@ -33,7 +33,7 @@ MIN_FRAMES_PER_VIEW = 4
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
 """A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
-EMPTY_VIEW = "the model shows nothing there: `warpgs eval` scores each view"
+EMPTY_VIEW = "score each view with `warpgs eval`"
 """Advice for training views that show nothing."""
 
 

@@ -69,19 +69,19 @@ class InitConfig:
 
     def __post_init__(self):
         if self.source not in SOURCES:
-            raise UsageError(f"init source {self.source!r} is not one of {', '.join(SOURCES)}")
+            raise UsageError(f"init: `source` {self.source!r} is not one of {', '.join(SOURCES)}")
         for name in ("merge_px", "fill_px", "sweep_up_to"):
             if not 0 <= getattr(self, name) < np.inf:
-                raise UsageError(f"init {name.replace('_', '-')} must be 0 or more, not {getattr(self, name)}")
+                raise UsageError(f"init: `{name.replace('_', '-')}` must be 0 or more, not {getattr(self, name)}")
         if self.flow_range not in RANGES:
-            raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
+            raise UsageError(f"init: `flow-range` {self.flow_range!r} is not one of {', '.join(RANGES)}")
         self.epipolar()  # its own checks
         if not 1e-3 <= self.scale_factor <= 10:
-            raise UsageError(f"init scale-factor {self.scale_factor} must be between 0.001 and 10")
+            raise UsageError(f"init: `scale-factor` must be between 0.001 and 10, not {self.scale_factor}")
         if not 0 < self.opacity < 1:
-            raise UsageError(f"init opacity {self.opacity} must be in (0, 1)")
+            raise UsageError(f"init: `opacity` must be in (0, 1), not {self.opacity}")
         if self.random_count < 1:
-            raise UsageError(f"init random-count {self.random_count} must be at least 1")
+            raise UsageError(f"init: `random-count` must be at least 1, not {self.random_count}")
 
     def epipolar(self) -> EpipolarConfig:
         """Return the settings of depth from flow.

@@ -91,15 +91,15 @@ class LimitConfig:
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_size <= 1e6:
-            raise UsageError(f"limits max-size must be 0 (no limit) to 1e6, not {self.max_size}")
+            raise UsageError(f"limits: `max-size` must be 0 (no limit) to 1e6, not {self.max_size}")
         if self.max_ratio != 0 and not 1 <= self.max_ratio <= 1e6:
-            raise UsageError(f"limits max-ratio must be 0 (no limit) or between 1 and 1e6, not {self.max_ratio}")
+            raise UsageError(f"limits: `max-ratio` must be 0 (no limit) or between 1 and 1e6, not {self.max_ratio}")
         if not 0 <= self.max_reach <= 1e6:
-            raise UsageError(f"limits max-reach must be 0 (no limit) to 1e6, not {self.max_reach}")
+            raise UsageError(f"limits: `max-reach` must be 0 (no limit) to 1e6, not {self.max_reach}")
         if not 0 <= self.min_pixels <= 1e6:
-            raise UsageError(f"limits min-pixels must be 0 (no limit) to 1e6, not {self.min_pixels}")
+            raise UsageError(f"limits: `min-pixels` must be 0 (no limit) to 1e6, not {self.min_pixels}")
         if not 0 <= self.ratio_from <= 1:
-            raise UsageError(f"limits ratio-from must be between 0 and 1, not {self.ratio_from}")
+            raise UsageError(f"limits: `ratio-from` must be between 0 and 1, not {self.ratio_from}")
 
     def at(self, progress: float, radius: float, antialiased: bool = False) -> Limits:
         """Return the limits of a step.

@@ -91,7 +91,7 @@ def camera_values(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any]) -> Camera:
-    """Return the camera from the result of `camera_values`; UsageError if its camera model is missing."""
+    """Return the camera from the result of `camera_values`; UsageError if its camera model is not supported."""
     arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
     camera = Camera(**(values | arrays))
     check_camera(camera)
@@ -99,7 +99,7 @@ def _camera(values: dict[str, Any]) -> Camera:
 
 
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
-    """Return the cameras of a file by name; DataError if a camera model is missing."""
+    """Return the cameras of a file by name; DataError if a camera model is not supported."""
     try:
         return {n: _camera(c) for n, c in stored.items()}
     except UsageError as e:

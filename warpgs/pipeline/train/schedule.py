@@ -33,7 +33,7 @@ def check_lrs(of: str, **rates: float | None) -> None:
     """
     for name, value in rates.items():
         if value is not None and not 0 < value <= MAX_LR:
-            raise UsageError(f"{of} {name} must be positive and at most {MAX_LR:g}, not {value}")
+            raise UsageError(f"{of}: `{name}` must be positive and at most {MAX_LR:g}, not {value}")
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class OptimizerConfig:
 
     def __post_init__(self):
         if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
-            raise UsageError(f"optimizer opacities-decay must be between 0 and {MAX_DECAY}, not {self.opacities_decay}")
+            raise UsageError(f"optimizer: `opacities-decay` must be between 0 and {MAX_DECAY}, not {self.opacities_decay}")
         check_lrs("optimizer", **{n: v for n, v in vars(self).items() if n != "opacities_decay"})
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:

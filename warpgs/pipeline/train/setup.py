@@ -61,9 +61,9 @@ def prepare(
 
     Raises:
         DataError: The scene gives no initial points.
-        UsageError: A view's camera cannot be rendered: its model is missing, or has other coefficients. A given map has the
-            wrong size or is not finite. The start or the strategy compares views, and a camera model has no pinhole equivalent
-            with the same K.
+        UsageError: A view's camera cannot be rendered: its model is unknown, or the number of coefficients is wrong. A given
+            map has the wrong size or is not finite. The start or the strategy compares views, and a camera model has no pinhole
+            equivalent with the same K.
     """
     for view in train:
         check_camera(view.camera)

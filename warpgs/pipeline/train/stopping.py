@@ -29,8 +29,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""The gain is measured since the latest measurement at which the number of steps, times this factor, was at most the present
-number."""
+"""The gain is measured since the latest measurement at or before the present step divided by this factor, so over at least the
+last third of the steps."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float | None = 0.0
-    """Growth ends when the gain of the left-out blocks over the last third of the steps, plus ``noise`` standard errors, is
-    below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor while
-    views have half size. 0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if --cpu-limit
+    """Growth ends when the gain of the left-out blocks over at least the last third of the steps, plus ``noise`` standard
+    errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor
+    while views have half size. 0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if --cpu-limit
     shortens the fit."""
     fraction: float = 0.03
     """Fraction of the pixels in blocks that are left out until growth ends."""
@@ -51,13 +51,13 @@ class StoppingConfig:
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"stopping fraction {self.fraction} must be above 0 and at most 0.5")
+            raise UsageError(f"stopping: `fraction` must be above 0 and at most 0.5, not {self.fraction}")
         if self.measurements < 1:
-            raise UsageError(f"stopping measurements must be at least 1, not {self.measurements}")
+            raise UsageError(f"stopping: `measurements` must be at least 1, not {self.measurements}")
         for name in ("noise", "min_gain_db"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
-                raise UsageError(f"stopping {name.replace('_', '-')} must be 0 or more and finite, not {value}")
+                raise UsageError(f"stopping: `{name.replace('_', '-')}` must be 0 or more and finite, not {value}")
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,9 @@ class LossConfig:
     def __post_init__(self) -> None:
         for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
             if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
-                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1000")
+                raise UsageError(f"loss: `{name.replace('_', '-')}` must be between 0 and 1000, not {getattr(self, name)}")
         if not 0 <= self.ssim_weight <= 1:
-            raise UsageError(f"loss ssim weight {self.ssim_weight} must be between 0 and 1")
+            raise UsageError(f"loss: `ssim-weight` must be between 0 and 1, not {self.ssim_weight}")
 
 
 def built_in_terms(

@@ -58,7 +58,7 @@ class GivenDepthDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-depth: weight {self.weight} must be between 0 and 1000")
+            raise UsageError(f"given-depth: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return weight times q / d, weight, and weight times q, [H, W, 3]; 0 where no depth is given."""
@@ -110,7 +110,7 @@ class GivenNormalsDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-normals: weight {self.weight} must be between 0 and 1000")
+            raise UsageError(f"given-normals: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""

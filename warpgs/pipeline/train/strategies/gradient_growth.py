@@ -30,7 +30,8 @@ class DensityConfig:
     every: int = 100
     """Steps between events that add and remove Gaussians."""
     stop_fraction: float = 0.5
-    """Fraction of the fit after which no Gaussians are added or removed."""
+    """Fraction of the fit after which no Gaussians are added or removed. In a fit with phases, this happens when phase 3 begins
+    instead."""
     gradient: float = 2e-4
     """Mean norm of the gradient of a projected mean, in half image widths and heights, above which a Gaussian is cloned or
     split."""
@@ -57,12 +58,12 @@ class DensityConfig:
             )
         for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1")
+                raise UsageError(f"density: `{name.replace('_', '-')}` must be between 0 and 1, not {getattr(self, name)}")
         for name in ("gradient", "clone_size", "prune_size"):
             if not getattr(self, name) >= 0:
-                raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
+                raise UsageError(f"density: `{name.replace('_', '-')}` must be at least 0, not {getattr(self, name)}")
         if not 0 < self.reset_opacity < 1:
-            raise UsageError(f"density reset opacity {self.reset_opacity} must be in (0, 1)")
+            raise UsageError(f"density: `reset-opacity` must be in (0, 1), not {self.reset_opacity}")
 
     def times(self, steps: int) -> EventTimes:
         """Return the times of events in a fit of that many steps."""

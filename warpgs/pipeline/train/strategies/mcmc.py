@@ -60,10 +60,10 @@ class MCMCConfig:
             raise UsageError(f"mcmc: `start` must be at least 0, not {self.start}, and `every` at least 1, not {self.every}")
         for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
             if not 0 <= getattr(self, name) <= top:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and {top}")
+                raise UsageError(f"mcmc: `{name.replace('_', '-')}` must be between 0 and {top}, not {getattr(self, name)}")
         for name in ("noise_lr", "opacity_weight", "scale_weight"):
             if not 0 <= getattr(self, name) <= 1e9:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and 1e9")
+                raise UsageError(f"mcmc: `{name.replace('_', '-')}` must be between 0 and 1e9, not {getattr(self, name)}")
 
 
 @torch.no_grad()

@@ -94,9 +94,9 @@ class MethodConfig:
 
     def __post_init__(self):
         if not 0 < self.keep <= 1:
-            raise UsageError(f"method keep {self.keep} must be in (0, 1]")
+            raise UsageError(f"method: `keep` must be in (0, 1], not {self.keep}")
         if not 0 <= self.coarse_lr_factor <= 1:
-            raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must be between 0 and 1")
+            raise UsageError(f"method: `coarse-lr-factor` must be between 0 and 1, not {self.coarse_lr_factor}")
 
     def weights(self, semantics: bool = True) -> tuple[float, float, float]:
         """Return the weights of the render, semantic and geometric score, 0 where switched off, scaled to sum to 1.

@@ -88,7 +88,7 @@ class Exposure(ViewModule):
     def __post_init__(self) -> None:
         check_lrs(self.name, lr=self.lr, decay=self.decay)
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"exposure weight must be between 0 and 1000, not {self.weight}")
+            raise UsageError(f"exposure: `weight` must be between 0 and 1000, not {self.weight}")
 
     def check(self, views: Sequence[View]) -> None:
         """Check that no view has an alpha channel: an exposure would change the background with the object.
