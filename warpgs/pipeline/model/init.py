@@ -37,9 +37,9 @@ class InitConfig:
 
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
-    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep for few
-    views or given depth; else points if the training views saw at least 100 of them; else random. If views have an alpha
-    channel, points in an empty area of a view are left out."""
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep with given
+    depth or up to --init.sweep-up-to views; else points if the training views saw at least 100 of them; else random. If views
+    have an alpha channel, points in an empty area of a view are left out."""
     sweep_up_to: int = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
     random_count: int = 20_000

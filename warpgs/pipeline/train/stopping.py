@@ -47,7 +47,7 @@ class StoppingConfig:
     measurements: int = 12
     """Number of equal intervals of the growth phase; the blocks are measured after each interval."""
     noise: float = 1.0
-    """Number of standard errors of the mean gain over the blocks that are added to the gain."""
+    """Number of standard errors that are added to the gain, which is a mean over the blocks."""
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:

@@ -35,7 +35,7 @@ class LossConfig:
     1000]; 0 to disable."""
 
     exposure_weight: float = 0.01
-    """Weight of the squared difference between each learned exposure and the identity, in [0, 1000]."""
+    """No effect, in [0, 1000]: the weight of the view module exposure is --exposure.weight."""
 
     def __post_init__(self) -> None:
         for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
