@@ -49,7 +49,7 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
     """Make the engine that is requested.
 
     Raises:
-        ResourceError: The device is missing.
+        ResourceError: The device is missing, the cluster cannot be reached, or Slurm's private folder cannot be written.
         UsageError: The engine is unknown or not installed, has fewer slots than requested, or other users can write to
             ``slurm_folder``.
     """

@@ -148,7 +148,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
 
     Raises:
         DataError: The file of keyframes cannot be read.
-        UsageError: The path is unknown.
+        UsageError: The path is unknown, or a setting does not apply to it.
     """
     if path not in PATHS and not path.lower().endswith(".json"):
         hint = did_you_mean(path, PATHS) or f"choose one of {', '.join(PATHS)}, or give a .json file of keyframes"

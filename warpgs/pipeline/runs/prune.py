@@ -89,7 +89,8 @@ def prune(
         Lines for the user.
 
     Raises:
-        DataError: The folder is not a run, its scene is gone, or the scene's data have changed since the fit.
+        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the training PSNR
+            is not finite.
         ResourceError: The new folder cannot be written, or the device is missing.
         UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
     """

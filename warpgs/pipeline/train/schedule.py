@@ -102,7 +102,7 @@ class PhaseConfig:
     """
 
     coarse: int = 0
-    """Steps of phase 1, with only the coarse layer; 2000 in the paper. If ``stable`` is 0, too, the fit has no phases."""
+    """Steps of phase 1, with only the coarse layer; 2000 in the paper. If this and ``stable`` are 0, the fit has no phases."""
     stable: int = 0
     """Steps of phase 3, in which no Gaussians are added or removed; 3000 in the paper."""
     every: float = 100.0

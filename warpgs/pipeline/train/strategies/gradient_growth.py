@@ -30,7 +30,7 @@ class DensityConfig:
     every: int = 100
     """Steps between events that add and remove Gaussians."""
     stop_fraction: float = 0.5
-    """Fraction of the fit after which no Gaussians are added or removed. In a fit with phases, this happens when phase 3 begins
+    """Fraction of the fit after which no Gaussians are added or removed. In a fit with phases, the start of phase 3 counts
     instead."""
     gradient: float = 2e-4
     """Mean norm of the gradient of a projected mean, in half image widths and heights, above which a Gaussian is cloned or

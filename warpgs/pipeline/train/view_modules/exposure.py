@@ -3,7 +3,7 @@
 A camera with automatic exposure and white balance changes the colours between photographs. With exposures a step compares the
 view's image with A rgb + b of its render. The learned parameters are the 12 numbers of [A - 1 | b], which start at zero. A step
 subtracts their mean over all training views, so that the model has the mean exposure. Otherwise all exposures could become
-darker and the Gaussians brighter, and the loss would not change.
+darker and the Gaussians brighter, with the same colours in the training views.
 """
 
 from __future__ import annotations
