@@ -37,7 +37,7 @@ def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypa
         )
     assert calls == [tmp_path / "in"] and "has no cameras: finding the poses" in said[0]
     (tmp_path / "in" / "0.png").write_bytes((tmp_path / "in" / "1.png").read_bytes())
-    with pytest.raises(UsageError, match="holds poses of photographs other than"):
+    with pytest.raises(UsageError, match="holds poses of other photographs than"):
         with_poses(request, run, said.append)
     for resume in (False, True):  # a fit that ended before its first step begins again either way
         with run_folder(run, resume):

@@ -1,4 +1,4 @@
-"""The process of a Slurm job: runs the job described in one file, and writes the state of the job into another file.
+"""The process of a Slurm job: runs the job that one file describes, and writes the job's state into another file.
 
 ``python -P -m warpgs.pipeline.farm.batch JOB ANSWER THREADS``
 """

@@ -15,7 +15,8 @@ class Event:
     name: str
     """Name of the job."""
     state: str
-    """running; or the last event: done, failed, held (another process works on it) or crashed (its process ended)."""
+    """running; or, as the last event of the job: done, failed, held (another process works on it) or crashed (its process
+    ended)."""
     message: str = ""
     """Reason of a crash."""
     step: int = 0
@@ -31,7 +32,7 @@ class Engine(Protocol):
     """Largest number of jobs that run at a time."""
 
     def start(self, job: FarmJob) -> None:
-        """Start a job; called while fewer than `slots` run."""
+        """Start a job; called while fewer than `slots` jobs run."""
 
     def wait(self, seconds: float) -> list[Event]:
         """Return new events, after at most ``seconds`` [s]."""

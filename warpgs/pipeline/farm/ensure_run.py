@@ -106,7 +106,7 @@ def ensure_run(
         fingerprint: Fingerprint of the scene's data.
         split: Training and held-out views; None if no existing run can match.
         device: cpu or cuda.
-        variants: Names of the LPIPS scores that must be there, with their definitions; empty for none.
+        variants: Definitions of the required LPIPS scores by name; empty for none.
         resolved: The settings of ``request`` with automatic ones chosen; None if no setting is automatic.
         others: Further arguments of `fit`: on_step, verbose.
 

@@ -44,7 +44,7 @@ def list_jobs(jobs: str) -> list[ListedJob]:
     """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file.
 
     Raises:
-        DataError: A line of the file is not a job.
+        DataError: A line of the file is not a job, or a name is not valid for a folder.
         UsageError: There is nothing to fit, the folder is a single scene, or two jobs have the same name.
     """
     path = Path(jobs)

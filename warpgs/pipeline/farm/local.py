@@ -37,7 +37,7 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
 
     Args:
         device: auto, cpu or cuda.
-        slots: Number of slots; None for ``per_gpu`` on each GPU, or for one on a CPU.
+        slots: Number of slots; None: ``per_gpu`` for each GPU, or one on a CPU.
         per_gpu: Slots of each GPU.
 
     Raises:
@@ -67,7 +67,7 @@ class _Process:
     """A worker process of a slot, and the job it works on."""
 
     def __init__(self, slot: Slot, news: queue.SimpleQueue[tuple[_Process, str | None]]):
-        """Start it; its lines go to ``news``, and None at its end."""
+        """Start the process; its lines go to ``news``, then None when it ends."""
         threads = {"OMP_NUM_THREADS": str(slot.threads)}
         self.slot, self.job = slot, ""
         self.worker = PythonWorker(WORKER, environment={**threads, **slot.environment})
@@ -94,7 +94,7 @@ class LocalEngine:
         self._compiled = False
 
     def _prepare(self) -> None:
-        """Compile kernels once for all, in a process that sees all devices."""
+        """Compile kernels once for all processes, in a process that sees all devices."""
         self._compiled = True
         slot = self._free[-1]
         alone = self.slots == 1 or slot.device == "cpu"  # that process can serve its slot afterwards
@@ -130,7 +130,7 @@ class LocalEngine:
         return {name: process.worker.number for name, process in self._busy.items()}
 
     def start(self, job: FarmJob) -> None:
-        """Start a job in an idle process, or in a new one; before the first, kernels are compiled.
+        """Start a job in an idle process, or in a new one; before the first job, kernels are compiled.
 
         Raises:
             ResourceError: The kernels cannot be compiled.

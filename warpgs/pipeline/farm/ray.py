@@ -33,7 +33,7 @@ class RayEngine:
             slots: Jobs at a time; None for as many as fit into the cluster now.
             per_gpu: Jobs that share a GPU.
             threads: CPU threads of a job.
-            address: Address of the cluster; None for the one that RAY_ADDRESS names, or a new one on this machine.
+            address: Address of the cluster; None: the cluster that RAY_ADDRESS names, or else a new one on this machine.
 
         Raises:
             ResourceError: The cluster cannot be reached, or Ray does not start.

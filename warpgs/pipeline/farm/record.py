@@ -127,7 +127,7 @@ def source_stamp(scene: Path) -> str:
 
 
 def is_whole(folder: Path, record: JobRecord) -> bool:
-    """Return whether the files of a finished run are those of its record, byte by byte."""
+    """Return whether the files of a finished run match the checksums of its record."""
     try:
         return set(record.files) == set(CHECKED) and all(file_digest(folder / n) == d for n, d in record.files.items())
     except ResourceError:

@@ -31,7 +31,8 @@ class EngineRequest:
     engine: str = "local"
     """local (processes of this machine), ray or slurm."""
     slots: int | None = None
-    """Number of concurrent jobs; None: ``per_gpu`` for each GPU, one on a CPU, or as many as the cluster has capacity for."""
+    """Number of concurrent jobs; None: ``per_gpu`` for each GPU, one on a CPU, as many as fit into Ray's cluster, or 100 with
+    Slurm."""
     per_gpu: int = 1
     """Jobs that share a GPU."""
     threads: int = 1
@@ -48,7 +49,7 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
     """Make the engine that is requested.
 
     Raises:
-        ResourceError: The device is missing.
+        ResourceError: The device is missing, the cluster cannot be reached, or Slurm's private folder cannot be written.
         UsageError: The engine is unknown or not installed, has fewer slots than requested, or other users can write to
             ``slurm_folder``.
     """
@@ -125,5 +126,5 @@ def check_failures(statuses: list[JobStatus]) -> None:
         names = ", ".join(s.job.name for s in failed[:5]) + ("" if len(failed) <= 5 else f" and {len(failed) - 5} more")
         raise ResourceError(
             f"{len(failed)} of {len(statuses)} jobs failed: {names}; {INDEX} has their messages. First message: "
-            f"{first.message.rstrip('.') if first else 'unknown'}. The same command tries them again"
+            f"{first.message.rstrip('.') if first else 'unknown'}. Repeat the command to try them again"
         )

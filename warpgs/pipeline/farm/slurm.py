@@ -164,7 +164,7 @@ class SlurmEngine:
         return Event(name, state)
 
     def _output(self, job: _Queued) -> str:
-        """Return the end of a job's output outside its log."""
+        """Return the end of the output that Slurm wrote for a job."""
         try:
             with (self._folder / f"{job.number}.log").open("rb") as f:
                 f.seek(0, os.SEEK_END)

@@ -67,7 +67,7 @@ def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
 
 
 def main() -> int:
-    """Run jobs until stdin ends or one fails; return the exit code."""
+    """Run jobs until stdin ends or a job fails; return the exit code."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # also where the farm was started to ignore it
     answer, lines, working = _answers(), queue.SimpleQueue[str | None](), threading.Event()
     threading.Thread(target=_read, args=(lines, working), daemon=True).start()

@@ -31,7 +31,7 @@ def framed(camera: Camera, size: tuple[int, int] | None = None, fov_y: float | N
     Args:
         camera: Camera of a photograph; its pose is kept, and a lens is replaced by the pinhole of the same K.
         size: Width and height [px]; None for those of the photograph.
-        fov_y: Vertical field of view [rad], as of a principal point in the middle; None for that of the photograph.
+        fov_y: Vertical field of view [rad] for a centred principal point; None for the field of view of the photograph.
         turned: True if the photograph is rotated by a quarter turn, so that width and height are swapped.
 
     Raises:

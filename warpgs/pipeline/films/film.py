@@ -210,14 +210,14 @@ def render_path(
             choice by the positions of the training cameras; the name of a JSON file of keyframes; or your own cameras.
         out: Folder to write, which may exist; or a film file (.mp4, .webm, .webp or .gif), to write only the film.
         units: Units of your own cameras: scene or file.
-        frames: Number of frames; None for ``seconds`` times ``fps``.
+        frames: Number of frames; None for ``seconds`` times ``fps``. Ignored with your own cameras.
         fps: Frames per second of the film.
-        seconds: Duration of the film; None for the default of the path.
-        size: Width and height of the frames [px]; None for those of the photographs. Not supported with your own cameras.
-        fov_y: Vertical field of view [rad]; None for that of the photographs. Not supported with your own cameras.
-        background: Colour behind the scene, in [0, 1]; None for that of the fit.
+        seconds: Duration of the film [s]; None for the default of the path. Ignored with your own cameras.
+        size: Width and height of the frames [px]; None for the size of the photographs. Ignored with your own cameras.
+        fov_y: Vertical field of view [rad]; None for the field of view of the photographs. Ignored with your own cameras.
+        background: Colour behind the scene, in [0, 1]; None for the background of the fit.
         coverage: True to also write images into the subfolder coverage, with magenta stripes on pixels that no training view
-            saw and amber ones on pixels that one saw. Or the training views, to respect their masks.
+            saw, and amber stripes on pixels that one view saw. Or the training views, to respect their masks.
 
     Returns:
         The files written: a PNG for each camera in order, then the film, if any; without the coverage images.

@@ -88,7 +88,7 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
     neighbours they turn nearly as evenly as by spherical interpolation, and they do not jerk at a keyframe.
 
     Args:
-        keyframes: At least one, at rising times; of a closed path the last is the first again.
+        keyframes: At least one, at rising times; in a closed path the last keyframe repeats the first.
         frames: Number of cameras; with two or more the first and the last are keyframes, but a closed path ends one frame
             before it returns.
         closed: Whether the path goes through its end without a corner.

@@ -25,7 +25,7 @@ from warpgs.suggestion import did_you_mean
 PATHS = ("auto", "views", "turntable", "spiral", "interpolate")
 """Names of paths; a path may also be a JSON file of keyframes."""
 SECONDS = 3.0
-"""Default duration of a film."""
+"""Default duration of a film [s]."""
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 """Duration of a film through training views [s]: per view, and at most in all."""
 MIN_FRAMES_PER_VIEW = 4
@@ -33,7 +33,7 @@ MIN_FRAMES_PER_VIEW = 4
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
 """A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
-EMPTY_VIEW = "the model shows nothing there: `warpgs eval` scores each view"
+EMPTY_VIEW = "score each view with `warpgs eval`"
 """Advice for training views that show nothing."""
 
 
@@ -49,11 +49,11 @@ class FilmSettings:
     fps: int = 30
     """Frames per second."""
     size: tuple[int, int] | None = None
-    """Width and height [px]; None for those of the photographs."""
+    """Width and height [px]; None for the size of the photographs."""
     fov_y: float | None = None
-    """Vertical field of view [rad]; None for that of the photographs."""
+    """Vertical field of view [rad]; None for the field of view of the photographs."""
     background: tuple[float, float, float] | None = None
-    """Colour behind the scene, in [0, 1]; None for that of the fit."""
+    """Colour behind the scene, in [0, 1]; None for the background of the fit."""
 
     def __post_init__(self) -> None:
         """Check what can be checked before any work.
@@ -148,7 +148,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
 
     Raises:
         DataError: The file of keyframes cannot be read.
-        UsageError: The path is unknown.
+        UsageError: The path is unknown, or a setting does not apply to it.
     """
     if path not in PATHS and not path.lower().endswith(".json"):
         hint = did_you_mean(path, PATHS) or f"choose one of {', '.join(PATHS)}, or give a .json file of keyframes"

@@ -31,7 +31,7 @@ MIN_UP = 0.5
 FLAT = 0.02
 """Largest variance of positions across the plane of cameras on a circle, as a fraction of the variance in the plane."""
 ROLLED = 0.05
-"""The same for horizontal axes of level photographs, which lean by 13 degrees (root mean square) at most."""
+"""The limit `FLAT` for horizontal axes of level photographs: they lean by at most 13 degrees (root mean square)."""
 MIN_SAME = math.cos(math.radians(15))
 """Cosine of the largest angle between the normals of both planes for which they count as equal."""
 MIN_SWING = math.radians(6)
@@ -116,8 +116,8 @@ def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, b
     """Return the upward direction [3] of a film, and whether the photographs lie on their side.
 
     For cameras on a level circle, it is the normal of their plane, which does not depend on the rotation of photographs. If the
-    cameras' horizontal axes lie in another plane, it is the normal of that one: some photographs are nearer or lower than the
-    others. Else it is the mean of the cameras' own upward directions.
+    cameras' horizontal axes lie in another plane, it is the normal of that plane: then some photographs are nearer or lower
+    than the others. Else it is the mean of the cameras' own upward directions.
     """
     rights, ups, forwards = (sign * np.array([c.viewmat[i, :3] for c in cameras]) for i, sign in ((0, 1), (1, -1), (2, 1)))
     centers = np.array([c.center for c in cameras])
@@ -141,7 +141,7 @@ def _upward(cameras: list[Camera], looked_at: np.ndarray) -> tuple[np.ndarray, b
 
 
 def _span(azimuths: np.ndarray) -> tuple[float, float] | None:
-    """Return the ends of the shortest range that holds all azimuths [N] [rad]; None where no gap is above `MAX_GAP`."""
+    """Return the ends of the shortest range that holds all azimuths [N] [rad]; None if no gap is above `MAX_GAP`."""
     ordered = np.sort(azimuths % (2 * np.pi))
     gaps = np.diff(np.append(ordered, ordered[0] + 2 * np.pi))
     widest = int(gaps.argmax())

@@ -25,7 +25,7 @@ MAX_COUNT = 255
 GRID = 32
 """Number of points along the longer side of an image that `fraction_outside` checks."""
 MAX_PIXELS = 2**26
-"""Most pixels of all depth maps together, 256 MiB; to stay below, maps are rendered at a smaller size."""
+"""Largest total number of pixels of all depth maps, 256 MiB; above it, maps are rendered at a smaller size."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class Match:
     """Row in the other view [px]."""
     difference: torch.Tensor
     """Difference between the point's depth in the other view and the nearest of the depths that the other view sees at the four
-    pixels around it, as a fraction of the depth: depth varies within a pixel on a slanted surface. Infinite outside of the
-    other image, where that view sees no surface, and where the pixel itself shows none."""
+    pixels around it, as a fraction of the depth. The four pixels are compared because depth varies within a pixel on a slanted
+    surface. Infinite outside of the other image, where that view sees no surface, and where the pixel itself shows none."""
 
 
 @torch.no_grad()
@@ -74,7 +74,8 @@ def depth_views(
         options: Options of the rasterizer.
         masks: True for pixels of a view that are used, bool, shape [H, W] each; None for a view without a mask, or for no
             masks.
-        max_pixels: Most pixels of all maps together; if there are more, both sides of every map are reduced by the same factor.
+        max_pixels: Largest total number of pixels of all maps; above it, both sides of every map are reduced by the same
+            factor.
 
     Returns:
         The views in the order of the cameras, on the device of the Gaussians.

@@ -27,7 +27,7 @@ background."""
 BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
 """Upper bounds of the classes of depth difference, each with its expected error; the last class has no bound."""
 PROBED = 6
-"""Most training views that are compared with each other, evenly spaced: 6 give 30 ordered pairs."""
+"""Largest number of training views that are compared with each other, evenly spaced: 6 give 30 ordered pairs."""
 
 
 @torch.no_grad()
@@ -139,7 +139,9 @@ def score_by_coverage(
     show: Callable[[View, np.ndarray, dict[str, np.ndarray]], object] = lambda *_: None,
     tell: Callable[[str], object] = lambda line: None,
 ) -> dict[str, Any]:
-    """Split the scores of held-out views by the number of training views that saw each pixel's point.
+    """Split the scores of held-out views by the number of training views that see the point at each pixel.
+
+    Views of lenses are scored as a pinhole would show them.
 
     Args:
         gaussians: N Gaussians in the units of the views' cameras.
@@ -156,8 +158,7 @@ def score_by_coverage(
         ``depth_differences`` and ``photo_psnr``: the table of `photo_errors`; ``tolerance``; ``summary``, a sentence.
 
     Raises:
-        UsageError: A camera has no pinhole of the same K, such as an orthographic one. Views of lenses are scored as a pinhole
-            would show them.
+        UsageError: A camera has no pinhole of the same K, such as an orthographic one.
     """
     tell("checking coverage")
     train, test = ([pinhole_view(v) for v in views] for views in (train, test))

@@ -17,7 +17,7 @@ RIDGE = 1e-6
 
 
 def affine_map(rendered: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matrix [3, 3] and the offset [3] that take rendered colours [N, 3] to the target's by least squares."""
+    """Return the least-squares matrix [3, 3] and offset [3] that map rendered colours to target colours, [N, 3] each."""
     a, b = rendered.astype(np.float64), target.astype(np.float64)
     of_a, of_b = a.mean(0), b.mean(0)
     a, b = a - of_a, b - of_b

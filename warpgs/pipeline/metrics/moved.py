@@ -107,8 +107,8 @@ def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[i
 def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
     """Return for each training view the fraction of its pixels, in [0, 1], in regions that it shows differently from others.
 
-    A pixel is included if the view's residual is much larger than those of other views at the same point, and at least two
-    other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
+    A pixel is included if the view's residual is much larger than the residuals of other views at the same point, and at least
+    two other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
 
     Args:
         views: The training views, at least one.

@@ -17,7 +17,7 @@ from warpgs.scene import Camera, Gaussians
 ROUNDS = 5
 """Number of bisection steps in the search for the largest fraction."""
 PASSES = 8
-"""Most rounds of merging: up to 2^8 neighbours become one."""
+"""Largest number of rounds of merging: up to 2^8 neighbours become one."""
 DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
 """Fractions of the allowed loss that may be used up after degrees are lowered, and after neighbours are merged; removal may use
 up the rest."""
@@ -55,7 +55,7 @@ def prune_order(maxima: torch.Tensor, sensitivity: torch.Tensor) -> torch.Tensor
     removed only if both scores are low; thin Gaussians and wide faint ones stay if one score is high.
 
     Args:
-        maxima: Largest blending weight of each, shape [N].
+        maxima: Largest blending weight of each Gaussian, shape [N].
         sensitivity: Result of `fisher`, shape [N].
     """
     return torch.argsort(torch.maximum(_ranks(maxima), _ranks(sensitivity)), stable=True)
@@ -75,7 +75,7 @@ def keep_last(order: torch.Tensor, fraction: float) -> torch.Tensor:
 
 
 def rows_of(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
-    """Return the Gaussians of the rows ``keep``, int64 or bool [N]."""
+    """Return the Gaussians of the rows ``keep``, int64 [K] or bool [N]."""
     return Gaussians(**{n: t[keep] for n, t in gaussians.tensors().items()})
 
 

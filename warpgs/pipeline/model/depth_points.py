@@ -196,9 +196,9 @@ def coarse_points(
 def _elsewhere(
     points: np.ndarray, widths: np.ndarray, more: np.ndarray, colors: np.ndarray, more_widths: np.ndarray, cell: float
 ) -> tuple[PointCloud, np.ndarray]:
-    """Return points ``more`` [M, 3], merged, of cells without any of ``points`` [N, 3]; and which of them these are, bool [M].
+    """Merge points ``more`` [M, 3] in cells without any of ``points`` [N, 3]; return them and a mask of those used, bool [M].
 
-    Widths [N] and [M] [u] are those of a pixel, and ``cell`` is the width of a cell [px].
+    ``widths`` [N] and ``more_widths`` [M] are widths of a pixel at each point [u]; ``cell`` is the width of a cell [px].
     """
     cells = merge_cells(np.concatenate([points, more]), cell * np.concatenate([widths, more_widths]))
     cells, taken = cells[len(points) :], cells[: len(points)]

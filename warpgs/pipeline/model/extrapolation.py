@@ -36,7 +36,7 @@ SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 
 
 def extrapolated_points(views: Sequence[View], depths: Sequence[ViewDepth]) -> PointCloud:
-    """Return extrapolated points of all views: first those beyond the images, then those behind edges of depth.
+    """Return extrapolated points: first points beyond the images of pinhole cameras, then points behind edges of depth.
 
     There are none if any view has a mask, an alpha channel or a black background, since the border of a masked region is not
     the border of the image.

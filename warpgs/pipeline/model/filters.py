@@ -20,7 +20,7 @@ from warpgs.pipeline.model.scale_limits import NEEDLE, ROUNDING, long_axes
 from warpgs.scene import Gaussians
 
 INNER = 0.02
-"""Fraction of the means that is left out at both ends of each axis when the size of the scene is measured."""
+"""Fraction of the means that is left out at each end of each axis when the size of the scene is measured."""
 NEEDLE_LENGTH = 0.2
 """A Gaussian beyond the ratio `NEEDLE` is removed if it is longer than this fraction of the scene's size: shorter needles are
 hairs and edges of a good model. With a tenth instead, removal costs up to 0.08 dB on held-out views
@@ -105,7 +105,7 @@ def _box_of_file(path: Path) -> Box:
 
 
 def select(gaussians: Gaussians, keep: torch.Tensor) -> Gaussians:
-    """Return the Gaussians selected by ``keep``, bool or rows [N]."""
+    """Return the Gaussians selected by ``keep``, bool [N] or rows [K]."""
     return Gaussians(**{name: t[keep] for name, t in gaussians.tensors().items()})
 
 

@@ -19,9 +19,9 @@ MARGIN = 1.5
 FINEST = 1.5
 """Largest width of the finest cells, as the median over the views [px]."""
 PROJECTIONS = 2**25
-"""Most projections of cells into views at one level of the octree; they take a few seconds."""
+"""Largest number of projections of cells into views at one level of the octree; they take a few seconds."""
 MAX_LEVELS = 20
-"""Most levels of the octree: the finest cells are then a millionth as wide as the first one."""
+"""Largest number of levels of the octree: the finest cells are then a millionth as wide as the first one."""
 TOLERANT = 12
 """Number of views per tolerated error: from this many views on, two must find a cell empty to remove it; from twice as many on,
 three."""
@@ -53,7 +53,7 @@ class Silhouette:
         """True if the object reaches the border of the image, so that it may extend beyond it."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
-        """Return three masks [N] of balls around points [N, 3]: only at empty pixels; only at opaque ones; perhaps seen.
+        """Return three masks [N] for balls around points [N, 3]: all pixels are empty; all are opaque; the view may see them.
 
         Args:
             points: Centres of the balls [u].

@@ -37,9 +37,9 @@ class InitConfig:
 
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
-    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep for few
-    views or given depth; else points if the training views saw at least 100 of them; else random. If views have an alpha
-    channel, points in an empty area of a view are left out."""
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep with given
+    depth or up to --init.sweep-up-to views; else points if the training views saw at least 100 of them; else random. If views
+    have an alpha channel, points in an empty area of a view are left out."""
     sweep_up_to: int = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
     random_count: int = 20_000
@@ -51,7 +51,7 @@ class InitConfig:
     near_views: int = 4
     """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps one for every pixel."""
+    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps a point for every pixel."""
     fill_px: float = 16.0
     """sweep, flow: cell width [px] for filling in points where depth is not consistent; 0 fills in none."""
     extrapolate: bool | None = False
@@ -69,19 +69,19 @@ class InitConfig:
 
     def __post_init__(self):
         if self.source not in SOURCES:
-            raise UsageError(f"init source {self.source!r} is not one of {', '.join(SOURCES)}")
+            raise UsageError(f"init: `source` {self.source!r} is not one of {', '.join(SOURCES)}")
         for name in ("merge_px", "fill_px", "sweep_up_to"):
             if not 0 <= getattr(self, name) < np.inf:
-                raise UsageError(f"init {name.replace('_', '-')} must be 0 or more, not {getattr(self, name)}")
+                raise UsageError(f"init: `{name.replace('_', '-')}` must be 0 or more, not {getattr(self, name)}")
         if self.flow_range not in RANGES:
-            raise UsageError(f"init flow-range {self.flow_range!r} is not one of {', '.join(RANGES)}")
+            raise UsageError(f"init: `flow-range` {self.flow_range!r} is not one of {', '.join(RANGES)}")
         self.epipolar()  # its own checks
         if not 1e-3 <= self.scale_factor <= 10:
-            raise UsageError(f"init scale-factor {self.scale_factor} must be between 0.001 and 10")
+            raise UsageError(f"init: `scale-factor` must be between 0.001 and 10, not {self.scale_factor}")
         if not 0 < self.opacity < 1:
-            raise UsageError(f"init opacity {self.opacity} must be between 0 and 1")
+            raise UsageError(f"init: `opacity` must be in (0, 1), not {self.opacity}")
         if self.random_count < 1:
-            raise UsageError(f"init random-count {self.random_count} must be at least 1")
+            raise UsageError(f"init: `random-count` must be at least 1, not {self.random_count}")
 
     def epipolar(self) -> EpipolarConfig:
         """Return the settings of depth from flow.
@@ -228,7 +228,7 @@ def initial_points(
     ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines about the current work.
 
     Raises:
-        DataError: Points were requested and the scene has none that the training views saw.
+        DataError: The training views saw no points, and ``config`` needs them; or masks leave no pixel for a random start.
     """
     check_points(views, points, config)
     if config.source == "hull":

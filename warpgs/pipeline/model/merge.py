@@ -28,7 +28,7 @@ def _area(log_scales: torch.Tensor) -> torch.Tensor:
 
 
 def _covered(opacity: torch.Tensor, area: torch.Tensor, own: torch.Tensor, means: torch.Tensor) -> torch.Tensor:
-    """Return the integral of 1 - (1 - a G)(1 - b H) over the plane on which both are seen face on, over 2 pi [u^2], shape [P].
+    """Return 1 / (2 pi) times the integral of 1 - (1 - a G)(1 - b H) over the plane that both face [u^2], shape [P].
 
     Args:
         opacity: a and b, shape [P, 2].

@@ -56,7 +56,7 @@ class FittedModel(Model):
     transparent: bool = field(default=False, kw_only=True)
     """True if the scene's images have an alpha channel, so that renders are transparent."""
     antialiased: bool = field(default=False, kw_only=True)
-    """True where renders are antialiased (`RasterizeOptions.antialiased`)."""
+    """True if renders are antialiased (`RasterizeOptions.antialiased`)."""
 
     def __repr__(self) -> str:
         """Describe the model in one line."""
@@ -78,7 +78,7 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
     Tensors are stored unchanged; the header contains their units and the normalization.
 
     Args:
-        path: File to write; an existing one is replaced.
+        path: File to write; an existing file is replaced.
         gaussians: N Gaussians, on any device.
         normalization: Similarity from file to scene units; None for Gaussians in file units without a scene.
         units: Units of ``gaussians``: scene or file.
@@ -108,7 +108,7 @@ def save(path: str | Path, gaussians: Gaussians, normalization: Normalization | 
 
 
 def load(path: str | Path, device: str | torch.device = "cpu") -> Model:
-    """Read a model that `save` wrote; `Model.gaussians` returns its Gaussians in either units.
+    """Read a model that `save` wrote; `Model.gaussians` returns its Gaussians in scene or file units.
 
     Args:
         path: The file.
@@ -147,7 +147,7 @@ def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussi
     """Return stored tensors as Gaussians.
 
     Args:
-        tensors: Those of `Gaussians` by name, of any shape [...].
+        tensors: Fields of `Gaussians` by name, of any shape [...].
         where: Path of their file, for messages.
 
     Raises:
@@ -170,7 +170,7 @@ def checked_gaussians(tensors: Mapping[str, torch.Tensor], where: str) -> Gaussi
 
 
 def _check_type(gaussians: Gaussians) -> None:
-    """Raise TypeError where tensors are not all float32 or all float64."""
+    """Raise TypeError if tensors are not all float32 or all float64."""
     for name, t in gaussians.tensors().items():
         if t.dtype not in (torch.float32, torch.float64) or t.dtype != gaussians.means.dtype:
             raise TypeError(f"{name} is {t.dtype}; give all tensors as float32 or all as float64")

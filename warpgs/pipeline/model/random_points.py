@@ -18,7 +18,7 @@ MIN_MATCHES = 10
 NEIGHBORS = 5
 """Number of nearest matched points from which a random pixel takes its depth."""
 PAIRS = 2**20
-"""Most distances in memory at a time while neighbours are searched."""
+"""Largest number of distances in memory at a time while neighbours are searched."""
 DEPTH_SPREAD = 0.1
 """Standard deviation of the logarithm of depth around a matched point."""
 
@@ -26,8 +26,7 @@ DEPTH_SPREAD = 0.1
 def camera_depths(views: list[View]) -> tuple[float, float]:
     """Return the default near and far depth [u]: 0.1 and 10 times the distance to the cameras' focus point.
 
-    Cameras in one place with one direction have no focus point; then the distance is one unit, for which the scene's scale was
-    chosen.
+    Cameras in one place with one direction have no focus point; then the distance is 1 u.
     """
     focus = geometry.focus_point([v.camera for v in views])
     distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))

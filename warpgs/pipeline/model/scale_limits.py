@@ -21,7 +21,7 @@ WITHIN = 0.9
 NEEDLE = 30.0
 """Ratio of the longest to the middle axis above which a Gaussian is counted as a needle."""
 MAX_CENTERS = 32
-"""Most cameras to which the distance of every Gaussian is measured in a step."""
+"""Largest number of cameras to which the distance of every Gaussian is measured in a step."""
 ROUNDING = 1e-5
 """Tolerance of the logarithm of an axis at its limit: ten times the rounding error of float32."""
 
@@ -85,21 +85,21 @@ class LimitConfig:
     views."""
     min_pixels: float = 0.2**0.5
     """Smallest standard deviation of an axis in an antialiased fit, in pixels of the training camera that samples the Gaussian
-    most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, of variance 0.2 pixels squared."""
+    most finely; 0 for no limit. It replaces the 3D filter of Mip-Splatting, which has a variance of 0.2 pixels squared."""
     ratio_from: float = 0.7
     """Fraction of the steps after which ``max_ratio`` applies, in [0, 1]. Long Gaussians help the first steps."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_size <= 1e6:
-            raise UsageError(f"limits max-size must be 0, for no limit, or at most 1e6, not {self.max_size}")
+            raise UsageError(f"limits: `max-size` must be 0 (no limit) to 1e6, not {self.max_size}")
         if self.max_ratio != 0 and not 1 <= self.max_ratio <= 1e6:
-            raise UsageError(f"limits max-ratio must be 0, for no limit, or lie between 1 and 1e6, not {self.max_ratio}")
+            raise UsageError(f"limits: `max-ratio` must be 0 (no limit) or between 1 and 1e6, not {self.max_ratio}")
         if not 0 <= self.max_reach <= 1e6:
-            raise UsageError(f"limits max-reach must be 0, for no limit, or at most 1e6, not {self.max_reach}")
+            raise UsageError(f"limits: `max-reach` must be 0 (no limit) to 1e6, not {self.max_reach}")
         if not 0 <= self.min_pixels <= 1e6:
-            raise UsageError(f"limits min-pixels must be 0, for no limit, or at most 1e6, not {self.min_pixels}")
+            raise UsageError(f"limits: `min-pixels` must be 0 (no limit) to 1e6, not {self.min_pixels}")
         if not 0 <= self.ratio_from <= 1:
-            raise UsageError(f"limits ratio-from must be between 0 and 1, not {self.ratio_from}")
+            raise UsageError(f"limits: `ratio-from` must be between 0 and 1, not {self.ratio_from}")
 
     def at(self, progress: float, radius: float, antialiased: bool = False) -> Limits:
         """Return the limits of a step.
@@ -155,7 +155,7 @@ def camera_centers(cameras: Sequence[Camera], device: torch.device) -> torch.Ten
 
 
 def long_axes(log_scales: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the logarithms of the longest and of the middle axis, shape [N] each, from those of all axes, shape [N, 3]."""
+    """Return the logarithms of the longest and of the middle axis, shape [N] each; ``log_scales`` has shape [N, 3]."""
     a, b, c = log_scales.unbind(1)
     low, high = torch.minimum(a, b), torch.maximum(a, b)
     return torch.maximum(high, c), torch.maximum(low, torch.minimum(high, c))

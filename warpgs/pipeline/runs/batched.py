@@ -37,12 +37,12 @@ def check_batched(
     path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
     if path is not None and not resume and needs_poses(path):
         raise UsageError(
-            f"{path}: has no cameras, and each of {ranks.count} ranks would find other poses; run `warpgs poses {path} --out "
+            f"{path}: has no cameras, and each of {ranks.count} ranks finds its own poses; run `warpgs poses {path} --out "
             "SCENE` first, and fit SCENE"
         )
     if time_budget is not None:
         raise UsageError(
-            f"--time-budget measures the speed of a process, so {ranks.count} ranks would choose different steps; give --steps"
+            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
         )
 
 
@@ -75,7 +75,7 @@ def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
 
 
 def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
-    """Return sentences on views and processes of a step, none for one view."""
+    """Return sentences on views and processes of a step; empty if a step has one view."""
     if config.batch == 1:
         return []
     notes = [

@@ -46,7 +46,7 @@ def safetensors_chunks(tensors: dict[str, torch.Tensor], metadata: dict[str, str
 
 
 def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[str, Any]) -> Path:
-    """Write a checkpoint; the last checkpoint is replaced only when the new one is complete on disk.
+    """Write a checkpoint; the previous checkpoint is replaced only when the new one is complete on disk.
 
     ``state`` is stored in the header of the same file, so tensors and state always belong to the same step.
 
@@ -59,8 +59,8 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
         The file's path.
 
     Raises:
-        NotFiniteError: A tensor holds a NaN or an infinity; the last checkpoint is untouched.
-        ResourceError: The disk is full or not writable; the last checkpoint is untouched.
+        NotFiniteError: A tensor holds a NaN or an infinity; the previous checkpoint is untouched.
+        ResourceError: The disk is full or not writable; the previous checkpoint is untouched.
     """
     path = folder / TENSORS
     for name, t in tensors.items():
@@ -68,7 +68,7 @@ def save_checkpoint(folder: Path, tensors: dict[str, torch.Tensor], state: dict[
         if t.is_floating_point() and t.numel() and not all(math.isfinite(float(v)) for v in t.aminmax()):
             raise NotFiniteError(
                 f"{path} was not written: {name} holds non-finite values; results after the last checkpoint are invalid. "
-                "--resume repeats the same steps; fit again into a new --out with lower learning rates"
+                "--resume would repeat the same steps; fit again into a new --out with lower learning rates"
             )
     metadata = {"format": str(FORMAT), "version": __version__, "state": json.dumps(state)}
     chunks = safetensors_chunks(tensors, metadata)

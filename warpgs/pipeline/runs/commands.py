@@ -48,7 +48,7 @@ def scene_of(
 
     Args:
         stored: The run.
-        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        reader: User-defined reader, as given to `warpgs fit --reader`.
         tell: Called with a line for each image before it is read.
 
     Raises:
@@ -77,9 +77,9 @@ def evaluate(
     Args:
         folder: The run folder.
         device_name: auto, cpu or cuda.
-        lpips_weights: File of `warpgs convert-lpips`; without one LPIPS is not measured.
-        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
-        by_coverage: Whether to split the scores by the number of training views that saw each pixel's point.
+        lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
+        reader: User-defined reader, as given to `warpgs fit --reader`.
+        by_coverage: Whether to split the scores by the number of training views that see the point at each pixel.
 
     Raises:
         DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the file of

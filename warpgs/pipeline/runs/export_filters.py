@@ -101,7 +101,7 @@ def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | 
 
     Args:
         wish: Axis and angle as x,y,z,degrees; level; or None.
-        cameras: Cameras with the upward direction for `level`; None if unknown.
+        cameras: Cameras that define the upward direction for `level`; None if unknown.
 
     Raises:
         UsageError: The text is not a rotation, or there are no cameras for `level`.

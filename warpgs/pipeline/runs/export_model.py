@@ -48,8 +48,8 @@ def convert(
     Raises:
         DataError: The file cannot be read or is malformed, or no Gaussian is left.
         ResourceError: Another process writes into the target's folder, or the target cannot be written.
-        UsageError: A suffix is unknown, a given format fits neither file, a filter is invalid, or a filter needs the cameras of
-            a run.
+        UsageError: A suffix is unknown, ``source`` is a run folder, a given format fits neither file, a filter is invalid, or a
+            filter needs the cameras of a run.
     """
     if holds_cameras(target):
         _check_for_cameras(filters, formats)

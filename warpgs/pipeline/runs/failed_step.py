@@ -132,10 +132,11 @@ def broken_terms(bundle: Bundle) -> list[str]:
 def findings(bundle: Bundle) -> list[str]:
     """Compute a failed step again; returns a line for every input and result, with its range or its non-finite values.
 
-    Loss terms of the user are computed if their classes are loaded, and else named. The strategy's loss terms are not computed.
+    User-defined loss terms are computed if their classes are loaded; otherwise a line names them. The strategy's loss terms are
+    not computed.
 
     Raises:
-        DataError: A tensor or a value is missing or of another shape.
+        DataError: A tensor or a value is missing or has the wrong shape.
     """
     tensors, plain = bundle
     try:

@@ -108,13 +108,13 @@ def fit(
             object, ``module:NAME`` or ``file.py:NAME`` (this runs the code of the module); None for the default preset.
         split: Views to fit and to hold out, as in `warpgs fit --split`; None to fit all.
         out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
-        device: auto, cpu, cuda, or one of torch's.
+        device: auto, cpu, cuda, or a torch device.
         on_step: Called after every step with its number, loss, PSNR, number of Gaussians and time.
         resume: Continue the run in ``out`` from its last checkpoint.
         lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
         time_budget: Time that the fit may take [s], which determines the number of steps; None to use the number in the
             settings.
-        notes: Earlier choices, which are printed and recorded with those of the fit.
+        notes: Earlier choices, which are printed and recorded with the choices of the fit.
         verbose: True to print everything, False to print nothing, "progress" to print progress only.
         on_model: Called after every step with the current model, for viewers: the next step overwrites its tensors.
         ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. Only the first
@@ -211,7 +211,7 @@ def _scene_of(
     device: str,
     progress: Callable[[str], object],
 ) -> tuple[SceneRequest, Scene, Split, list[str]]:
-    """Read and split a scene that is given in one of four ways; returns it, the split and notes."""
+    """Read and split a scene that is given in one of four ways; returns request, scene, split and notes."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
         return SceneRequest("", spec, 1).with_scale(device), scene, split, [*scene.notes, *notes]

@@ -132,7 +132,7 @@ def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteErr
     mend = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
     return NotFiniteError(
         f"{error}, on {name}{where}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` names the non-finite values. Continued, the fit would fail at the same step; {mend} into a new --out"
+        f"{out / FAILED}` names the non-finite values. --resume would fail at the same step; {mend} into a new --out"
     )
 
 

@@ -57,7 +57,7 @@ def versions() -> dict[str, str]:
 def run_folder(out: Path, resume: bool) -> Iterator[list[str]]:
     """Lock a run folder for a fit: a new or empty one, or one with a run to continue; yields notes for the user.
 
-    A folder with found poses only, from a fit that ended before its first step, is accepted in both cases.
+    A folder with found poses only, from a fit that ended before its first step, is accepted with and without ``resume``.
 
     Raises:
         FolderHeldError: Another process writes into the folder.
@@ -91,7 +91,7 @@ def camera_values(camera: Camera) -> dict[str, Any]:
 
 
 def _camera(values: dict[str, Any]) -> Camera:
-    """Return the camera from the result of `camera_values`; UsageError if its camera model is missing."""
+    """Return the camera from the result of `camera_values`; UsageError if its camera model is not supported."""
     arrays = {k: np.array(values[k], np.float64) for k in ("viewmat", "K", "distortion") if values.get(k) is not None}
     camera = Camera(**(values | arrays))
     check_camera(camera)
@@ -99,7 +99,7 @@ def _camera(values: dict[str, Any]) -> Camera:
 
 
 def _cameras(stored: dict[str, Any], path: Path) -> dict[str, Camera]:
-    """Return the cameras of a file by name; DataError if a camera model is missing."""
+    """Return the cameras of a file by name; DataError if a camera model is not supported."""
     try:
         return {n: _camera(c) for n, c in stored.items()}
     except UsageError as e:
@@ -297,7 +297,7 @@ def open_run(folder: str | Path, device: str | torch.device = "auto") -> StoredR
 
     Args:
         folder: The run folder.
-        device: Device of the tensors: auto, cpu, cuda, or one of torch's.
+        device: Device of the tensors: auto, cpu, cuda, or a torch device.
 
     Raises:
         DataError: The folder is not a run folder, another version of warpgs wrote it, or its checkpoint is incomplete.

@@ -29,7 +29,7 @@ SIZES = (64, 8192)
 MIN_OPACITY = 0.1
 """Least opacity of a Gaussian that is shown: fainter ones are invisible."""
 MAX_POINTS = {"gaussians": 50_000, "start": 300_000}
-"""Largest number of Gaussians and of points shown; of more, a random sample is shown."""
+"""Largest number of Gaussians and of points shown; larger sets are sampled at random."""
 CLASSES = (
     (0, "seen by no training view", "#d6219c"), (1, "by 1", "#f0a020"), (2, "by 2", "#a6bf3a"), (3, "by 3 to 5", "#2fa37c"),
     (6, "by 6 and more", "#2878b5"),

@@ -46,7 +46,7 @@ from warpgs.runtime.terminal import say
 THREADS = 256
 """Default number of threads of a block."""
 CAMERA_MODEL = "pinhole"
-"""Camera model whose kernels are compiled: that of a scene read without native lenses."""
+"""Camera model whose kernels are compiled: the model of scenes read without native lenses."""
 
 
 def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:

@@ -79,17 +79,18 @@ def prune(
 
     Args:
         folder: The run folder, which is not changed.
-        keep_psnr: Allowed loss, above 0.
+        keep_psnr: Allowed loss [dB], above 0.
         out: Folder to write; None for the run's name with ``-pruned``.
         device_name: auto, cpu or cuda.
-        reader: Reader from outside warpgs, as `warpgs fit --reader` was given it.
+        reader: User-defined reader, as given to `warpgs fit --reader`.
         tell: Called with a line for the user about the current work.
 
     Returns:
         Lines for the user.
 
     Raises:
-        DataError: The folder is not a run, its scene is gone, or the scene's data have changed since the fit.
+        DataError: The folder is not a run, its scene is gone, the scene's data have changed since the fit, or the training PSNR
+            is not finite.
         ResourceError: The new folder cannot be written, or the device is missing.
         UsageError: ``keep_psnr`` is not above 0, or the new folder exists.
     """

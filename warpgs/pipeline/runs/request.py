@@ -53,20 +53,20 @@ class SceneRequest:
     max_pixels: int = MAX_PIXELS
     """Largest number of pixels of a stored image or mask."""
     max_side: int | None = None
-    """Largest image side [px], 0 for no limit; None for no limit with --downscale, else for 1600, or 800 in a fit on a CPU."""
+    """Largest image side [px], 0 for no limit. None: no limit with --downscale; otherwise 1600, or 800 in a fit on a CPU."""
     lenses: str = "undistort"
     """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (the model is rendered through the
     lens). Fisheyes need native."""
     depths: str | None = None
     """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
-    Default: the maps named in transforms.json; none ignores these."""
+    Default: the maps named in transforms.json; give none to ignore them."""
     normals: str | None = None
     """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, as for --depths."""
     depth_kind: str = "metric"
     """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
     disparity (inverse lengths of unknown scale and shift, as networks give)."""
     depth_unit: float | None = None
-    """Length of one unit of a metric depth map in units of the cameras; None for 0.001 for integers, 1 for floats."""
+    """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
     normal_axes: str = "opencv"
     """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
     matcher: str | None = None
@@ -92,7 +92,7 @@ class FitRequest:
     resume: bool = False
     """Continue the run in ``out`` from its last checkpoint."""
     lpips_weights: Path | None = None
-    """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    """File of `warpgs convert-lpips`; None to leave LPIPS out."""
     time_budget: float | None = None
     """Time that the fit may take [s], which determines the number of steps; None to use ``config``. Not with ``resume``."""
     notes: tuple[str, ...] = ()
@@ -108,7 +108,7 @@ def check_overrides(overrides: Mapping[str, object]) -> None:
         UsageError: A keyword is an option of `load_scene`.
     """
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
-        raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to warpgs.load_scene and fit its result")
+        raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to load_scene, and fit that scene")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
@@ -148,7 +148,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
         The split, and notes for the user: the choice made, and masks and held-out views for which scores are less reliable.
 
     Raises:
-        DataError: A view that is named is missing.
+        DataError: A named view is missing.
         UsageError: The split is invalid.
     """
     split = split_views(scene, "all" if spec is None else spec)
@@ -159,7 +159,7 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
             "folder idrmasks, or give them with --score-masks"
         )
     for test, train in coincident_views(scene, split):
-        notes.append(f"{test} is held out, but training view {train} has the same pose, so its score is no test of new views")
+        notes.append(f"{test} is held out, but training view {train} has the same pose, so this score does not test new views")
     return split, notes
 
 

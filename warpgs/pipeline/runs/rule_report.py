@@ -26,7 +26,7 @@ SIDE = 64
 
 
 def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
-    """Sample a part of an image, [left, top, width, height], with edges at tile edges or the image's."""
+    """Sample a part of an image, [left, top, width, height], with edges at tile edges or image edges."""
     sides = []
     for length in (camera.width, camera.height):
         first = TILE_SIZE * int(generator.integers(max(0, length - SIDE) // TILE_SIZE + 1))

@@ -17,7 +17,7 @@ from warpgs.poses.record import JSON, TEXT, read_record
 
 
 def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
-    """Find the poses of photographs if a request names some without cameras; other requests are returned unchanged.
+    """Find the poses of photographs if a request names photographs without cameras; other requests are returned unchanged.
 
     Args:
         request: The request; its path may be a folder of images or a video.
@@ -43,7 +43,7 @@ def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str]
     if (scene / JSON).is_file():
         record = read_record(scene)
         if record["source_sha256"] != source_digest(source, request.allow_outside):
-            raise UsageError(f"{scene} holds poses of photographs other than those of {source}; give another --out")
+            raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
     else:
         progress(f"{source} has no cameras: finding the poses of its photographs, to store them in {scene}")
         threads = torch.get_num_threads()

@@ -44,7 +44,7 @@ by the residual and one more score at a time; each enabled part switched off alo
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:
-    """Return presets as the variants of a study, in the order named; ``steps`` replaces the steps of all.
+    """Return presets as the variants of a study, in the order of ``names``; ``steps`` replaces the steps of each preset.
 
     Args:
         names: Presets as `warpgs.fit` takes them; a file or an object is shown by the last part of its name.

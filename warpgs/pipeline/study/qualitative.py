@@ -16,7 +16,7 @@ from warpgs.scene import View
 CROPS = 2
 """Enlarged parts of each view."""
 FRACTION = 0.22
-"""Width and height of a crop as a fraction of the image's."""
+"""Width and height of a crop, as fractions of the width and height of the image."""
 
 
 def _rendered(folder: Path, views: list[View], device: torch.device) -> list[np.ndarray]:

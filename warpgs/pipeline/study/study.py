@@ -55,7 +55,7 @@ class StudyRequest:
     device: str = "auto"
     """auto, cpu or cuda."""
     lpips_weights: Path | None = None
-    """File of `warpgs convert-lpips`; without one LPIPS is not measured."""
+    """File of `warpgs convert-lpips`; None to leave LPIPS out."""
     engine: EngineRequest | None = None
     """Engine of a farm for the runs; None: one run after another in this process."""
     marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)

@@ -31,8 +31,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
-"""Positions in the last summed tensor, after loss and squared error: of the number of processes that were asked to stop, and of
-the first slot's reason to stop the step."""
+"""Indices in the last summed tensor, after loss and squared error: the number of processes that were asked to stop, and the
+first slot's reason to stop the step."""
 
 
 class SumUpdate:
@@ -160,7 +160,7 @@ class BatchSteps:
             places: Kind and row of the view of each slot, of all processes, step by step.
             settings: Settings of each slot, as `StepBuffers` takes them.
             stacks: Views by kind.
-            plan: Choices that the steps are made of.
+            plan: Fixed choices of the steps.
             max_instances: Instances that a view may have at a time; None for no limit.
             captured: Whether CUDA graphs are used.
 
@@ -200,7 +200,7 @@ class BatchSteps:
     def _works(
         self, kinds: list[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, captured: bool
     ) -> list[Callable[[], ViewGradients]]:
-        """Return for each slot of this process, with a view of this kind, the function that computes its gradients."""
+        """Return each slot's function for its gradients; ``kinds`` are the kinds of the views of this process's slots."""
         if captured and self._graphs is not None:
             return [_replayed(graph) for graph in self._graphs.capture_all(kinds, stacks, plan, max_instances)]
         render = eager_renderer(self.options, max_instances)
@@ -220,7 +220,7 @@ class BatchSteps:
             said[STOP : STOP + 1].fill_(1.0)
 
     def _prepared(self, first: ViewGradients, plan: StepPlan, captured: bool) -> list[Callable[[], object]]:
-        """Return the functions that update by the sums, which are of what ``first`` contributes."""
+        """Return the functions that update by the sums; ``first`` determines the shapes of the sums."""
         table, tensors = self.learned.table, (*first.gradients, *first.statistics.values())
         shapes = [*(tuple(t.shape) for t in tensors), (FLAGS + self.tree.batch,)]
         large = max(table.params, key=lambda n: table.params[n].numel())

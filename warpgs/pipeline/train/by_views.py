@@ -19,11 +19,12 @@ MIN_STEPS, OPAQUE_STEPS = 3000, 4500
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Number of views above which steps exceed `MIN_STEPS`; exponent of this growth; and largest number of steps."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
-"""Learning rate of the log scales up to so many views, and exponent with which it falls for more views."""
+"""Learning rate of the log scales for up to `SCALES_VIEWS` views, and exponent with which it falls for more views."""
 OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
 """Learning rate of the opacities for 3 views, which rises with the square root of their number, and its largest value."""
 HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
-"""Fraction of the steps at half size up to so many views; for more views it is inversely proportional to their number."""
+"""Fraction of the steps at half size for up to `HALF_VIEWS` views; for more views it is inversely proportional to their
+number."""
 DEGREES = (5, 9, 12)
 """Fewest training views for spherical harmonics of degree 1, 2 and 3. With fewer, colours do not depend on the view: four
 photographs cannot distinguish a view-dependent colour from an error of the shape."""
@@ -38,18 +39,18 @@ EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
 of opacities with such points. Neither was measured in other fits (docs/decisions/026-extrapolated-points.md)."""
 MIN_GAIN_DB = 0.1
-"""Gain of held-out blocks below which growth ends [dB]. Nothing is held out if a CPU's time limits the steps: these are too few
-to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
+"""Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
+too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
 CPU_PIXELS = 1.55e6
-"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; up to three times as many pixels
-with fewer Gaussians."""
+"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians up to three
+times as many."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
 ONE_LAYER = 1.1
-"""Ratio of the times of a step on a CPU with one layer and with two layers, which have fewer Gaussians."""
+"""Time of a step on a CPU with one layer, relative to a step with two layers, which have fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
-"""Learning rates of the means and of the constant colour; and the factor of both if a CPU's time limits the steps and there are
-more than so many views (docs/decisions/025-time-on-a-cpu.md)."""
+"""Learning rates of the means and of the constant colour; and the factor of both if the time limit on a CPU shortens the fit
+and there are more than `CPU_RATES_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
 LOST_DB = 0.18
 """Least loss of PSNR for each halving of the steps of a fit on a CPU [dB]; with many views the loss is larger."""
 
@@ -78,7 +79,7 @@ def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
     Args:
         wanted: Steps of the fit without a limit.
         views: Number of training views.
-        pixels: Pixels that those steps render, weighed by the time that each takes.
+        pixels: Pixels that those steps render, weighted by the time for a pixel.
     """
     seconds, most = pixels / CPU_PIXELS, cpu_seconds(views)
     if seconds <= most:

@@ -44,7 +44,8 @@ class FitConfig:
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """Limit the steps on a CPU, if the number of views sets them, to the work of two cores in 1 to 20 minutes."""
+    """Limit the steps on a CPU, if --steps is None, to those that two cores finish in 1 to 20 minutes, depending on the number
+    of views."""
     seed: int = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
@@ -67,12 +68,12 @@ class FitConfig:
     dropout_views: int = 3
     """Number of training views up to which dropout has its full probability; with more views it falls in proportion."""
     checkpoint_every: int = 1000
-    """Number of steps between checkpoints; one is always written at the end."""
+    """Number of steps between checkpoints; the last step always writes a checkpoint."""
     checkpoint_seconds: float = 20.0
     """Least time between checkpoints [s], because writing takes time. This setting does not affect results."""
     memory_limit: int | None = None
     """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
-    a step would exceed the limit, and images are rendered in chunks if a whole image would exceed it."""
+    a step would exceed the limit, and images are rendered in chunks if a whole image would exceed the limit."""
     cuda_graph: bool = True
     """CUDA graphs: steps are captured once and replayed, which is faster and gives the same bytes."""
     max_gaussians: int = 1_000_000
@@ -142,7 +143,7 @@ class FitConfig:
         return Settings(value for value in vars(self).values() if dataclasses.is_dataclass(value))
 
     def own_code(self) -> dict[str, str]:
-        """Return the SHA-256 of the source file of each user-defined class, by its name."""
+        """Return the SHA-256 of each user-defined class's source file, by class name."""
         return own_code(self.plugged_in())
 
     def plugged_in(self) -> list[type]:

@@ -21,7 +21,7 @@ FLOOR = (2 / 255) ** 2
 little effect."""
 SIDES = 16, 32
 """Bounds of the side of a block [px]. The side is a sixteenth of the image's shorter side, within these bounds, and at most an
-eighth."""
+eighth of that side."""
 MIN_BLOCKS = 12
 """Smallest number of blocks over all views for a significant gain."""
 MAX_FRACTION = 0.1

@@ -12,7 +12,7 @@ from warpgs.scene import Scene, View
 
 
 def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
-    """Return the named views of a scene, in the order named."""
+    """Return the named views of a scene, in the order of the names."""
     return [scene.view(n) for n in names]
 
 
@@ -25,9 +25,9 @@ def run(
 ) -> None:
     """Take all remaining steps; report each, and save at intervals and at the end.
 
-    A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the set of Gaussians was
-    being changed, the fit continues from the last saved state. With several processes there is no second try, because one
-    process would be alone in that step.
+    A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the state is incomplete, for
+    example during a change of the set of Gaussians, the fit continues from the last saved state. With several processes there
+    is no second try, because one process would be alone in that step.
 
     Args:
         trainer: The fit.
@@ -38,7 +38,8 @@ def run(
 
     Raises:
         NotFiniteError: The loss, or the state to save, is not finite; the state is not saved.
-        OutOfMemoryError: A step ran out of memory twice; the state before the step is saved if it is complete.
+        OutOfMemoryError: A step ran out of memory, and a second try failed or was not possible; a complete state before the
+            step is saved.
         KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
     """
     every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1

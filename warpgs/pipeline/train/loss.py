@@ -30,7 +30,7 @@ class Target:
     """Maps that loss terms requested (`LossTerm.needs`), by name, each of shape [H, W] or [H, W, C]."""
     alpha: torch.Tensor | None = None
     """Opacity of the subject, in [0, 1], shape [H, W]; None if no training view has one. ``image`` and the render have the same
-    background; with `LossConfig.random_background` it changes at each step."""
+    background; with `LossConfig.random_background` the background changes at each step."""
 
 
 class _Outputs(dict[str, torch.Tensor]):
@@ -84,7 +84,7 @@ class LossTerm:
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the maps of a view that the term reads, by name, each of shape [H, W] or [H, W, C].
 
-        No two terms of a fit may use the same name.
+        No two terms of a fit may use the same name for a map.
         """
         return {}
 

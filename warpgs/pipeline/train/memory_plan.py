@@ -1,9 +1,9 @@
 """Memory that a fit needs, as the sum of the needs that its parts declare, and the means to keep to a limit.
 
-A step always holds parameters with their Adam moments, plus the memory of its heaviest moment. Each part declares its bytes
-beside its allocations: kernels, loss terms, view modules and the strategy by moment (`StepSizes`), the table by row. The CUDA
-driver, Python and the compiled kernels need additional memory. Small parts are not counted: parameters of single views, and the
-buffers of learning rates and losses (`StepBuffers`).
+A step needs the memory of the parameters and Adam's state, plus the memory of its heaviest moment, such as blending or the
+loss. Each part declares its bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment of a
+step (`StepSizes`), the table by row. The CUDA driver, Python and the compiled kernels need additional memory. Small parts are
+not counted: parameters of single views, and the buffers of learning rates and losses (`StepBuffers`).
 """
 
 from __future__ import annotations

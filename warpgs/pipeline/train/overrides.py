@@ -49,13 +49,14 @@ def with_settings(config: FitConfig, values: Mapping[str, Any], place: str, *, k
 
     Args:
         config: Settings to start from.
-        values: New values by name: the name of the flag, with dots or with groups as mappings, or with underscores throughout.
+        values: New values by name of the flag (``init.opacity``), by names in nested mappings, or by keyword
+            (``init_opacity``).
         place: Source of the values, for messages: a file, or the function that was called.
         keywords: True for keywords of a call in Python. Only then may ``strategy``, ``loss_terms`` and ``view_modules`` name
             ``module:Class`` or ``file.py:Class``, which is imported.
 
     Raises:
-        UsageError: A name is unknown, or a value is of another type or out of range; the message names it.
+        UsageError: A name is unknown, or a value has the wrong type or is out of range; the message names the setting.
     """
     given = {name.replace("-", "_"): value for name, value in _flat(values, place)}
     try:

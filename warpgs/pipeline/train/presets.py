@@ -62,11 +62,11 @@ class Presets(Mapping[str, "FitConfig"]):
             UsageError: A built-in preset has that name, or the name is not possible in a flag.
         """
         if name in self._files or ":" in name or name.endswith(SUFFIX) or not name.strip():
-            raise UsageError(f"a preset cannot be registered as {name!r}; choose a name without a colon that is not built in")
+            raise UsageError(f"a preset cannot be registered as {name!r}; choose a new name without a colon or .toml")
         self._made[name], self._about[name] = config, about
 
     def described(self) -> dict[str, str]:
-        """Return a line about each by name."""
+        """Return a line about each preset, by name."""
         return {name: self._about_of(name) for name in self}
 
     def _about_of(self, name: str) -> str:
@@ -103,7 +103,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
 
     Raises:
         DataError: The file cannot be read or is not TOML.
-        UsageError: The preset is unknown, or one of its settings is unknown or has the wrong type.
+        UsageError: The preset is unknown, or one of its settings is unknown, has the wrong type or is out of range.
     """
     from warpgs.pipeline.train.config import FitConfig
 
@@ -133,7 +133,7 @@ def chosen_settings(
 
     Raises:
         DataError: The file of a preset cannot be read or is not TOML.
-        UsageError: The preset is unknown, or a setting is unknown or has the wrong type.
+        UsageError: The preset is unknown, or a setting is unknown, has the wrong type or is out of range.
     """
     from warpgs.pipeline.train.config import FitConfig
     from warpgs.pipeline.train.overrides import with_settings

@@ -33,7 +33,7 @@ def check_lrs(of: str, **rates: float | None) -> None:
     """
     for name, value in rates.items():
         if value is not None and not 0 < value <= MAX_LR:
-            raise UsageError(f"{of} {name} must be positive and at most {MAX_LR:g}, not {value}")
+            raise UsageError(f"{of}: `{name}` must be positive and at most {MAX_LR:g}, not {value}")
 
 
 @dataclass(frozen=True)
@@ -41,30 +41,30 @@ class OptimizerConfig:
     """Learning rates, by default those of the reference implementation of Kerbl et al. 2023, except for the scales."""
 
     means_lr: float | None = 1.6e-4
-    """Learning rate of the means at the start, in units of the scene's extent. None: 1.6e-4, or more if a CPU's time limits the
-    steps."""
+    """Learning rate of the means at the start, in units of the scene's extent. None: 1.6e-4, or more if --cpu-limit shortens
+    the fit."""
     means_lr_final: float = 1.6e-6
-    """Learning rate of the means at the last step, in units of the scene's extent; log-linear between."""
+    """Learning rate of the means at the last step, in units of the scene's extent; log-linear in between."""
     quats_lr: float = 1e-3
     """Learning rate of the rotations."""
     scales_lr: float | None = 0.01
     """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md). None: by the number of
     views."""
     scales_decay: float = 1.0
-    """Ratio of the last to the first learning rate of the log scales; log-linear from the beginning of phase 3, or of a fit
-    without phases. 1 for a constant rate."""
+    """Learning rate of the log scales at the last step, as a fraction of the first. It falls log-linearly during phase 3;
+    without phases, during the whole fit. 1: constant."""
     opacities_lr: float | None = 0.05
     """Learning rate of the opacity logits. None: by the number of views."""
     opacities_decay: float | None = 0.0
     """Fraction by which each step lowers every opacity, in [0, 0.1]; 0 for no decay. None: by the number of views."""
     sh_lr: float | None = 2.5e-3
-    """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if a CPU's time limits the steps."""
+    """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if --cpu-limit shortens the fit."""
     sh_rest_factor: float = 0.05
     """Learning rate of the other colour coefficients, as a fraction of ``sh_lr``."""
 
     def __post_init__(self):
         if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
-            raise UsageError(f"optimizer opacities-decay must be between 0 and {MAX_DECAY}, not {self.opacities_decay}")
+            raise UsageError(f"optimizer: `opacities-decay` must be between 0 and {MAX_DECAY}, not {self.opacities_decay}")
         check_lrs("optimizer", **{n: v for n, v in vars(self).items() if n != "opacities_decay"})
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
@@ -97,11 +97,12 @@ class OptimizerConfig:
 class PhaseConfig:
     """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in the second.
 
-    In a fit shorter than twice phases 1 and 3 together, these phases and the interval are shortened in proportion.
+    In a fit shorter than twice phases 1 and 3 together, these phases and the interval between events are shortened in
+    proportion.
     """
 
     coarse: int = 0
-    """Steps of phase 1, with only the coarse layer; 2000 in the paper. 0 with ``stable`` 0: no phases."""
+    """Steps of phase 1, with only the coarse layer; 2000 in the paper. If this and ``stable`` are 0, the fit has no phases."""
     stable: int = 0
     """Steps of phase 3, in which no Gaussians are added or removed; 3000 in the paper."""
     every: float = 100.0
@@ -109,7 +110,7 @@ class PhaseConfig:
     growth: float = 4.0
     """Growth of the interval between events over phase 2, gamma: T_sample(t) = T_base (1 + gamma t), t from 0 to 1."""
     least: float = 1.0
-    """Lower bound of T_base [steps] in short fits, which shorten it: on a CPU an event takes as long as ten steps."""
+    """Lower bound of T_base [steps] where a short fit shortens it. On a CPU an event takes as long as ten steps."""
 
     def __post_init__(self):
         if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
@@ -153,7 +154,7 @@ class Phases:
 def plan_phases(config: PhaseConfig, steps: int) -> Phases:
     """Plan the phases of a fit of that many steps.
 
-    With the paper's numbers there are 102 events in 25,000 steps of phase 2 and 21 in 5000.
+    With the default intervals there are 102 events in 25,000 steps of phase 2, and 21 in 5000.
     """
     outer = config.coarse + config.stable
     shrink = min(1.0, 0.5 * steps / outer) if outer else 1.0

@@ -55,14 +55,15 @@ def prepare(
         config: Settings.
         generator: Generator of random points.
         device: Device to sweep on; with a memory limit the CPU sweeps, since a sweep may need more memory than a step.
-        priors: Prior of each view; None to compute them where they are needed.
-        ready: Called before the device is used, and in any case before the end.
+        priors: Prior of each view; None to compute them if they are needed.
+        ready: Called before the device is used, and in any case before this function returns.
         progress: Called with a line for the user about the current work.
 
     Raises:
         DataError: The scene gives no initial points.
-        UsageError: A view's camera cannot be rendered: its model is missing, or has other coefficients. A given map has the
-            wrong size or is not finite. The start or the strategy compares views, and a camera has no pinhole of the same K.
+        UsageError: A view's camera cannot be rendered: its model is unknown, or the number of coefficients is wrong. A given
+            map has the wrong size or is not finite. The start or the strategy compares views, and a camera model has no pinhole
+            equivalent with the same K.
     """
     for view in train:
         check_camera(view.camera)

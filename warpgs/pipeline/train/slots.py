@@ -20,7 +20,7 @@ SUMMED = 2
 """Number of statistics of a Gaussian that are summed with the gradients of several views: sum of its gradients, and number of
 renders."""
 Node = tuple[int, int]
-"""Slots of a subtree: the first, and the one after the last."""
+"""Slots of a subtree: the first, and the last plus one."""
 ALIGNMENT = 16
 """Alignment of the parts of a sum, in floats: Adam reads four at a time."""
 FLOAT_BYTES = 4
@@ -87,7 +87,7 @@ def depth(node: Node) -> int:
 
 
 def finished(node: Node, known: Mapping[Node, torch.Tensor]) -> torch.Tensor:
-    """Return the sum of a node from known sums of its subtrees, shape [...]; these are overwritten."""
+    """Return the sum of a node from known sums of its subtrees, shape [...]; the known sums are overwritten."""
     if node in known:
         return known[node]
     left, right = (finished(child, known) for child in children(node))

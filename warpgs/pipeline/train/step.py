@@ -85,7 +85,7 @@ class StepBuffers:
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
-        """Upload view rows, learning rates and settings (7 each) of the next steps, of which there are at most ``rows``."""
+        """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as were allocated."""
         self.counter.zero_()
         self.stop.zero_()
         self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
@@ -93,7 +93,7 @@ class StepBuffers:
         self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
-        """Return the number of steps taken, the stop flag, and losses and squared errors, including non-finite ones."""
+        """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next."""
         done, stop = int(self.counter), int(self.stop)
         return done, stop, self.history[: done + 1].tolist()
 
@@ -115,11 +115,12 @@ class StepBuffers:
 
 
 Renderer = Callable[[Gaussians, Camera, int, "torch.Tensor | None", "torch.Tensor | None"], Render]
-"""Renderer of a batch of one camera. Further arguments: the degree, opacity factors, and a shift of the background [3]."""
+"""Function that renders for a camera with a leading axis of 1. Arguments: Gaussians, camera, degree, opacity factors, and a
+shift of the background [3]."""
 
 
 def eager_renderer(options: RasterizeOptions, max_instances: int | None) -> Renderer:
-    """Return a renderer that allocates memory for each render, in chunks of at most ``max_instances``."""
+    """Return a renderer that allocates memory for each render, and renders in chunks of at most ``max_instances``."""
 
     def render(
         gaussians: Gaussians, camera: Camera, degree: int, factors: torch.Tensor | None, shift: torch.Tensor | None
@@ -211,7 +212,7 @@ def step(learned: Learned, views: ViewStack, buffers: StepBuffers, plan: StepPla
         learned: Tables and strategy that the step changes.
         views: Views of one kind.
         buffers: Settings of the steps, and their results.
-        plan: Choices that the step is made of.
+        plan: Fixed choices of the step.
         render: Renderer.
     """
     found = view_gradients(learned, views, buffers, plan, render)
@@ -249,7 +250,7 @@ def forward(
         dropout_seed: Seed of the opacity dropout; None without dropout.
         views: Views of one kind.
         buffers: Settings of the steps.
-        plan: Choices that the step is made of.
+        plan: Fixed choices of the step.
         render: Renderer.
     """
     lrs, settings, viewmat, K, image = buffers.begin(views)
@@ -285,7 +286,7 @@ def total_loss(plan: StepPlan, inputs: LossInputs, strategy: Strategy, of_views:
 
 @torch.no_grad()
 def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor) -> None:
-    """Update all parameters and columns; nothing changes if ``stop`` [1] is not 0, int32."""
+    """Update all parameters and columns; nothing changes if ``stop`` (int32, [1]) is not 0."""
     descend(learned, plan, found, stop, list(learned.table.params))
     settle(learned, plan, found)
 
@@ -294,11 +295,11 @@ def update(learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.T
 def descend(
     learned: Learned, plan: StepPlan, found: ViewGradients, stop: torch.Tensor, names: list[str], rows: slice = slice(None)
 ) -> None:
-    """Update parameters by Adam; nothing changes if ``stop`` [1] is not 0, int32.
+    """Update parameters by Adam; nothing changes if ``stop`` (int32, [1]) is not 0.
 
     Args:
         learned: Tables that the step changes.
-        plan: Choices that the step is made of.
+        plan: Fixed choices of the step.
         found: Gradients and learning rates.
         stop: Not 0 to change nothing, int32, shape [1].
         names: Parameters of the Gaussians. The parameters of view modules are updated together with the means.

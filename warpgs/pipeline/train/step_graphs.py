@@ -53,7 +53,7 @@ class Capacities:
         Args:
             kinds: Kinds of views.
             stacks: Views by kind.
-            plan: Choices that the steps are made of.
+            plan: Fixed choices of the steps.
             max_instances: Largest capacity; None for no limit.
 
         Raises:
@@ -113,7 +113,7 @@ class StepGraphs:
         Args:
             kinds: Kind of each step's view.
             stacks: Views by kind.
-            plan: Choices that the steps are made of.
+            plan: Fixed choices of the steps.
             max_instances: Largest capacity for instances; None for no limit.
 
         Raises:

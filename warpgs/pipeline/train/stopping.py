@@ -29,8 +29,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""The gain is measured since the latest measurement at which the number of steps, times this factor, was at most the present
-number."""
+"""The gain is measured since the latest measurement at or before the present step divided by this factor, so over at least the
+last third of the steps."""
 
 
 @dataclass(frozen=True)
@@ -38,25 +38,26 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float | None = 0.0
-    """Growth ends when the gain of the left-out blocks over the last third of the steps, plus its noise, is below this [dB].
-    The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor while views have half size.
-    0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if a CPU's time limits the steps."""
+    """Growth ends when the gain of the left-out blocks over at least the last third of the steps, plus ``noise`` standard
+    errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor
+    while views have half size. 0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if --cpu-limit
+    shortens the fit."""
     fraction: float = 0.03
     """Fraction of the pixels in blocks that are left out until growth ends."""
     measurements: int = 12
     """Number of equal intervals of the growth phase; the blocks are measured after each interval."""
     noise: float = 1.0
-    """Factor of the noise, which is the standard error of the mean gain over the blocks."""
+    """Number of standard errors that are added to the gain, which is a mean over the blocks."""
 
     def __post_init__(self):
         if not 0 < self.fraction <= 0.5:
-            raise UsageError(f"stopping fraction {self.fraction} must be above 0 and at most 0.5")
+            raise UsageError(f"stopping: `fraction` must be above 0 and at most 0.5, not {self.fraction}")
         if self.measurements < 1:
-            raise UsageError(f"stopping measurements must be at least 1, not {self.measurements}")
+            raise UsageError(f"stopping: `measurements` must be at least 1, not {self.measurements}")
         for name in ("noise", "min_gain_db"):
             value = getattr(self, name)
             if value is not None and not 0 <= value < math.inf:
-                raise UsageError(f"stopping {name.replace('_', '-')} must be 0 or more and finite, not {value}")
+                raise UsageError(f"stopping: `{name.replace('_', '-')}` must be 0 or more and finite, not {value}")
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ class Stopping:
         """Begin with nothing held out."""
         self.config = config
         self.active = False
-        """True where blocks are held out and measured."""
+        """True if blocks are held out and measured."""
         self.ended: int | None = None
         """Steps done when growth ended; None before."""
         self.why = ""
@@ -109,7 +110,7 @@ class Stopping:
         self.marks: list[int] = []
         """Steps done when the blocks are measured: when growth begins, and after each interval."""
         self.earliest = 0.0
-        """Number of first steps, in which views have half size and growth does not end."""
+        """Last step in which views have half size. Growth ends after it at the earliest."""
         self.measured: list[tuple[int, torch.Tensor]] = []
         """For every measurement, the steps done and the errors of the blocks [B]."""
 
@@ -164,7 +165,7 @@ class Stopping:
         return self.active and self.ended is None and step in self.marks
 
     def changes(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> Iterator[DensityUpdate]:
-        """Yield the changes of the set of Gaussians after a step: those of the strategy, and the last changes when growth ends.
+        """Yield the strategy's changes of the Gaussians after a step, and its last changes when growth ends.
 
         Args:
             step: Steps done.
@@ -181,7 +182,7 @@ class Stopping:
             yield from strategy.update(step)
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
-        """Measure the blocks if the set has changed since the last measurement; return whether growth ends."""
+        """Measure the blocks if the set has changed since the previous mark, and at the last; return whether growth ends."""
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
             return False

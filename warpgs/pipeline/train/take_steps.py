@@ -59,7 +59,7 @@ class StepTaker:
             places: Kind and row of each step's view; in steps of several views, of the view of each slot, step by step.
             settings: Returns the settings of each slot, step by step.
             stacks: Views by kind.
-            plan: Choices that the steps are made of.
+            plan: Fixed choices of the steps.
             max_instances: Instances that a view may have at a time; None for no limit.
             captured: Whether CUDA graphs are used.
 

@@ -189,7 +189,7 @@ class Trainer:
         Raises:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.
             OutOfMemoryError: A step, or a change of the set of Gaussians, ran out of memory.
-            ResourceError: The instances would not fit into memory.
+            ResourceError: The instances would not fit into memory, or another process is gone.
         """
         try:
             return self._advance(limit)

@@ -22,7 +22,8 @@ class LossConfig:
     """Put views with an alpha channel, and their renders, on a random background at each step. Without this, Gaussians of the
     background colour could cover empty areas. No effect on opaque views."""
     alpha_weight: float = 1.0
-    """Weight of the mean absolute difference of opacities, for views with an alpha channel, in [0, 1000]; 0 to disable."""
+    """Weight of the mean absolute difference of rendered and given opacity, for views with an alpha channel, in [0, 1000]; 0 to
+    disable."""
 
     smooth_weight: float | None = 0.0
     """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: by the
@@ -30,18 +31,18 @@ class LossConfig:
     depth_weight: float = 0.3
     """Weight of the difference of rendered and given inverse depth, for views with given depth, in [0, 1000]; 0 to disable."""
     normal_weight: float = 0.03
-    """Weight of 1 - cos of the angle between given normals and those of rendered depth, for views with given normals, in [0,
+    """Weight of 1 - cos of the angle between given normals and normals of rendered depth, for views with given normals, in [0,
     1000]; 0 to disable."""
 
     exposure_weight: float = 0.01
-    """Weight of the squared difference between each learned exposure and the identity, in [0, 1000]."""
+    """No effect, in [0, 1000]: the weight of the view module exposure is --exposure.weight."""
 
     def __post_init__(self) -> None:
         for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
             if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
-                raise UsageError(f"loss {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1000")
+                raise UsageError(f"loss: `{name.replace('_', '-')}` must be between 0 and 1000, not {getattr(self, name)}")
         if not 0 <= self.ssim_weight <= 1:
-            raise UsageError(f"loss ssim weight {self.ssim_weight} must be between 0 and 1")
+            raise UsageError(f"loss: `ssim-weight` must be between 0 and 1, not {self.ssim_weight}")
 
 
 def built_in_terms(

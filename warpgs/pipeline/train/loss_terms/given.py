@@ -1,9 +1,8 @@
 """Loss terms for given depth and normals, for views that have them.
 
 The depth term is the mean of |q / z - q / d|, with rendered depth z, given depth d, and the view's median given depth q. This
-difference of inverse depths has no unit. A far surface has less weight than a near one, and an outlier has no
-larger gradient than other pixels. The normal term is the mean of 1 - cos of the angle between given normals and those of
-rendered depth.
+difference of inverse depths has no unit. A far surface has less weight than a near one, and an outlier has no larger gradient
+than other pixels. The normal term is the mean of 1 - cos of the angle between given normals and normals of rendered depth.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ class GivenDepthDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-depth: weight {self.weight} must be between 0 and 1000")
+            raise UsageError(f"given-depth: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return weight times q / d, weight, and weight times q, [H, W, 3]; 0 where no depth is given."""
@@ -83,12 +82,12 @@ class GivenDepthDifference(LossTerm):
 
 
 def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
-    """Compute the mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 if no pixel has both.
+    """Compute the weighted mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 if no pixel has both.
 
     Args:
         normals: Unit normals, 0 for missing values, shape [H, W, 3].
-        target: Given normals, 0 for missing values, shape [H, W, 3]; normals averaged over pixels are shorter, and have less
-            weight.
+        target: Given normals, 0 for missing values, shape [H, W, 3]; the weight is their length, which is below 1 for averages
+            over pixels.
         mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
     """
     shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
@@ -111,7 +110,7 @@ class GivenNormalsDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"given-normals: weight {self.weight} must be between 0 and 1000")
+            raise UsageError(f"given-normals: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""

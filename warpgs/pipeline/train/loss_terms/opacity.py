@@ -23,7 +23,7 @@ class AlphaDifference(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"alpha: weight {self.weight} must be between 0 and 1000")
+            raise UsageError(f"alpha: `weight` must be between 0 and 1000, not {self.weight}")
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the difference, its magnitude and its gradient."""

@@ -59,7 +59,7 @@ class Photometric(LossTerm):
     """Fraction lambda of the structural term, in [0, 1]."""
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes of the differences and, with a mask, of both images where it keeps pixels."""
+        """Return the bytes of the differences and, with a mask, of both masked images."""
         masked = 7 * FLOAT * sizes.pixels if sizes.masked else 0  # two images, and the mask's own
         return {LOSS: difference_bytes(sizes) + masked}
 

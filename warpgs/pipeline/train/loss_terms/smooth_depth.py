@@ -72,7 +72,7 @@ class SmoothDepth(LossTerm):
 
     def __post_init__(self) -> None:
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"smooth-depth: weight {self.weight} must be between 0 and 1000")
+            raise UsageError(f"smooth-depth: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
         """Return the weights of the view's pixels, shape [H, W]: `CONFIRMED` where depth is consistent, else 1."""

@@ -1,4 +1,4 @@
-"""Clone, split and prune (Kerbl et al. 2023, section 5.2), all through the fit."""
+"""Clone, split and prune (Kerbl et al. 2023, section 5.2), without sampling."""
 
 from __future__ import annotations
 

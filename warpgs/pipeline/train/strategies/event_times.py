@@ -10,11 +10,11 @@ class EventTimes:
     """Events at equal intervals, in steps done."""
 
     after: int
-    """Step after which the first event comes."""
+    """Step after which events begin."""
     every: int
     """Steps between two events; events are at multiples of this number."""
     until: int
-    """Last step with an event."""
+    """Step after which there are no more events."""
 
     @staticmethod
     def of_fit(start: int, every: int, stop_fraction: float, steps: int) -> EventTimes:

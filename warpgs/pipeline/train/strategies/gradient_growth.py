@@ -30,9 +30,11 @@ class DensityConfig:
     every: int = 100
     """Steps between events that add and remove Gaussians."""
     stop_fraction: float = 0.5
-    """Fraction of the fit after which no Gaussians are added or removed."""
+    """Fraction of the fit after which no Gaussians are added or removed. In a fit with phases, the start of phase 3 counts
+    instead."""
     gradient: float = 2e-4
-    """Mean gradient of a projected mean, in half image widths and heights, above which the Gaussian is densified."""
+    """Mean norm of the gradient of a projected mean, in half image widths and heights, above which a Gaussian is cloned or
+    split."""
     clone_size: float = 0.01
     """Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split."""
     prune_opacity: float = 0.005
@@ -56,12 +58,12 @@ class DensityConfig:
             )
         for name in ("stop_fraction", "prune_opacity"):
             if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"density {name.replace('_', ' ')} {getattr(self, name)} must be between 0 and 1")
+                raise UsageError(f"density: `{name.replace('_', '-')}` must be between 0 and 1, not {getattr(self, name)}")
         for name in ("gradient", "clone_size", "prune_size"):
             if not getattr(self, name) >= 0:
-                raise UsageError(f"density {name.replace('_', ' ')} must be at least 0, not {getattr(self, name)}")
+                raise UsageError(f"density: `{name.replace('_', '-')}` must be at least 0, not {getattr(self, name)}")
         if not 0 < self.reset_opacity < 1:
-            raise UsageError(f"density reset opacity {self.reset_opacity} must be between 0 and 1")
+            raise UsageError(f"density: `reset-opacity` must be in (0, 1), not {self.reset_opacity}")
 
     def times(self, steps: int) -> EventTimes:
         """Return the times of events in a fit of that many steps."""
@@ -112,7 +114,7 @@ def refine(
         protected: Gaussians that are not pruned, bool, shape [N]; None for none.
 
     Returns:
-        The change; at least one Gaussian, the most opaque, always stays.
+        The change. If all Gaussians would be pruned, the most opaque one is not.
     """
     with torch.no_grad():
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
@@ -159,7 +161,7 @@ class GradientGrowth:
 
     @staticmethod
     def columns() -> dict[str, Column]:
-        """Return the columns for the sum of gradient norms of a projected mean, and for the number of renders that saw it."""
+        """Return the columns for the sum of a projected mean's gradient norms, and for the number of renders that show it."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
     @property

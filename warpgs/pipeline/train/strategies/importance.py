@@ -38,10 +38,10 @@ class ImportanceConfig:
 
     def __post_init__(self):
         if self.residual not in ("length", "gain"):
-            raise UsageError(f"importance residual {self.residual!r} is not one of length, gain")
+            raise UsageError(f"importance: `residual` {self.residual!r} is not one of length, gain")
         for name in ("render", "semantic", "geometry", "curvature"):
             if not 0 <= getattr(self, name) < math.inf:
-                raise UsageError(f"importance weight `{name}` must be at least 0 and finite, not {getattr(self, name)}")
+                raise UsageError(f"importance: `{name}` must be at least 0 and finite, not {getattr(self, name)}")
 
 
 def blur(image: torch.Tensor, sigma: float = BLUR) -> torch.Tensor:
@@ -119,7 +119,7 @@ def weights(config: ImportanceConfig, *, render: bool, semantic: bool, geometry:
 
 
 def importance(scores: tuple[torch.Tensor, torch.Tensor, torch.Tensor], by: tuple[float, float, float]) -> torch.Tensor:
-    """Compute S_importance = w . s of the render, semantic and geometric score, each [H, W] in [0, 1].
+    """Compute S_importance, the sum of the render, semantic and geometric score (each [H, W] in [0, 1]) with weights ``by``.
 
     If all weights are 0, S_importance is 1 everywhere, so that sampling is uniform.
     """

@@ -131,7 +131,7 @@ class ImportanceSampling(Strategy):
         return self.gradients.due(step) or self.samples_after(step) or self.shrinks_after(step)
 
     def shrinks_after(self, step: int) -> bool:
-        """Return whether the Gaussians that contribute least are removed after a step, which is the last of phase 2."""
+        """Return whether the Gaussians that contribute least are removed after a step: after the last step of phase 2."""
         return self.method.events and self.method.keep < 1 and step == self.context.phases.stable_start
 
     def shrink(self, views: list[TrainingView]) -> DensityUpdate:
@@ -172,7 +172,7 @@ class ImportanceSampling(Strategy):
         )  # fmt: skip
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Sample fine Gaussians in the blocks that were held out so far, as many per pixel as in the other pixels."""
+        """Shrink the set; then sample fine Gaussians in the blocks that were held out, as many per pixel as elsewhere."""
         if self.method.events and self.method.keep < 1:
             yield self.shrink(self.context.views)
         pixels = sum(v.image[..., 0].numel() for v in views)

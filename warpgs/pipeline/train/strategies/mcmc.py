@@ -1,4 +1,4 @@
-"""Markov chain Monte Carlo: dead Gaussians are relocated by opacity, and all are perturbed (Kheradmand et al. 2024).
+"""Markov chain Monte Carlo: relocation of dead Gaussians onto live ones, and perturbation of all (Kheradmand et al. 2024).
 
 "3D Gaussian Splatting as Markov Chain Monte Carlo", arXiv 2404.09591. Equation numbers are that paper's.
 """
@@ -30,8 +30,8 @@ MAX_OPACITY = 1 - 2**-24
 NOISE_STREAM = 0x6D636D63
 """Constant mixed into the seed, so that noise and opacity dropout use different random numbers."""
 GATE_SLOPE, GATE_OPACITY = 100.0, 0.005
-"""Perturbation fades above the opacity `GATE_OPACITY`: sigmoid(-slope (opacity - `GATE_OPACITY`)), eq. 8 with k = 100 and t =
-0.995 of 1 - opacity."""
+"""Perturbation fades above the opacity `GATE_OPACITY`: sigmoid(-slope (opacity - `GATE_OPACITY`)), eq. 8 with k = 100, and with
+t = 0.995 for 1 - opacity."""
 
 
 @dataclass(frozen=True)
@@ -60,23 +60,23 @@ class MCMCConfig:
             raise UsageError(f"mcmc: `start` must be at least 0, not {self.start}, and `every` at least 1, not {self.every}")
         for name, top in (("stop_fraction", 1), ("growth", 1), ("min_opacity", 0.5)):
             if not 0 <= getattr(self, name) <= top:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and {top}")
+                raise UsageError(f"mcmc: `{name.replace('_', '-')}` must be between 0 and {top}, not {getattr(self, name)}")
         for name in ("noise_lr", "opacity_weight", "scale_weight"):
             if not 0 <= getattr(self, name) <= 1e9:
-                raise UsageError(f"mcmc {name.replace('_', '-')} {getattr(self, name)} must be between 0 and 1e9")
+                raise UsageError(f"mcmc: `{name.replace('_', '-')}` must be between 0 and 1e9, not {getattr(self, name)}")
 
 
 @torch.no_grad()
 def relocated(opacities: torch.Tensor, copies: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return opacity and scale factor of each of N Gaussians that replace one Gaussian in one place (eq. 9).
 
-    The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians together are as opaque at the centre as the one. The scales
-    shrink such that the integral over a line through the centre is unchanged. Both are computed in float64, since the sum
-    alternates.
+    The new opacity is 1 - (1 - o)^(1/N), so that the N Gaussians together are as opaque at the centre as the original. The
+    scales shrink such that the integral over a line through the centre is unchanged. Both are computed in float64, since the
+    sum alternates.
 
     Args:
-        opacities: o of the one Gaussian, in (0, 1), shape [M].
-        copies: N, integers from 1 to `MAX_COPIES`, shape [M].
+        opacities: o of each original Gaussian, in (0, 1), shape [M].
+        copies: N of each original, integers from 1 to `MAX_COPIES`, shape [M].
 
     Returns:
         New opacities and factors of the scales, shape [M] each, of the type of ``opacities``.
@@ -165,7 +165,7 @@ class MCMC(Strategy):
         return Growth(self.times.after, self.times.until)
 
     def regularisation(self, phase, gaussians):
-        """Return the weighted mean opacity plus the weighted mean axis length, shape []; it makes unneeded Gaussians die."""
+        """Return the weighted mean opacity plus the weighted mean axis length, shape []; unneeded Gaussians fade."""
         c = self.config
         # in float64, since the rounding of float32's functions depends on the processor
         opacity, scale = gaussians.logit_opacities.double().sigmoid().mean(), gaussians.log_scales.double().exp().mean()

@@ -41,7 +41,7 @@ class SamplerConfig:
 
     def __post_init__(self):
         if self.depth not in ("rendered", "consistent"):
-            raise UsageError(f"sampler depth {self.depth!r} is not one of rendered, consistent")
+            raise UsageError(f"sampler: `depth` {self.depth!r} is not one of rendered, consistent")
         if not 0 < self.fraction <= 1 or not 0 <= self.gate_quantile < 1 or not 0 <= self.min_alpha < 1:
             raise UsageError(
                 "sampler: `fraction` must be in (0, 1], `gate-quantile` and `min-alpha` in [0, 1), not "

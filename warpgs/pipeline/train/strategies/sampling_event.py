@@ -61,7 +61,7 @@ class ProtectConfig:
 
 @dataclass(frozen=True)
 class MethodConfig:
-    """Switches of the paper's parts (its Table 2), and their settings. With all off, the method is 3D Gaussian splatting."""
+    """Switches and settings of the paper's parts (its Table 2). With all off, the method is 3D Gaussian splatting."""
 
     events: bool = False
     """Sampling events, which add fine Gaussians in phase 2."""
@@ -73,8 +73,8 @@ class MethodConfig:
     s_semantic: bool = True
     """Use the semantic score in the importance."""
     s_geometry: bool = True
-    """Use the geometric score in the importance. With gate_quantile above 0 (paper-literal) the reliability gate uses the score
-    even if this is off."""
+    """Use the geometric score in the importance. With gate_quantile above 0 (preset paper-literal), the reliability gate uses
+    the score even if this is off."""
     ra: bool = True
     """Reliability gate: sample only pixels above gate_quantile of the geometric score and, with sampler.depth consistent, only
     pixels with consistent depth, in views that have some."""
@@ -84,19 +84,19 @@ class MethodConfig:
     pm: bool = True
     """Protection mechanism: new fine Gaussians keep a minimum opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
-    """Factor of the learning rate of the means of the coarse layer from phase 2 on, in [0, 1]."""
+    """Factor on the learning rate of coarse means from phase 2 on, with two layers, in [0, 1]."""
     keep: float = 1.0
     """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
-    over the training views."""
+    over at most 32 training views."""
     importance: ImportanceConfig = field(default_factory=ImportanceConfig)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     protect: ProtectConfig = field(default_factory=ProtectConfig)
 
     def __post_init__(self):
         if not 0 < self.keep <= 1:
-            raise UsageError(f"method keep {self.keep} must be in (0, 1]")
+            raise UsageError(f"method: `keep` must be in (0, 1], not {self.keep}")
         if not 0 <= self.coarse_lr_factor <= 1:
-            raise UsageError(f"method coarse-lr-factor {self.coarse_lr_factor} must be between 0 and 1")
+            raise UsageError(f"method: `coarse-lr-factor` must be between 0 and 1, not {self.coarse_lr_factor}")
 
     def weights(self, semantics: bool = True) -> tuple[float, float, float]:
         """Return the weights of the render, semantic and geometric score, 0 where switched off, scaled to sum to 1.

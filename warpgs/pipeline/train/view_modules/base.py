@@ -15,8 +15,8 @@ from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 
 CAMERA_BYTES = 4 * (16 + 9)
-"""Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before these are
-summed."""
+"""Bytes per Gaussian if cameras are learned: the Gaussian's part of the gradients of view matrix and intrinsics, before the
+sum."""
 Tensors = Mapping[str, torch.Tensor]
 """Parameters of views, or values computed from them, by name."""
 
@@ -49,9 +49,9 @@ class ViewModule:
 
     To write a module, derive a frozen dataclass; its fields are its settings.
 
-    The parameters have a row for each training view. Dense Adam updates them, as in `torch.optim.Adam`: a step has a
-    gradient only in the row of its own view, and the other rows move by their decaying momentum. Checkpoints store
-    parameters and moments; a module has no other state.
+    The parameters have a row for each training view. Dense Adam updates them, as in `torch.optim.Adam`: a step has gradients
+    only in the rows of its own views, and the other rows move by their decaying momentum. Checkpoints store parameters and
+    moments; a module has no other state.
 
     `values`, `before_render`, `after_render` and `regularisation` are part of the captured step: they must not read back
     from the device, and their tensors must have the same shapes at each call.
@@ -70,7 +70,7 @@ class ViewModule:
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
         """Return the parameters before the first step, by name, float32, shape [V, ...]: a row for each training view.
 
-        No two modules of a fit may use the same name.
+        No two modules of a fit may use the same parameter name.
         """
         return {}
 
@@ -88,7 +88,7 @@ class ViewModule:
 
         Args:
             params: Parameters of all training views, by name, shape [V, ...].
-            numbers: Indices of the B views among them, int64, shape [B].
+            numbers: Indices of the B views among all training views, int64, shape [B].
 
         Returns:
             Tensors by the names of the parameters, shape [B, ...].
@@ -109,7 +109,7 @@ class ViewModule:
         return rgb
 
     def regularisation(self, values: Tensors) -> torch.Tensor | None:
-        """Return a loss term for the step's view, shape []; None for no term. ``values`` [...] are those of the view."""
+        """Return a loss term for the step's view, shape []; None for no term. ``values`` [...] belong to this view."""
         return None
 
     def bytes(self, sizes: StepSizes) -> Needs:

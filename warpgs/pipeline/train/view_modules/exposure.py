@@ -3,7 +3,7 @@
 A camera with automatic exposure and white balance changes the colours between photographs. With exposures a step compares the
 view's image with A rgb + b of its render. The learned parameters are the 12 numbers of [A - 1 | b], which start at zero. A step
 subtracts their mean over all training views, so that the model has the mean exposure. Otherwise all exposures could become
-darker while the Gaussians become brighter, with the same training images.
+darker and the Gaussians brighter, with the same colours in the training views.
 """
 
 from __future__ import annotations
@@ -81,14 +81,14 @@ class Exposure(ViewModule):
     lr: float = 5e-3
     """Learning rate of the exposures at the start."""
     decay: float = 0.1
-    """Ratio of the last to the first learning rate; log-linear between."""
+    """Learning rate at the last step, as a fraction of the first; log-linear in between."""
     weight: float = 0.01
     """Weight of the squared difference between each view's exposure and the identity, in [0, 1000]."""
 
     def __post_init__(self) -> None:
         check_lrs(self.name, lr=self.lr, decay=self.decay)
         if not 0 <= self.weight <= 1000:
-            raise UsageError(f"exposure weight must be between 0 and 1000, not {self.weight}")
+            raise UsageError(f"exposure: `weight` must be between 0 and 1000, not {self.weight}")
 
     def check(self, views: Sequence[View]) -> None:
         """Check that no view has an alpha channel: an exposure would change the background with the object.
@@ -120,12 +120,12 @@ class Exposure(ViewModule):
         return exposed(rgb, values[EXPOSURE])
 
     def regularisation(self, values: Tensors) -> torch.Tensor:
-        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it draws an exposure towards the identity."""
+        """Return ``weight`` times the sum of squares of [A - 1 | b], shape []: it pulls exposures towards the identity."""
         square = values[EXPOSURE].double().square().sum()
         return (self.weight * square).to(values[EXPOSURE].dtype)
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes of the render under its exposure, beside the one without."""
+        """Return the bytes of the render after its exposure, which exists beside the plain render."""
         return {LOSS: FLOAT * CHANNELS * sizes.pixels}
 
     def figures(self, fitted: FittedViews) -> dict[str, Any]:

@@ -7,7 +7,7 @@ close to exp(w). It needs no special case for w = 0, and has the same bits on ev
 
 A focal length that is not known exactly can be learned too: fx and fy of every view of one camera are multiplied by
 s = (2 + z) / (2 - z), which is exp(z) to second order and positive for |z| < 2. Views with the same intrinsics and size count
-as one camera. Each row of such a camera holds the same z: a view has the mean of its camera's rows, so each row gets the same
+as one camera. All rows of one camera hold the same z: a view uses the mean of its camera's rows, so each row gets the same
 gradient.
 """
 
@@ -59,8 +59,8 @@ def moved(viewmats: torch.Tensor, rotation: torch.Tensor, translation: torch.Ten
 
     Args:
         viewmats: camera_from_world as given, shape [B, 4, 4].
-        rotation: w of each [rad], shape [B, 3].
-        translation: t of each [u], shape [B, 3].
+        rotation: w of each view [rad], shape [B, 3].
+        translation: t of each view [u], shape [B, 3].
     """
     motion = increments(rotation, translation)
     # four products, since the order of summation in a matrix product depends on the library
@@ -69,7 +69,7 @@ def moved(viewmats: torch.Tensor, rotation: torch.Tensor, translation: torch.Ten
 
 
 def camera_numbers(cameras: Sequence[Camera]) -> list[int]:
-    """Return a number for each view's camera: views with the same intrinsics and size have the same one."""
+    """Return a number for each view's camera: views with the same intrinsics and size have the same number."""
     numbers: dict[tuple[bytes, int, int], int] = {}
     return [numbers.setdefault((np.asarray(c.K, np.float64).tobytes(), c.width, c.height), len(numbers)) for c in cameras]
 
@@ -89,7 +89,7 @@ def zoomed(K: torch.Tensor, factor: torch.Tensor) -> torch.Tensor:
 
 
 def similarity(given: Sequence[Camera], refined: Sequence[Camera]) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return rotation [3, 3], scale and translation [3] from the world of given cameras to that of refined ones.
+    """Return rotation [3, 3], scale and translation [3] from the world of the given cameras to the world of the refined ones.
 
     The rotation is the mean of the cameras' rotations. Scale and translation are least squares over the camera centres. If all
     centres coincide, the scale is 1.
@@ -212,16 +212,16 @@ class RefinePoses(ViewModule):
     focal_lr: float | None = None
     """Learning rate of the logarithm of each camera's focal length, shared by all its views; None to keep it fixed."""
     decay: float = 0.1
-    """Ratio of the last to the first of these learning rates; log-linear between."""
+    """Learning rates at the last step, as a fraction of the first ones; log-linear in between."""
 
     def __post_init__(self) -> None:
         lrs = {"rotation_lr": self.rotation_lr, "translation_lr": self.translation_lr, "focal_lr": self.focal_lr}
         check_lrs(self.name, **lrs, decay=self.decay)
         if not 0 <= self.start < 1:
-            raise UsageError(f"refine_poses start must be at least 0 and less than 1, not {self.start}")
+            raise UsageError(f"refine_poses: `start` must be at least 0 and less than 1, not {self.start}")
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
-        """Return zeros, shape [V, 3] each; for focal lengths, if they are learned, zeros and the views' cameras [V, 1]."""
+        """Return zeros, shape [V, 3] each; for learned focal lengths also zeros and the camera of each view, [V, 1] each."""
         found = {name: torch.zeros(len(views), 3) for name in (ROTATION, TRANSLATION)}
         if self.focal_lr is not None:
             numbers = torch.tensor(camera_numbers([v.camera for v in views]), dtype=torch.float32)
