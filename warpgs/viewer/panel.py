@@ -103,7 +103,7 @@ class Panel:
         self._status.content = f"**{_plain(content.title)}**\n\n{', '.join(parts)}"
 
     def explain(self, note: str) -> None:
-        """Write a note on the image; an empty note is hidden."""
+        """Show a note about the image; hide an empty one."""
         self._note.content, self._note.visible = _plain(note), bool(note)
 
     def _add_stepping(self) -> None:

@@ -21,7 +21,7 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`, or a file of Gaussians from any program, in a format of `warpgs convert`."""
         cameras: Path | None = None
-        """Cameras for a file of Gaussians: cameras.json, transforms.json, COLMAP's folder, or a scene."""
+        """Cameras for a file of Gaussians: cameras.json, transforms.json, a COLMAP folder, or a scene."""
         rule: str | None = None
         """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
