@@ -43,10 +43,10 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
 
 
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
-    """Make the background transparent if all views show an object on black: the dark pixels around the object and in its holes.
+    """Make the dark pixels around an object and in its holes transparent, if all views show an object on black.
 
-    All other pixels get an opacity of 1, and so do specks and cracks that the object encloses. If any view has an opacity or a
-    mask, or shows something else, all views stay unchanged.
+    All other pixels get an opacity of 1, and so do dark specks and cracks that the object encloses. If any view has an alpha
+    channel or a mask, or shows something else, all views stay unchanged.
 
     Args:
         views: The views of a scene.

@@ -116,7 +116,7 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 class _Names(dict[str, tuple[np.ndarray, Lens]]):
-    """Pose and lens by a name that is unique: of equal names all but the first get a number."""
+    """Pose and lens by a name that is unique: equal names, except the first, get a number."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -29,7 +29,7 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4].
 
     Raises:
-        DataError: The matrix is not finite or singular, or its axes are skewed by more than a thousandth.
+        DataError: The matrix is not finite, is singular, or has a skew of more than a thousandth of the focal length.
     """
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):

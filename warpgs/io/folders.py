@@ -120,7 +120,9 @@ class SceneFolder:
             The image, float32, shape [H, W, 3], with intrinsics for its size.
 
         Raises:
-            DataError: The file is outside the folder, or `load_image` rejects it.
+            DataError: The file is outside the folder, or `load_image` rejects it; or a map is invalid.
+            ResourceError: There is not enough memory to decode the image.
+            UsageError: A side becomes too small, or the camera model does not support a map.
         """
         if self.options.on_image is not None:
             self.options.on_image(path)

@@ -55,6 +55,7 @@ class GivenMaps:
 
         Raises:
             DataError: A map cannot be read, does not fit its image, or its values cannot be depths or normals.
+            UsageError: The camera model of the image does not support the map.
         """
         depth, confidence, options = named.depth, None, self.options
         if options.depths is not None:

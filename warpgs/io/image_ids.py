@@ -44,11 +44,11 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
         where: Protocol and scene, for errors.
 
     Returns:
-        Name by id. Names without numbers are counted in sorted order; numbered images must have no gaps, since a gap may mean
-        that the numbers are not the protocol's ids.
+        Name by id. Names without numbers are counted in sorted order. Numbered images must have no gaps: after a gap, the
+        numbers may not be the protocol's ids.
 
     Raises:
-        DataError: There are too few images, or some are missing from the middle; the message names the ids.
+        DataError: There are too few images, or some ids are missing; the message names them.
     """
     if len(names) < least:
         raise DataError(

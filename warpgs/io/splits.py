@@ -108,7 +108,7 @@ class _Names:
         raise DataError(f"split {self.spec}: no view {wanted!r}; the nearest names are {some}")
 
     def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
-        """Return the names by their last ``count`` parts, only names that have more parts; by the whole name for 0."""
+        """Return the names that have more than ``count`` parts, by their last ``count`` parts; for 0 all, by the whole name."""
         if (bare, count) not in self._ends:
             table: dict[str, list[str]] = {}
             for name in self.names:

@@ -84,7 +84,7 @@ def verification_options(pycolmap: Any) -> Any:
 
 
 def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Write the keypoints and matches of a network into the database and verify them; return what `match` does."""
+    """Write the keypoints and matches of a network into the database and verify them; return what `matched` does."""
     with np.load(job["learned"], allow_pickle=False) as learned:
         pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
         matches = np.split(learned["matches"], ends[:-1])
@@ -113,7 +113,7 @@ def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Match pairs of photographs; return keypoints by photograph, and pairs with their matches that agree with one motion."""
+    """Match pairs of photographs; return what `matched` does."""
     with pycolmap.Database.open(job["database"]) as database:
         order = numbers_of(database, job)
         few = len(order) <= job["exhaustive"]
@@ -132,7 +132,7 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
-    """Return the keypoints of each photograph, and the pairs with their matches that agree with one motion."""
+    """Return the number of keypoints of each photograph, and for each pair the number of matches that agree with one motion."""
     with pycolmap.Database.open(job["database"]) as database:
         order = numbers_of(database, job)
         keypoints = [database.num_keypoints_for_image(i) for i in order]
@@ -146,7 +146,7 @@ def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
 
 
 def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
-    """Return the models that grow photograph by photograph from a good pair; a kept focal length is EXIF's."""
+    """Return the models that grow photograph by photograph from a good pair; ``keep_focal`` keeps EXIF's focal lengths."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1  # else the rounding depends on which thread finishes first
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
@@ -167,7 +167,7 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether models with EXIF's focal length hold no fewer photographs than free ones, at nearly the same error."""
+    """Return whether a model with EXIF's focal length holds as many photographs as one with a free one, at nearly its error."""
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))

@@ -31,7 +31,7 @@ def fov_y(camera: Camera, aspect: float = math.inf) -> float:
 
 
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
-    """Return the median depth [u] of the means that a camera sees, or 1 if it sees none; dragging turns the view about this depth."""
+    """Return the median depth [u] of the means that a camera sees, or 1 if it sees none; the view turns about this depth."""
     means = gaussians.means.detach().cpu().double().numpy()
     points = matmul(means, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = points[:, 2]
