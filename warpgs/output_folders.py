@@ -150,7 +150,7 @@ class Folder:
         os.rename(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def remove_tree(self, name: str) -> None:
-        """Remove a folder with all that is in it; what cannot be removed stays."""
+        """Remove a folder with its contents; entries that cannot be removed stay."""
         shutil.rmtree(self._name(name), ignore_errors=True, dir_fd=self.descriptor)
 
     def names(self) -> list[str]:

@@ -32,7 +32,7 @@ def run(arguments: list[str], about: str) -> int:
         (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
         """Folder for the images and film.mp4; or only a film: .mp4, .webm, .webp or .gif. Existing files are replaced.
-        Default: RUN/path-PATH."""
+        Default: path-PATH in the run folder, or beside the file."""
         seconds: float | None = None
         """Duration of the film [s]. Default: chosen by the path."""
         fps: int = 30
