@@ -89,8 +89,8 @@ class Rule:
     transmittance_stop: float = TRANSMITTANCE_STOP
     """Transmittance below which a pixel is finished."""
     inclusive_stop: bool = True
-    """True to blend the Gaussian that crosses the stop. By default at most 1e-4 of the pixel is then lost, and alpha is
-    monotone in every opacity up to that amount. False to drop it, which loses up to 1e-2."""
+    """True to blend the Gaussian that crosses the stop. With the default stop, at most 1e-4 of the pixel is then lost, and
+    alpha is monotone in every opacity up to that amount. False to drop this Gaussian, which loses up to 1e-2."""
     near: float = NEAR
     """Nearest depth rendered [u], at least 0."""
     far: float = FAR

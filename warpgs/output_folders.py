@@ -210,7 +210,7 @@ def output_folder(folder: Path) -> Iterator[None]:
 
 
 def is_below(path: Path) -> bool:
-    """Return whether a path is below an open folder; then no link on the way to it is followed."""
+    """Return whether a path is below an open folder; no link on the way to such a path is followed."""
     return _outermost(path.absolute().parent) is not None
 
 

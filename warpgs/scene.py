@@ -338,7 +338,7 @@ RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
 class Render:
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C).
 
-    With ``RasterizeOptions.pixels`` images have one axis P instead of H and W.
+    With ``RasterizeOptions.pixels``, images have one axis P instead of H and W.
     """
 
     rgb: torch.Tensor

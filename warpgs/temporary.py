@@ -57,7 +57,7 @@ class TemporaryFile:
         """Make the file.
 
         Args:
-            folder: Open folder that it is made in.
+            folder: Open folder to make the file in.
             suffix: End of its name: none, .mp4 or .webm.
 
         Raises:
@@ -93,7 +93,7 @@ class TemporaryFolder:
         """Make the folder.
 
         Args:
-            above: Open folder that it is made in; closed by `remove`.
+            above: Open folder to make the folder in; closed by `remove`.
             prefix: Beginning of its name.
             mode: Rights of the folder.
 

@@ -20,7 +20,7 @@ HOLE = 0.001
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:
     """Return the dark pixels, bool [H, W], of an image [H, W, 3] that shows an object on black; None for any other image.
 
-    At least `DARK_FRACTION` of its pixels and half of its border are dark, and not all are.
+    In such an image, at least `DARK_FRACTION` of the pixels and half of the border are dark, but not all pixels.
     """
     dark: np.ndarray = image.max(-1) < DARK
     border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])

@@ -77,7 +77,7 @@ def _number(file: Path) -> int | None:
 
 
 def _masks(root: Path, files: list[Path]) -> dict[Path, Path]:
-    """Return the mask file of each image that has one, by name, else by the number in it (image/000003.png, mask/003.png)."""
+    """Return the mask file of each image that has one, by name, else by number (image/000003.png, mask/003.png)."""
     folder = next((root / f for f in ("mask", "masks") if (root / f).is_dir()), None)
     masks = [] if folder is None else list_images(folder)
     by_name, by_number = {m.stem: m for m in masks}, {_number(m): m for m in masks}

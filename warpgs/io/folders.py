@@ -114,7 +114,7 @@ class SceneFolder:
                 already. None for the factor that the user gave.
             mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`.
             background: Colour in [0, 1] behind transparent pixels.
-            named: Maps that the scene names for it.
+            named: Maps that the scene names for the image.
 
         Returns:
             The image, float32, shape [H, W, 3], with intrinsics for its size.

@@ -51,7 +51,7 @@ class GivenMaps:
         self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
 
     def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
-        """Return an image with its maps, at its size; the user's folder has priority over maps named in the scene.
+        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene.
 
         Raises:
             DataError: A map cannot be read, does not fit its image, or its values cannot be depths or normals.

@@ -209,7 +209,7 @@ def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> LoadedImage:
-    """Resample by the factor, then to the longest side where it is longer; the intrinsics follow the sizes exactly."""
+    """Resample by the factor, or to ``max_side`` if the result would be larger; the intrinsics follow the sizes exactly."""
     height, width = loaded.image.shape[:2]
     factor, flags, done = float(downscale), f"--downscale {downscale}", loaded.done
     if max_side and round(max(width, height) / downscale) > max_side:

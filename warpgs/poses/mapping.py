@@ -62,7 +62,7 @@ class Mapping:
     keypoints: tuple[int, ...]
     """Number of keypoints of each photograph."""
     matches: dict[tuple[int, int], int]
-    """Number of matches that agree with one motion of the camera, by pair, the smaller number first."""
+    """Number of matches that agree with one motion of the camera, by pair, the smaller index first."""
     tried: int
     """Number of pairs that were matched."""
     views: dict[int, FoundView]
@@ -85,7 +85,7 @@ class Mapping:
 
     @cached_property
     def links(self) -> dict[int, list[tuple[int, int]]]:
-        """Photographs that each one matches, with the number of matches."""
+        """Photographs that each photograph matches, with the number of matches."""
         links: dict[int, list[tuple[int, int]]] = {}
         for (a, b), n in self.matches.items():
             if n > 0:

@@ -106,7 +106,7 @@ class Matcher:
         return Features(pixels.astype(np.float32), whole)
 
     def _check(self, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray, h: int, w: int) -> None:
-        """Raise a DataError if these are not the keypoints of an image of ``h`` x ``w`` px."""
+        """Raise a DataError if the outputs are not keypoints of an image of ``h`` x ``w`` px."""
         shapes = ", ".join(f"{n} {list(a.shape)}" for n, a in zip(OUTPUTS, (keypoints, scores, descriptors)))
         count = len(scores) if scores.ndim == 1 else -1
         if keypoints.shape != (count, 2) or descriptors.ndim != 2 or len(descriptors) != count:

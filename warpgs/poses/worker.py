@@ -3,7 +3,7 @@
 It is a separate process for three reasons: pycolmap may end its own process on an internal error, it cannot be interrupted,
 and its wheels contain code under the GPL (decision 017). No other module of warpgs imports pycolmap.
 
-A line holds ``progress``, a text for the user, or ``result``, the last one.
+A line holds ``progress``, a text for the user; the last line holds ``result``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from warpgs.runtime.terminal import answer
 SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
-"""Number of matches that a pair needs, all in agreement with one motion of the camera, and of points that a new photograph must
-see."""
+"""Smallest number of matches of a pair that agree with one motion of the camera, and of points that a new photograph sees."""
 MIN_RATIO = 0.6
 """Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
 (decision 017)."""

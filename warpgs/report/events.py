@@ -68,7 +68,7 @@ class EventLog:
             raise self._failure(e) from e
 
     def flush(self) -> None:
-        """Sync everything written to the disk, so that the log never lags behind a checkpoint.
+        """Flush the log and sync it to the disk, so that it never lags behind a checkpoint.
 
         Raises:
             ResourceError: The file cannot be written.

@@ -126,7 +126,7 @@ def render_overview(
     """Render training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3], ``up`` [3] upwards.
 
     Returns:
-        PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot render.
+        PNG bytes and an empty string; or None and the reason why there is no image, with a remedy if there is one.
     """
     if not (len(points) and train):
         return None, "no overview image: there are no points or no training cameras to show"

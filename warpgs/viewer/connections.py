@@ -23,7 +23,7 @@ from warpgs.viewer.page import live_page
 MAX_BROWSERS = 16
 """Largest number of websockets at a time."""
 MAX_CONNECTIONS = 64
-"""Largest number of connections at a time, including those without a request so far."""
+"""Largest number of connections at a time, including connections that have sent no request yet."""
 MESSAGES_PER_SECOND = 200.0
 """Rate of messages of one browser; moving a camera sends 50 a second."""
 MAX_BURST = 2000.0

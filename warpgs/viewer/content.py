@@ -27,7 +27,7 @@ class Content:
     """A model and its description."""
 
     title: str
-    """Name to show: that of the folder or the file."""
+    """Name to show: the name of the folder or the file."""
     model: FittedModel
     """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
     stem: Path

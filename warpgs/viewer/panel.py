@@ -34,7 +34,7 @@ class Shown(Protocol):
         """Send the current image."""
 
     def step_into(self, name: str, client: Any) -> None:
-        """Move a browser's camera to one of the model."""
+        """Move a browser's camera to the model's camera of that name."""
 
     def reset(self, client: Any) -> None:
         """Move a browser's camera back to where pages start."""
