@@ -236,7 +236,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     """Return points, with the views that saw them, from points3D.bin or points3D.txt.
 
     Args:
-        path: The file; an empty one gives no points.
+        path: The file; it may list no points.
         names: View names by image number; images without a name here are left out of the tracks.
 
     Returns:

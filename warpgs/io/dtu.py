@@ -67,7 +67,9 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: cannot be read as an archive of arrays ({type(e).__name__}: {e}); copy it again") from e
     for key, matrix in matrices.items():
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise DataError(f"{path}: {key} is not a finite [4, 4] matrix but {list(matrix.shape)}; copy the archive again")
+            raise DataError(
+                f"{path}: {key} must be finite and [4, 4]; its shape is {list(matrix.shape)}. Copy the archive again"
+            )
     return matrices
 
 

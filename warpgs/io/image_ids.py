@@ -24,7 +24,7 @@ def named_by_dtu(names: list[str]) -> bool:
 
 
 def image_ids(names: list[str]) -> list[int] | None:
-    """Return the ids of image files from their names, counted from 0; None if no number distinguishes the names.
+    """Return the ids of image files from the numbers in their names; None if no number distinguishes the names.
 
     DTU's own names, `rect_001_3_r5000.png`, count from 1, so number 1 is id 0; other numbers are used unchanged.
     """

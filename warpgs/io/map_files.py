@@ -178,7 +178,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
         raise DataError(
-            f"{path}: has eight bits, too few for lengths; save 16-bit PNG, or give --depth-kind relative or disparity"
+            f"{path}: has 8 bits, too few for metric depth; save 16-bit PNG, or give --depth-kind relative or disparity"
         )
     values = raw.astype(np.float32)
     finite = np.isfinite(values)

@@ -170,7 +170,7 @@ def _something_else(folder: Path) -> str:
         return "is the folder of a run; give the scene that it was fitted to"
     scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
     if scenes:
-        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one scene, or use `warpgs farm` for all"
+        return f"holds scenes, such as {scenes[0]}; give one scene, or only photographs, or use `warpgs farm` for all"
     return ""
 
 

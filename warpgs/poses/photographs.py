@@ -140,6 +140,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
     Raises:
         DataError: The file cannot be decoded.
+        ResourceError: There is not enough memory, or the copy cannot be written.
     """
     import cv2
 

@@ -166,7 +166,10 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether a model with EXIF's focal length holds as many photographs as one with a free one, at nearly its error."""
+    """Return whether the best of ``kept``, with EXIF's focal length, has at least as many photographs as that of ``free``.
+
+    Its error must be at most `MAX_RATIO` times as large. If a list is empty, return whether ``kept`` has models.
+    """
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))
