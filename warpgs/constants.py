@@ -69,7 +69,7 @@ FRUSTUM_MARGIN = 0.15
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 RIM_SAMPLES = 16
-"""Number of points between the axis and a position, the last at the position, at which a lens is tested for folding back."""
+"""Number of points at which a lens is tested for folding back, from the axis to a position; the last is the position."""
 
 
 @document_fields

@@ -73,7 +73,7 @@ def _help() -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted.
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted.
 
     Raises:
         SystemExit: A command has printed its help.

@@ -146,7 +146,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the column and the row in the distorted image of each pixel of a pinhole image, [H, W] each, as in OpenCV.
+    """Map the pixels of a pinhole image to the distorted image: return their columns and rows there, [H, W] each, as OpenCV.
 
     Args:
         K: Intrinsics [px] of both images at this size, shape [3, 3].

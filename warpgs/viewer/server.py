@@ -68,7 +68,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
 
     rules, bound = Rules(), loopback_socket(port, OTHER_PORT)
     port = bound.getsockname()[1]
-    # it would print its address; the command prints it instead
+    # viser would print its address; the command prints it instead
     with guarded_server(rules, bound, f"viser-v{viser.__version__}"), contextlib.redirect_stdout(io.StringIO()):
         server = LocalServer(host=HOST, port=port, label=label, verbose=False)
     server.rules = rules
