@@ -29,7 +29,7 @@ K_TOLERANCE = 1e-5
 """Largest error of the fixed entries of K. Such an error moves the pixels of an image of 2000 px by 0.02 px."""
 
 POSE_TOLERANCE = 1e-3
-"""Largest rounding error of a pose: of an entry of R R^T - 1, and of its last row. The product of a thousand rotations in
+"""Largest rounding error of an entry of R R^T - 1, and of the last row of a pose. The product of a thousand rotations in
 float32 is off by at most 1000 x 3 x 2^-23 = 4e-4. An error as large as the tolerance changes lengths by 0.05 %."""
 
 NEAR = 0.01
@@ -69,7 +69,7 @@ FRUSTUM_MARGIN = 0.15
 image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
 
 RIM_SAMPLES = 16
-"""Number of points on the way from the axis to a position at which a lens must not fold back; the last is the position."""
+"""Number of points at which a lens is tested for folding back, from the axis to a position; the last is the position."""
 
 
 @document_fields
@@ -89,8 +89,8 @@ class Rule:
     transmittance_stop: float = TRANSMITTANCE_STOP
     """Transmittance below which a pixel is finished."""
     inclusive_stop: bool = True
-    """True to blend the Gaussian that crosses the stop. By default at most 1e-4 of the pixel is then lost, and alpha is
-    monotone in every opacity up to that amount. False to drop it, which loses up to 1e-2."""
+    """True to blend the Gaussian that crosses the stop. With the default stop, at most 1e-4 of the pixel is then lost, and
+    alpha is monotone in every opacity up to that amount. False to drop this Gaussian, which loses up to 1e-2."""
     near: float = NEAR
     """Nearest depth rendered [u], at least 0."""
     far: float = FAR

@@ -80,7 +80,7 @@ def check_stored(gaussians: object) -> None:
 
 
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
-    """Return Gaussians in other units; the tensors are shared where nothing changes.
+    """Return Gaussians in other units; tensors that do not change are shared.
 
     Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
     Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.

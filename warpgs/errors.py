@@ -33,7 +33,7 @@ class NotFiniteError(WarpgsError):
 
 
 class ResourceError(WarpgsError):
-    """Too little memory or disk space, or a device that cannot be used; the message names what is needed and available."""
+    """Too little memory or disk space, a missing device or package, or a folder that cannot be written."""
 
     exit_code = 4
 

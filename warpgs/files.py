@@ -25,7 +25,7 @@ UNDECODABLE = re.compile("[\udc80-\udcff]")
 """Characters that Python puts in the place of bytes that are not UTF-8."""
 WINDOWS = sys.platform == "win32"
 PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""Waits before a replacement is tried again on Windows [s]: a virus scanner holds a new file open for about that long."""
+"""Pauses between attempts to replace a file on Windows [s]: a virus scanner holds a new file open for about that long."""
 FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of a full disk, or of an exhausted disk quota."""
 DESCRIPTORS = Path("/proc/self/fd")

@@ -189,7 +189,7 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
 def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return what `project_points` returns, from tensors and without a matrix product: pixels [S, 2] and depths [S] [u].
 
-    Where a camera cannot see a point, its depth is at most 0 and its pixel is meaningless.
+    For a point that the camera cannot see, the depth is at most 0 and the pixel is meaningless.
 
     Args:
         camera: A camera with float32 or float64 tensors, on the device of the points.
@@ -209,7 +209,7 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
 
 
 def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:
-    """Return the positions in the camera [S, 3] at depths [S], from those at depth 1 [S, 3]."""
+    """Return the positions in the camera [S, 3] at depths [S] on ``rays``, positions at depth 1 [S, 3]."""
     scaled = rays * depths[:, None]
     if camera.model == "orthographic":  # parallel rays
         scaled[:, :2] = rays[:, :2]

@@ -1,6 +1,6 @@
 """Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its memory.
 
-Every untrusted file is opened here. An unreadable one raises an OSError with the reason as its ``strerror``; callers turn it
+Every untrusted file is opened here. An unreadable file raises an OSError with the reason as its ``strerror``; callers turn it
 into a `DataError` with a remedy, with the text of `unread_reason`.
 """
 

@@ -40,7 +40,7 @@ class ProjectedMeans(torch.Tensor):
 
 
 def count_passes(projected: torch.Tensor, passes: list[bool] | None = None) -> None:
-    """Let projected Gaussians [C, N, 12] count backward passes through them, for `projected_means`.
+    """Count the backward passes through projected Gaussians [C, N, 12], for `projected_means`.
 
     Autograd nodes append an entry to the list ``passes`` in each pass; if it is None, a slower hook counts instead.
     """

@@ -150,7 +150,7 @@ class Folder:
         os.rename(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def remove_tree(self, name: str) -> None:
-        """Remove a folder with all that is in it; what cannot be removed stays."""
+        """Remove a folder with its contents; entries that cannot be removed stay."""
         shutil.rmtree(self._name(name), ignore_errors=True, dir_fd=self.descriptor)
 
     def names(self) -> list[str]:
@@ -210,7 +210,7 @@ def output_folder(folder: Path) -> Iterator[None]:
 
 
 def is_below(path: Path) -> bool:
-    """Return whether a path is below an open folder; then no link on the way to it is followed."""
+    """Return whether a path is below an open folder; no link on the way to such a path is followed."""
     return _outermost(path.absolute().parent) is not None
 
 
@@ -285,7 +285,7 @@ def _again(root: _Root) -> Folder:
 def _entered(above: Folder, name: str, make: bool) -> Folder:
     """Open a folder in another one, and make it first if it is missing and ``make`` is True."""
     if name == os.pardir:
-        raise RefusedError(f"{above.path / name}: points outside the folder; name the place without {os.pardir}")
+        raise RefusedError(f"{above.path / name}: points outside the folder; use a path without {os.pardir}")
     try:
         return above.folder(name)
     except FileNotFoundError:

@@ -31,8 +31,8 @@ T = TypeVar("T", bound=Named)
 class Registry(Generic[T]):
     """Classes of one kind by name.
 
-    Built-in classes are in the modules of a package, which are imported to look up a name; so a new class is a new file. A
-    user's own is given as a class in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A name in
+    Built-in classes are in the modules of a package, which are imported to look up a name. So a new class is a new file. A
+    user's own class is passed in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A name in
     a stored file never causes an import.
     """
 
@@ -71,7 +71,7 @@ class Registry(Generic[T]):
         return decorate
 
     def names(self) -> list[str]:
-        """Return the names of the built-in classes, sorted."""
+        """Return the names of the registered classes, sorted; names of the form ``module:Class`` are left out."""
         if not self._searched:
             package = importlib.import_module(self.package)
             for module in pkgutil.iter_modules(getattr(package, "__path__", [])):
@@ -89,11 +89,11 @@ class Registry(Generic[T]):
         return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name
 
     def described(self) -> dict[str, str]:
-        """Return a line about each built-in class by name: its ``description``, or the first sentence of its docstring."""
+        """Return a line about each class of `names`: its ``description``, or the first sentence of its docstring."""
         return {name: _line_about(self._classes[name]) for name in self.names()}
 
     def knows(self, name: str) -> bool:
-        """Return whether `find` can look up a name: True without a colon, or for a user's class that was loaded."""
+        """Return whether `find` accepts a name: one without a colon, or the name of a user's class that was loaded."""
         return ":" not in name or name in self._classes
 
     def has(self, cls: type) -> bool:

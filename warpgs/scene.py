@@ -134,7 +134,7 @@ class Scene:
     path: str
     """Folder that was read."""
     format: str
-    """Name of the dataset format: colmap, transforms, llff, dtu or middlebury."""
+    """Name of the dataset format: colmap, transforms, llff, dtu, middlebury, or that of your own reader."""
     views: tuple[View, ...]
     """All views, sorted by name."""
     points: PointCloud | None = None
@@ -144,7 +144,7 @@ class Scene:
     notes: tuple[str, ...] = ()
     """Messages about choices made while reading (skipped images, undistortion, the chosen image folder)."""
     fingerprint: str = ""
-    """SHA-256 over names, cameras and pixels, hexadecimal: the same data gives the same fingerprint."""
+    """SHA-256 over names, cameras, pixels, masks and given maps of the views, hexadecimal."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Colour behind the scene that the format implies (white for Blender's transparent images)."""
     pixels: str = ""
@@ -338,7 +338,7 @@ RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
 class Render:
     """Result of the rasterizer for one camera (no leading axis) or for a batch of C cameras (leading axis C).
 
-    With ``RasterizeOptions.pixels`` images have one axis P instead of H and W.
+    With ``RasterizeOptions.pixels``, images have one axis P instead of H and W.
     """
 
     rgb: torch.Tensor

@@ -23,7 +23,7 @@ MAX_DEPTH = 50
 MAX_PARTS = 2**19
 """Largest number of lists and objects; each takes some thirty times as much memory as its text."""
 MAX_WHOLE = 2**63 - 1
-"""Largest integer: that of 64 bits with a sign."""
+"""Largest signed integer of 64 bits."""
 MAX_NUMBER = 1e300
 """Largest magnitude of a finite number, and of an integer in the place of a number: a larger one could overflow a float."""
 
@@ -120,7 +120,7 @@ def text(value: Any, place: str) -> None:
 
 
 def one_of(*values: Any) -> Schema:
-    """Return the schema of a value that is one of some JSON values: 1 is not true."""
+    """Return the schema of a value that is one of some JSON values; 1 and true are different values."""
 
     def check(value: Any, place: str) -> None:
         if not any(value == v and type(value) is type(v) for v in values):
@@ -220,7 +220,7 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
 
 
 def of_type(hint: Any) -> Schema:
-    """Return the schema of the plain values of a field by its type hint: bool, int, float, str, None, unions and tuples.
+    """Return the schema of the plain values of a field by its type hint: bool, int, float, str, tuples, and these or None.
 
     Every value is allowed for other types.
     """

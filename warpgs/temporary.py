@@ -24,7 +24,7 @@ from filelock import lock_descriptor
 from warpgs.output_folders import Folder, open_folder
 
 NAMES = re.compile(r"\.?warpgs-[0-9a-f]{16}\.tmp(\.(mp4|webm|lock))?")
-"""Names of temporary files, folders and their locks: short and of ASCII letters, so that they fit wherever the file does."""
+"""Names of temporary files, folders and their locks: short and ASCII, so that every file system accepts them."""
 LOCKED = ".lock"
 """End of the name of the lock beside a temporary folder."""
 NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EINVAL)
@@ -57,7 +57,7 @@ class TemporaryFile:
         """Make the file.
 
         Args:
-            folder: Open folder that it is made in.
+            folder: Open folder to make the file in.
             suffix: End of its name: none, .mp4 or .webm.
 
         Raises:
@@ -93,7 +93,7 @@ class TemporaryFolder:
         """Make the folder.
 
         Args:
-            above: Open folder that it is made in; closed by `remove`.
+            above: Open folder to make the folder in; closed by `remove`.
             prefix: Beginning of its name.
             mode: Rights of the folder.
 

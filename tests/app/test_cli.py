@@ -378,7 +378,7 @@ def test_a_package_that_is_gone_is_named(capsys, monkeypatch):
     """A package that warpgs was installed with and that is no longer there is no defect of warpgs."""
     monkeypatch.setitem(sys.modules, "pyvista", None)
     monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", lambda *a: __import__("pyvista"))
-    assert "the Python package pyvista is missing" in failure(capsys, 2, "export", "run", "--to", "x.ply")
+    assert "the Python package pyvista, which is missing" in failure(capsys, 2, "export", "run", "--to", "x.ply")
 
 
 def test_changed_data_are_noticed(scene, run, tmp_path, capsys):

@@ -213,7 +213,7 @@ def test_images_without_a_pose_are_counted(tmp_path):
     scenes.write_colmap(tmp_path)
     scenes.save(tmp_path / "images" / "extra.png", scenes.image(0))
     scenes.save(tmp_path / "images" / "._photo0.png", scenes.image(0))
-    assert any(n.startswith("1 images of images have no pose") for n in load_scene(tmp_path).notes)
+    assert any(n.startswith("1 files in images have no pose") for n in load_scene(tmp_path).notes)
 
 
 def test_outside_images_need_permission_and_get_harmless_names(tmp_path):

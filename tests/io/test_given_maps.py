@@ -104,7 +104,7 @@ BAD = {
     "infinite": (np.full(SHAPE, np.inf, np.float32), "no depth is finite"),
     "huge": (np.full(SHAPE, 1e20, np.float32), "beyond 1e"),
     "picture": (np.stack([RAMP, RAMP, RAMP + 1], -1), "colour image of 3 channels"),
-    "bits": (RAMP.astype(np.uint8) | 1, "eight bits"),
+    "bits": (RAMP.astype(np.uint8) | 1, "has 8 bits"),
     "numbers": (RAMP.astype(np.int32), "its numbers are int32"),
     "words": (np.full(SHAPE, "a"), "its numbers are"),
     "axes": (np.zeros((2, 3, 4, 5), np.float32), "must be an array"),

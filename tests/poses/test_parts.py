@@ -159,9 +159,11 @@ def test_reasons_and_advice():
     assert reason(mapping(), 3, names) == "has 600 keypoints and 9 matches with c, too few of them at places of known depth"
     assert reason(mapping(), 4, names).startswith("has 12 keypoints, too few to match")
     said = advice(mapping(), names)
-    assert ["between d and c" in said[0], "take e again" in said[1], "between b and c, which look 50 degrees" in said[2]] == [
-        True
-    ] * 3
+    assert [
+        "between d and c" in said[0],
+        "take e again" in said[1],
+        "between b and c: their axes differ by 50 degrees" in said[2],
+    ] == [True] * 3
     assert said[3] == "take a photograph between c and b: they share only 40 matches" and len(said) == 4
     well = mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(mapping().views.items())[:2]))
     assert advice(well, ["a", "b"]) == []

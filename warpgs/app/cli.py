@@ -36,7 +36,7 @@ COMMANDS = {
     "compare": "fit presets to scenes with several seeds; tables and plots",
     "ablate": "fit a preset with one part changed at a time; tables and plots",
     "convert-lpips": "convert LPIPS weights for --lpips-weights",
-    "farm": "fit many scenes, on all GPUs, with Ray or on Slurm",
+    "farm": "fit many scenes: on all GPUs, with Ray, or on Slurm",
     "doctor": "check this machine: devices, packages, fixes",
 }
 """Commands by name, in the order of the help, each with a line about it."""
@@ -53,7 +53,7 @@ GROUPS = {
 
 
 PRINTING = ("doctor", "compare", "ablate")
-"""Commands with their result on the terminal."""
+"""Commands that print their result on the terminal."""
 ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
 """Arguments for which a command only prints text."""
 
@@ -73,10 +73,10 @@ def _help() -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 internal, 130 interrupted.
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted.
 
     Raises:
-        SystemExit: Help of a command was requested, or an argument is wrong.
+        SystemExit: A command has printed its help.
     """
     if arguments is None:
         use_utf8_names()
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             with interrupting_signals():
                 return output.exit_code(_run(words))
-        except SystemExit as e:  # tyro has printed the help or the error
+        except SystemExit as e:  # after the help of a command
             if e.code or not (code := output.exit_code(0)):
                 raise
             raise SystemExit(code) from e

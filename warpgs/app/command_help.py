@@ -15,7 +15,7 @@ WIDTH = 80
 NAMES = 22
 """Largest width of the column with flags and values [letters]."""
 FEW = 4
-"""Largest group of flags that is explained; of larger groups only names are listed."""
+"""Largest number of flags in a group that are explained; a larger group is only a list of names."""
 VALUES = {int: "N", float: "X", Path: "PATH", str: "VALUE"}
 """Placeholders for the value of a flag, by its type."""
 
@@ -78,7 +78,7 @@ def positional_names(kind: type) -> list[str]:
 
 
 def _parts(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """Return the type and the markers of an annotation; of a union the first type that is not None."""
+    """Return the type and the markers of an annotation; for a union, its first type that is not None."""
     markers: tuple[Any, ...] = ()
     while hasattr(hint, "__metadata__"):
         hint, markers = hint.__origin__, (*markers, *hint.__metadata__)

@@ -26,7 +26,7 @@ from warpgs.runtime.processor import processor_name, usable_cores
 from warpgs.runtime.terminal import counted, printable
 
 OK, MISSING, NOTE = "ok", "missing", "note"
-PYTHON = ((3, 11), (3, 14))  # from, and below
+PYTHON = ((3, 11), (3, 14))  # lowest version, and the first one that is too new
 LOW_DISK = 2 * 2**30  # [bytes]; a run folder with checkpoints and a video fits well into this
 LOW_MEMORY = 4 * 2**30  # [bytes]
 
@@ -36,7 +36,7 @@ class Finding:
     """Result of one check."""
 
     topic: str
-    """Subject, one or two words, unique within a report."""
+    """Subject in a few words, unique within a report."""
     status: Literal["ok", "missing", "note"]
     """``missing`` where something does not work; ``note`` where a fit works, but slower or with fewer features."""
     detail: str
@@ -97,8 +97,8 @@ def _python() -> Iterable[Finding]:
     if low <= sys.version_info[:2] < high:
         yield Finding("Python", OK, detail, required=True)
     else:
-        span = f"from {low[0]}.{low[1]} on, below {high[0]}.{high[1]}"
-        yield Finding("Python", MISSING, detail, f"make an environment with a Python {span}", True)
+        span = f">={low[0]}.{low[1]}, <{high[0]}.{high[1]}"
+        yield Finding("Python", MISSING, detail, f"create an environment with Python {span}", True)
     yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
 
 
@@ -183,7 +183,7 @@ def _cuda() -> Iterable[Finding]:
             driver = "CUDA_VISIBLE_DEVICES hides every device"
         yield Finding(
             "CUDA", NOTE, f"none: {driver}; {slower}",
-            f"with an NVIDIA GPU: unset CUDA_VISIBLE_DEVICES, or update the driver for CUDA {torch.version.cuda}",
+            f"with an NVIDIA GPU: unset CUDA_VISIBLE_DEVICES, or install a driver that supports CUDA {torch.version.cuda}",
         )  # fmt: skip
         return
     for i in range(torch.cuda.device_count()):
@@ -209,7 +209,7 @@ def _quiet_warp():
 
 
 def _warp_cuda() -> Finding:
-    """Check that Warp sees the devices that torch sees, and through which driver."""
+    """Check that Warp finds CUDA devices, and report its driver."""
     try:
         warp = _quiet_warp()
         if warp.is_cuda_available():
@@ -333,7 +333,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
     """Check everything that a fit and its report need.
 
     Args:
-        tell: Called with a line about each check.
+        tell: Called with lines on the progress.
 
     Returns:
         The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.

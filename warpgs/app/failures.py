@@ -33,7 +33,7 @@ def report_defect(error: Exception, arguments: list[str]) -> int:
 
     gone = missing_package(error)
     if gone:
-        line = f"warpgs: the Python package {gone} is missing, which this command needs; install warpgs again with pip"
+        line = f"warpgs: this command needs the Python package {gone}, which is missing; reinstall warpgs with pip"
         return last_words(line, UsageError.exit_code)
     details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
     try:

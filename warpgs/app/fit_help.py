@@ -6,14 +6,14 @@ FLAGS = (
     ("--out", "RUN", "", "run folder to fill; new or empty"),
     ("--split", "SPEC", "", "views to hold out for scores; default: none"),
     ("--preset", "NAME", DEFAULT_PRESET, "settings to start from: below, or a .toml file"),
-    ("--steps", "N", "", "number of steps, one view each; default: from the preset"),
+    ("--steps", "N", "", "number of optimisation steps; default: from the preset"),
     ("--device", "NAME", "auto", "auto, cpu or cuda"),
     ("--downscale", "F", "", "divide both sides of the images by F"),
-    ("--max-side", "N", "", "longest side [px]; 1600, on a CPU 800; 0 no limit"),
+    ("--max-side", "N", "", "longest side [px]; default: 1600, CPU 800; 0: no limit"),
     ("--seed", "N", "0", "seed of all random numbers"),
     ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
     ("--masks", "HOW", "ignore", "masked-out pixels: ignore or cutout (transparent)"),
-    ("--depths", "FOLDER", "", "depth maps, named as the images (docs/scenes.md)"),
+    ("--depths", "FOLDER", "", "depth maps, named like the images (docs/scenes.md)"),
     ("--exposure", "", "False", "learn brightness and colour of each photograph"),
     ("--refine-poses", "", "False", "correct slightly wrong poses while training"),
     ("--resume", "", "False", "continue the run in --out from its last checkpoint"),
@@ -26,7 +26,7 @@ SPLITS = {
     "llff:K, mip360:K": "hold out every 8th, train on K of the rest",
     "dtu:3|6|9, blender:8": "the published ids of these data sets",
     "train=NAMES;test=NAMES": "by name, with commas; either part alone is enough",
-    "all": "hold out none: no scores",
+    "all": "hold out no view: no scores",
 }
 """Kinds of splits, each in a line."""
 

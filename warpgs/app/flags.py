@@ -77,7 +77,7 @@ MAX_WHOLE = 2**63 - 1
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
 MAX_NUMBER = 3e38
-"""Largest number that a flag takes: about that of float32, in which everything is computed."""
+"""Largest number that a flag takes: just below the largest float32."""
 
 
 def _whole(words: list[str]) -> int:

@@ -37,7 +37,8 @@ def format_flags(arguments: list[str]) -> type:
         sh_degree: int | None = None
         """Highest degree of harmonics; 0 for colours without view dependence. Default: all."""
         rotate: str | None = None
-        """Rotate the model about the origin: x,y,z,degrees; or, for a run, level (the cameras' up becomes up)."""
+        """Rotate the model about the origin: x,y,z,degrees (axis and angle); for a run also level (the cameras' up becomes
+        -y)."""
 
     fields: list[tuple[str, Any, Any]] = []
     for name, kind in _with_options(word_after(arguments, "--format")).items():
@@ -61,7 +62,7 @@ def _found(choice: str) -> Format:
 
 
 def chosen_formats(a: Any, target: Path) -> list[Format]:
-    """Return the format of the file to write, with its options, and the format that --format names.
+    """Return formats to prefer: that of the file to write, if it has options, then the one that --format names, if any.
 
     Args:
         a: Parsed flags of `format_flags`.

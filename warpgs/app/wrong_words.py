@@ -63,7 +63,7 @@ def _are_whole(words: list[str]) -> bool:
 
 
 def _refuse_stray_word(kind: type, arguments: list[str], program: str, rows: list[str]) -> None:
-    """Raise UsageError for the first word that tyro calls unrecognized; it may be the file that a flag names."""
+    """Raise UsageError for the first word that tyro calls unrecognized; its flag, such as --out, may be missing."""
     words = " ".join(rows).partition("Unrecognized options:")[2].split()
     if not words or words[0] not in arguments:
         return
@@ -104,6 +104,6 @@ def _wrong_value(reason: str) -> str:
         return f"{flag} needs {count} values, got {given}"
     if found := re.match(r"Error parsing (.+?): (.*)", reason):
         flag, why = found.groups()
-        one = re.search(r"expected .*?, got .*?(?= - <class|$)", why)  # of all types that the flag accepts, the number
+        one = re.search(r"expected .*?, got .*?(?= - <class|$)", why)  # tyro gives a reason for each type that the flag accepts
         return f"{flag}: {one[0] if one else why}"
     return reason

@@ -20,7 +20,7 @@ HOLE = 0.001
 def dark_pixels(image: np.ndarray) -> np.ndarray | None:
     """Return the dark pixels, bool [H, W], of an image [H, W, 3] that shows an object on black; None for any other image.
 
-    At least `DARK_FRACTION` of its pixels and half of its border are dark, and not all are.
+    In such an image, at least `DARK_FRACTION` of the pixels and half of the border are dark, but not all pixels.
     """
     dark: np.ndarray = image.max(-1) < DARK
     border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
@@ -43,10 +43,10 @@ def empty_pixels(dark: np.ndarray) -> np.ndarray:
 
 
 def cut_from_black(views: list[View]) -> tuple[list[View], str]:
-    """Make the background transparent if all views show an object on black: the dark pixels around the object and in its holes.
+    """Make the dark pixels around an object and in its holes transparent, if all views show an object on black.
 
-    All other pixels get an opacity of 1, and so do specks and cracks that the object encloses. If any view has an opacity or a
-    mask, or shows something else, all views stay unchanged.
+    All other pixels get an opacity of 1, and so do dark specks and cracks that the object encloses. If any view has an alpha
+    channel or a mask, or shows something else, all views stay unchanged.
 
     Args:
         views: The views of a scene.

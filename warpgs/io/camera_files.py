@@ -56,7 +56,7 @@ def _json(path: Path) -> Any:
 
 
 def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
-    """Return pose and lens of each row; its rotation is camera to world, in OpenCV axes, and its position the centre."""
+    """Return pose and lens of each row, which has a camera-to-world rotation in OpenCV axes, and the camera centre."""
     found = _Names()
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
@@ -91,7 +91,7 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 def colmap_folder(folder: Path) -> Path | None:
-    """Return the folder of a reconstruction, given a scene folder, its sparse or its sparse/0; None without one."""
+    """Return the folder of the reconstruction in a scene folder, sparse or sparse/0; None without one."""
     found = colmap.model_folder(folder)
     return colmap.model_folder(folder / "0") if found is None else found
 
@@ -116,7 +116,7 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 class _Names(dict[str, tuple[np.ndarray, Lens]]):
-    """Pose and lens by a name that is unique: of equal names all but the first get a number."""
+    """Pose and lens by a name that is unique: equal names, except the first, get a number."""
 
     def __init__(self) -> None:
         super().__init__()

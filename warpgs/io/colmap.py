@@ -236,7 +236,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     """Return points, with the views that saw them, from points3D.bin or points3D.txt.
 
     Args:
-        path: The file; an empty one gives no points.
+        path: The file; it may list no points.
         names: View names by image number; images without a name here are left out of the tracks.
 
     Returns:
@@ -303,8 +303,8 @@ def model_folder(root: Path) -> Path | None:
 def _image_paths(scene: SceneFolder, images: Path, names: list[str], where: str) -> tuple[dict[str, Path], str]:
     """Return the image file by view name, and a note for the user (empty where nothing was chosen).
 
-    Ready-made small folders often hold other suffixes (image_8/a.png for a.JPG) or names of their own (LLFF's image000.png);
-    files with another suffix are matched by stem, files with other names by sorted order if the counts agree.
+    Folders of reduced images often have other suffixes (images_8/a.png for a.JPG) or other names (LLFF's image000.png). Files
+    with another suffix are matched by stem, files with other names by sorted order if the counts agree.
     """
     paths = {n: scene.child(images, n, where) for n in names}
     lost = [n for n in names if not paths[n].is_file()]
@@ -383,5 +383,5 @@ def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pos
         views.add(view, rigid(viewmat, where), loaded)
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:
-        notes.append(f"{unposed} images of {images.name} have no pose in the reconstruction and are left out")
+        notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")
     return views.views, notes + views.notes(scene.options)

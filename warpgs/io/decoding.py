@@ -67,7 +67,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         if pixels > max_pixels:
             raise DataError(
                 f"{path}: the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels; shrink it, or "
-                f"raise the limit with --max-pixels {pixels}, which takes {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB to decode"
+                f"raise the limit with --max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
             )
         if not pixels:
             raise ValueError(f"it has {width} x {height} px")
@@ -77,7 +77,7 @@ def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
         else:
             module.check(data)
         if raster is None:
-            # IMREAD_UNCHANGED also leaves the EXIF orientation alone: the camera, not the tag, says how the raster lies
+            # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
             raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if raster is None or raster.shape[:2] != (height, width):
             raise ValueError("its pixels cannot be read")

@@ -29,7 +29,7 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4].
 
     Raises:
-        DataError: The matrix is not finite or singular, or its axes are skewed by more than a thousandth.
+        DataError: The matrix is not finite, is singular, or has a skew of more than a thousandth of the focal length.
     """
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
@@ -67,7 +67,9 @@ def _read_matrices(path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"{path}: cannot be read as an archive of arrays ({type(e).__name__}: {e}); copy it again") from e
     for key, matrix in matrices.items():
         if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-            raise DataError(f"{path}: {key} is not a finite [4, 4] matrix but {list(matrix.shape)}; copy the archive again")
+            raise DataError(
+                f"{path}: {key} must be finite and [4, 4]; its shape is {list(matrix.shape)}. Copy the archive again"
+            )
     return matrices
 
 
@@ -77,7 +79,7 @@ def _number(file: Path) -> int | None:
 
 
 def _masks(root: Path, files: list[Path]) -> dict[Path, Path]:
-    """Return the mask file of each image that has one, by name, else by the number in it (image/000003.png, mask/003.png)."""
+    """Return the mask file of each image that has one, by name, else by number (image/000003.png, mask/003.png)."""
     folder = next((root / f for f in ("mask", "masks") if (root / f).is_dir()), None)
     masks = [] if folder is None else list_images(folder)
     by_name, by_number = {m.stem: m for m in masks}, {_number(m): m for m in masks}

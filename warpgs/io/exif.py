@@ -13,7 +13,7 @@ from warpgs.io.image_formats import avif, jpeg, png, webp
 from warpgs.io.image_formats.kinds import format_of
 
 MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
-"""Tags: maker and model of the device, orientation, place of the exposure data, and in it the equivalent focal length [mm]."""
+"""Tags: maker and model of the device, orientation, place of the exposure data, and its equivalent focal length [mm]."""
 ASCII = 2
 NUMBERS = {3: "H", 4: "I"}
 """Layouts of the integers that these tags may hold, by type."""
@@ -29,7 +29,7 @@ PREFIX = b"Exif\0\0"
 
 @dataclass(frozen=True)
 class Exif:
-    """Values of EXIF; defaults for missing ones."""
+    """Values of EXIF; missing values have the defaults."""
 
     orientation: int = 1
     """Orientation of the stored raster, 1 to 8."""

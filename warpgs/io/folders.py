@@ -114,13 +114,15 @@ class SceneFolder:
                 already. None for the factor that the user gave.
             mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`.
             background: Colour in [0, 1] behind transparent pixels.
-            named: Maps that the scene names for it.
+            named: Maps that the scene names for the image.
 
         Returns:
             The image, float32, shape [H, W, 3], with intrinsics for its size.
 
         Raises:
-            DataError: The file is outside the folder, or `load_image` rejects it.
+            DataError: The file is outside the folder, or `load_image` rejects it; or a map is invalid.
+            ResourceError: There is not enough memory to decode the image.
+            UsageError: A side becomes too small, or the camera model does not support a map.
         """
         if self.options.on_image is not None:
             self.options.on_image(path)

@@ -51,10 +51,11 @@ class GivenMaps:
         self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
 
     def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
-        """Return an image with its maps, at its size; the user's folder has priority over maps named in the scene.
+        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene.
 
         Raises:
             DataError: A map cannot be read, does not fit its image, or its values cannot be depths or normals.
+            UsageError: The camera model of the image does not support the map.
         """
         depth, confidence, options = named.depth, None, self.options
         if options.depths is not None:

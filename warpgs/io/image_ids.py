@@ -24,7 +24,7 @@ def named_by_dtu(names: list[str]) -> bool:
 
 
 def image_ids(names: list[str]) -> list[int] | None:
-    """Return the ids of image files from their names, counted from 0; None if no number distinguishes the names.
+    """Return the ids of image files from the numbers in their names; None if no number distinguishes the names.
 
     DTU's own names, `rect_001_3_r5000.png`, count from 1, so number 1 is id 0; other numbers are used unchanged.
     """
@@ -44,11 +44,11 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
         where: Protocol and scene, for errors.
 
     Returns:
-        Name by id. Names without numbers are counted in sorted order; numbered images must have no gaps, since a gap may mean
-        that the numbers are not the protocol's ids.
+        Name by id. Names without numbers are counted in sorted order. Numbered images must have no gaps: after a gap, the
+        numbers may not be the protocol's ids.
 
     Raises:
-        DataError: There are too few images, or some are missing from the middle; the message names the ids.
+        DataError: There are too few images, or some ids are missing; the message names them.
     """
     if len(names) < least:
         raise DataError(

@@ -22,11 +22,11 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".avif", 
 MIN_SIDE = 4
 """Smallest shorter side of an image [px]; below it there is nothing to fit."""
 MAX_INTRINSIC = 1e9
+"""Intrinsics and image sides must be below this value [px]."""
 MIN_FOCAL = 1e-3
-"""Smallest focal length as a fraction of the image side: a field of view of 179.9 degrees."""
+"""Smallest focal length as a fraction of the image side: a field of view of 179.8 degrees."""
 MAX_DISTORTION = 1e4
-"""Largest distortion coefficient; a file is rejected if a coefficient exceeds it, or an intrinsic exceeds `MAX_INTRINSIC`
-[px]."""
+"""Distortion coefficients must be below this value."""
 MIN_FOLD = 1e-9
 """Inverse of a squared radius; a fold of the lens beyond that radius lies outside any image."""
 
@@ -63,7 +63,7 @@ class Lens:
                 "calibrate again"
             )
         if not (np.abs(c) < MAX_INTRINSIC).all():
-            raise DataError(f"{where}: the principal point {c.tolist()} px is not finite; calibrate again")
+            raise DataError(f"{where}: the principal point {c.tolist()} px is not finite or too large; calibrate again")
         if not (np.abs(self.distortion) < MAX_DISTORTION).all():
             raise DataError(f"{where}: distortion {self.distortion} of the {self.model} lens is impossible; calibrate again")
         return self
@@ -146,7 +146,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the column and the row in the distorted image of each pixel of a pinhole image, [H, W] each, as in OpenCV.
+    """Map the pixels of a pinhole image to the distorted image: return their columns and rows there, [H, W] each, as OpenCV.
 
     Args:
         K: Intrinsics [px] of both images at this size, shape [3, 3].
@@ -209,7 +209,7 @@ def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
 
 
 def _shrink(path: Path, loaded: LoadedImage, downscale: int, max_side: int) -> LoadedImage:
-    """Resample by the factor, then to the longest side where it is longer; the intrinsics follow the sizes exactly."""
+    """Resample by the factor, or to ``max_side`` if the result would be larger; the intrinsics follow the sizes exactly."""
     height, width = loaded.image.shape[:2]
     factor, flags, done = float(downscale), f"--downscale {downscale}", loaded.done
     if max_side and round(max(width, height) / downscale) > max_side:
@@ -328,7 +328,9 @@ def load_image(
         The image with intrinsics for its final size.
 
     Raises:
-        DataError: The file cannot be decoded, its size does not fit its camera or its mask, or no pixel is left.
+        DataError: The file cannot be decoded, its size does not fit its camera or its mask, its lens cannot be undistorted, or
+            no pixel is left.
+        ResourceError: There is not enough memory to decode the file.
         UsageError: ``downscale`` or ``max_side`` leaves a side below `MIN_SIDE`.
     """
     image, alpha = decode(path, max_pixels)

@@ -64,7 +64,7 @@ def load_scene(
             `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
         black_is_empty: True to make dark pixels around an object and in its holes transparent, if every image shows an object
-            on black and none has an alpha channel or a mask.
+            on black, without an alpha channel or a mask.
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder, if it
             exists.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
@@ -86,8 +86,8 @@ def load_scene(
     Raises:
         DataError: A file of the folder is missing or malformed; the message names file, reason and fix.
         ResourceError: There is not enough memory to decode an image.
-        UsageError: ``downscale`` or ``max_pixels`` is below 1, ``max_side`` is below 0, ``depth_unit`` is not above 0, or a
-            choice or the reader is unknown.
+        UsageError: A number is out of range, a choice or the reader is unknown, an image would become too small, or a camera
+            model does not support a given map.
     """
     root, (factor, side) = Path(path), image_scale(downscale, max_side)
     given = [None if p is None else Path(p) for p in (depths, normals)]
@@ -120,7 +120,7 @@ def detect(root: Path) -> tuple[Reader, list[str]]:
     """Return the reader of the first complete format of a scene folder, and notes on the formats passed over.
 
     Raises:
-        DataError: The folder has no format, or only an incomplete one; the message lists the supported files.
+        DataError: The folder contains no known format, or only an incomplete one; the message names the files to look for.
     """
     readers = all_readers()
     found = [(r, p) for r in readers if (p := r.probe(root)) is not None]

@@ -112,8 +112,8 @@ class MapFolder:
         """Return the error for a folder in which no image found a map."""
         names = [key for key in self._files if not key.endswith(CONFIDENCE)]
         return DataError(
-            f"{self.folder}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each as "
-            f"its image, with .png or .npy, or give another {self.flag}"
+            f"{self.folder}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each "
+            f"map like its image, with .png or .npy, or give another {self.flag}"
         )
 
 
@@ -178,7 +178,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
         raise DataError(
-            f"{path}: has eight bits, too few for lengths; save 16-bit PNG, or give --depth-kind relative or disparity"
+            f"{path}: has 8 bits, too few for metric depth; save 16-bit PNG, or give --depth-kind relative or disparity"
         )
     values = raw.astype(np.float32)
     finite = np.isfinite(values)
@@ -227,7 +227,7 @@ def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) 
     """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
 
     Raises:
-        DataError: The file is not a map, or too many of its vectors have another length than 1.
+        DataError: The file is not a map of normals, contains none, or too many of its vectors have another length than 1.
     """
     raw = read_numbers(path, max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:

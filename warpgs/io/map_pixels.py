@@ -1,4 +1,4 @@
-"""Given maps in the pixels of an image: turned, undistorted and resized as the image, without mixing near and far depths."""
+"""Given maps in the pixels of an image: rotated, undistorted and resized like the image, without mixing near and far depths."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndarray:
-    """Turn, undistort and resize a map as an image was; the result has shape [h, w] or [h, w, C] of the image's final size.
+    """Rotate, undistort and resize a map like its image; the result has shape [h, w] or [h, w, C] of the image's final size.
 
     Args:
         loaded: The image at its final size.
@@ -52,7 +52,7 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
         path: File of the map, for errors.
 
     Raises:
-        DataError: The aspects differ, or the map holds vectors and the image was turned.
+        DataError: The aspects differ, or the map holds vectors and the image was rotated.
     """
     import cv2
 

@@ -73,7 +73,7 @@ def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointC
 
 
 def fingerprint(views: list[View]) -> str:
-    """Return the SHA-256, hexadecimal, over names, cameras, pixels and given maps of the views in their order."""
+    """Return the SHA-256, hexadecimal, over names, cameras, pixels, masks and given maps of the views in their order."""
     digest = hashlib.sha256()
     for v in views:
         # cameras to 1e-9: their last bits depend on the machine's linear algebra

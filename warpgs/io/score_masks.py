@@ -49,7 +49,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
     """Give every view its object mask, matched by image id and never by sorted order.
 
     The masks lie in ``folder`` or in its subfolder `mask`, named by id counted from 0 (000.png, 001.png, ...); the images
-    are named by the same ids, or as DTU names them, `rect_001_...` being id 0.
+    are named by the same ids, or by DTU's own names, in which `rect_001_...` is id 0.
 
     Args:
         views: The scene's views, at their final size.

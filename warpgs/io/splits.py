@@ -108,7 +108,7 @@ class _Names:
         raise DataError(f"split {self.spec}: no view {wanted!r}; the nearest names are {some}")
 
     def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
-        """Return the names by their last ``count`` parts, only names that have more parts; by the whole name for 0."""
+        """Return the names that have more than ``count`` parts, by their last ``count`` parts; for 0 all, by the whole name."""
         if (bare, count) not in self._ends:
             table: dict[str, list[str]] = {}
             for name in self.names:
@@ -166,7 +166,7 @@ def split_views(scene: Scene, spec: str) -> Split:
 
     ``llff:K`` and ``mip360:K``: every 8th of the sorted views is held out, and K of the others, evenly spaced, train. ``dtu:K``
     and ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
-    ``train=a,b;test=c``: names, with or without suffix; if one half is missing, it consists of all other views.
+    ``train=a,b;test=c``: names, with or without suffix; if one part is missing, it consists of all other views.
 
     Raises:
         DataError: The scene lacks views of the split, or training and test views overlap.
@@ -204,7 +204,7 @@ def held_out_split(scene: Scene) -> tuple[str, str]:
 def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
     """Return pairs (held-out view, training view) with the same camera: a copy of the training image would score as well.
 
-    Two cameras count as the same if no entry of their poses differs by a thousandth; lengths are in extents of the camera set.
+    Two cameras count as the same if all entries of their poses differ by less than a thousandth; lengths are in camera extents.
     """
     extent = max(camera_extent([v.camera for v in scene.views]), 1e-9)
     unit = np.array([[1, 1, 1, 1 / extent]] * 3 + [[1] * 4])

@@ -251,7 +251,7 @@ class TransformsReader(Reader):
             for number, frame in enumerate(shared["frames"]):
                 reading.frame(file, shared, number, frame)
             if shared.get("ply_file_path"):
-                notes.append(f"the points of {str(shared['ply_file_path'])[:80]} are not read")
+                notes.append(f"the points in {str(shared['ply_file_path'])[:80]} are not read")
         if missing := reading.missing:
             some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
             text = f"{len(missing)} of {reading.total} frames have no image file: {some}"

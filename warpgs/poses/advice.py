@@ -78,7 +78,9 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     tree = neighbours(found)
     for i, j, angle in sorted(tree, key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:
-            said.append(f"take one or two photographs between {names[i]} and {names[j]}, which look {angle:.0f} degrees apart")
+            said.append(
+                f"take one or two photographs between {names[i]} and {names[j]}: their axes differ by {angle:.0f} degrees"
+            )
     for i in found.views:
         best = [(n, j) for j, n in partners(found, i) if j in found.views]
         if best and best[0][0] < WEAK_MATCHES:

@@ -35,7 +35,7 @@ MIN_PHOTOGRAPHS = 3
 FRAMES = 60
 """Default number of frames from a video."""
 LINKS = 6
-"""Number of pairs of photographs to report if no poses are found, those with the fewest matches first."""
+"""Number of pairs of photographs to report if no poses are found; pairs with the fewest matches come first."""
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 """Files of a COLMAP model; the first three make a scene."""
 
@@ -107,7 +107,8 @@ def find_poses(
         DataError: There are too few photographs, one is outside the folder or cannot be decoded, fewer than three match, or the
             matcher is invalid.
         ResourceError: pycolmap failed, or the folder cannot be written.
-        UsageError: pycolmap is not installed, or ``out`` holds something already.
+        UsageError: pycolmap, or pi-heif for HEIC, is not installed; ``source`` is a run or holds scenes; or ``out`` is not
+            empty.
     """
     source, out = Path(source), Path(out)
     _check(source, out, allow_outside)
@@ -169,7 +170,7 @@ def _something_else(folder: Path) -> str:
         return "is the folder of a run; give the scene that it was fitted to"
     scenes = [d.name for d in sorted(folder.iterdir()) if d.is_dir() and any(r.probe(d) is not None for r in all_readers())]
     if scenes:
-        return f"holds scenes, such as {scenes[0]}, and no loose photographs; give one scene, or use `warpgs farm` for all"
+        return f"holds scenes, such as {scenes[0]}; give one scene, or only photographs, or use `warpgs farm` for all"
     return ""
 
 
@@ -266,8 +267,9 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
     if 2 * blank >= count:
         most = max(found.keypoints)
         why = (
-            f"{blank} of {count} photographs show almost nothing that can be matched (at most {most:,} keypoints): a blank "
-            "wall, darkness or blur. Take sharp photographs of textured things, in good light"
+            f"{blank} of {count} photographs show almost nothing that can be matched (fewer than {MIN_KEYPOINTS} keypoints; "
+            f"the best one has {most:,}): a blank wall, darkness or blur. Take sharp photographs of textured things, in good "
+            "light"
         )
     elif not largest:
         why = f"no two of {count} photographs show the same place. Take photographs that overlap by two thirds, in small steps"

@@ -20,7 +20,7 @@ from warpgs.runtime.processor import usable_cores
 from warpgs.runtime.subprocesses import ProcessFailed, python_lines
 
 EXHAUSTIVE = 60
-"""Largest number of photographs of which all pairs are matched; of more photographs, only chosen pairs."""
+"""Largest number of photographs of which all pairs are matched; for more photographs, pairs are chosen."""
 JOB = "job.json"
 """Name of the file with the worker's input."""
 LEARNED = "learned.npz"
@@ -62,7 +62,7 @@ class Mapping:
     keypoints: tuple[int, ...]
     """Number of keypoints of each photograph."""
     matches: dict[tuple[int, int], int]
-    """Number of matches that agree with one motion of the camera, by pair, the smaller number first."""
+    """Number of matches that agree with one motion of the camera, by pair, the smaller index first."""
     tried: int
     """Number of pairs that were matched."""
     views: dict[int, FoundView]
@@ -80,12 +80,12 @@ class Mapping:
     version: str
     """Version of pycolmap."""
     kept_focal: bool | None = None
-    """True if the focal length of EXIF is kept, because so few photographs cannot improve it; False if they contradict it; None
-    if this was not tested."""
+    """True if the focal length of EXIF is kept, because so few photographs cannot improve it; False if it does not fit them;
+    None if this was not tested."""
 
     @cached_property
     def links(self) -> dict[int, list[tuple[int, int]]]:
-        """Photographs that each one matches, with the number of matches."""
+        """Photographs that each photograph matches, with the number of matches."""
         links: dict[int, list[tuple[int, int]]] = {}
         for (a, b), n in self.matches.items():
             if n > 0:

@@ -1,4 +1,4 @@
-"""Keypoints and matches of photographs by a network that the user names, where SIFT's do not suffice.
+"""Keypoints and matches of photographs by a network that the user names, for photographs without a pose from SIFT.
 
 The network is one ONNX file. It takes an image, colours in [0, 1], and returns `keypoints` [K, 2] in pixels of its input (pixel
 centres at +0.5), `scores` [K], positive where there is a keypoint, and `descriptors` [K, D] of length 1.
@@ -37,8 +37,8 @@ MIN_COSINE = 0.82
 TURN_SIDE, TURN_KEYPOINTS = 512, 512
 """Longer side [px] and number of keypoints of a photograph for the search of rotations between photographs."""
 TURN_GAIN = 2
-"""Ratio of matches with a photograph rotated to those with it upright, above which it counts as rotated: networks are not
-rotation invariant."""
+"""A photograph counts as rotated if rotating it gives at least this many times the matches: networks are not rotation
+invariant."""
 WHOLE = 2047
 """Factor of descriptors before they are rounded: sums of their products stay below 2^24, where float32 is exact."""
 
@@ -106,7 +106,7 @@ class Matcher:
         return Features(pixels.astype(np.float32), whole)
 
     def _check(self, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray, h: int, w: int) -> None:
-        """Raise a DataError if these are not the keypoints of an image of ``h`` x ``w`` px."""
+        """Raise a DataError if the outputs are not keypoints of an image of ``h`` x ``w`` px."""
         shapes = ", ".join(f"{n} {list(a.shape)}" for n, a in zip(OUTPUTS, (keypoints, scores, descriptors)))
         count = len(scores) if scores.ndim == 1 else -1
         if keypoints.shape != (count, 2) or descriptors.ndim != 2 or len(descriptors) != count:
@@ -215,7 +215,7 @@ def write_matches(
         progress: Called with lines for the user.
 
     Returns:
-        Indices of the photographs that were rotated before the network saw them, because they match others better so.
+        Indices of the photographs that were rotated before the network saw them, because they then match others better.
     """
     found = []
     for i, image in enumerate(images):

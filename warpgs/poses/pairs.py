@@ -1,8 +1,8 @@
 """Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 
-Photographs look alike if their SIFT descriptors belong to the same visual words. The small vocabulary of words is made from the
-descriptors themselves (tf-idf: Sivic and Zisserman, "Video Google", 2003). Sums of products of integers below 2^24 are exact in
-float32, so the order of additions changes no bit.
+Photographs look alike if their descriptors, of SIFT or a network, belong to the same visual words. The small vocabulary of
+words is made from the descriptors themselves (tf-idf: Sivic and Zisserman, "Video Google", 2003). Sums of products of integers
+below 2^24 are exact in float32, so the order of additions changes no bit.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ SAMPLES = 20_000
 ROUNDS = 8
 """Rounds of k-means."""
 NEIGHBOURS = {"photographs": 2, "video": 10}
-"""Number of photographs before and after a photograph, in the order of names, that it is matched with, by kind of source."""
+"""A photograph is matched with this many before it and after it, in the order of names; by kind of source."""
 LOOKALIKES = {"photographs": 20, "video": 5}
 """Number of most similar photographs that a photograph is matched with, by kind of source."""
 
 
 def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
-    """Return the words of a vocabulary, integers as float32 [W, 128], by k-means on sampled descriptors.
+    """Return the words of a vocabulary, integers as float32 [W, D], by k-means on sampled descriptors.
 
     Args:
-        descriptors: SIFT descriptors of each photograph, uint8 [K, 128].
+        descriptors: Descriptors of each photograph, by SIFT or a network, uint8 [K, D].
         seed: Seed of the sample.
     """
     generator = np.random.default_rng(seed)
@@ -47,10 +47,10 @@ def _nearest(rows: np.ndarray, centers: np.ndarray) -> np.ndarray:
 
 
 def similarity(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
-    """Return how alike photographs are, cosines of their tf-idf vectors in [0, 1], float64 [N, N].
+    """Return the similarity of each pair of photographs: the cosine of their tf-idf vectors, in [0, 1], float64 [N, N].
 
     Args:
-        descriptors: SIFT descriptors of each photograph, uint8 [K, 128].
+        descriptors: Descriptors of each photograph, by SIFT or a network, uint8 [K, D].
         seed: Seed of the vocabulary.
     """
     if not any(len(d) for d in descriptors):
@@ -68,7 +68,7 @@ def choose_pairs(descriptors: list[np.ndarray], kind: str, seed: int = 0) -> lis
     """Choose the pairs of photographs to match, each as two indices, the smaller one first, in ascending order.
 
     Args:
-        descriptors: SIFT descriptors of each photograph in the order of their names, uint8 [K, 128].
+        descriptors: Descriptors of each photograph, by SIFT or a network, in the order of names, uint8 [K, D].
         kind: photographs or video, which determines `NEIGHBOURS` and `LOOKALIKES`.
         seed: Seed of the vocabulary.
     """

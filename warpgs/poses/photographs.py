@@ -51,7 +51,7 @@ class Photograph:
     device: str
     """Maker, model and equivalent focal length of the device; empty without EXIF."""
     focal: float | None
-    """Focal length by EXIF, in longer sides of the image; None if unknown."""
+    """Focal length by EXIF, as a multiple of the longer side of the image; None if unknown."""
     digest: str
     """SHA-256 of the file."""
 
@@ -140,6 +140,7 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 
     Raises:
         DataError: The file cannot be decoded.
+        ResourceError: There is not enough memory, or the copy cannot be written.
     """
     import cv2
 

@@ -40,7 +40,7 @@ _RECORD = schema.fields(
 
 
 def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, notes: Sequence[str]) -> dict[str, Any]:
-    """Return the contents of poses.json; ``digest`` is that of the source, ``notes`` are choices made for the user."""
+    """Return the contents of poses.json; ``digest`` is the hash of the source, ``notes`` are choices made for the user."""
     names = [p.name for p in photographs]
     rows = []
     for i, p in enumerate(photographs):

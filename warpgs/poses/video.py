@@ -93,13 +93,13 @@ def sharpest(values: list[float], count: int) -> list[int]:
 
 
 def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str], object]) -> int:
-    """Write the sharpest evenly spaced frames of a video as PNG files, named by their number.
+    """Write the sharpest frame of each of ``count`` equal parts of a video as PNG files, named by their number.
 
     Args:
         path: The video file.
         folder: Folder to write into.
-        count: Number of frames wanted; all where the video has fewer.
-        progress: Called with a line for the user at intervals.
+        count: Number of frames to write; all frames if the video has fewer.
+        progress: Called with a line for the user for each frame.
 
     Returns:
         The number of frames that the video has.

@@ -3,7 +3,7 @@
 It is a separate process for three reasons: pycolmap may end its own process on an internal error, it cannot be interrupted,
 and its wheels contain code under the GPL (decision 017). No other module of warpgs imports pycolmap.
 
-A line holds ``progress``, a text for the user, or ``result``, the last one.
+A line holds ``progress``, a text for the user; the last line holds ``result``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from warpgs.runtime.terminal import answer
 SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
-"""Number of matches that a pair needs, all in agreement with one motion of the camera, and of points that a new photograph must
-see."""
+"""Smallest number of matches of a pair that agree with one motion of the camera, and of points that a new photograph sees."""
 MIN_RATIO = 0.6
 """Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
 (decision 017)."""
@@ -84,7 +83,7 @@ def verification_options(pycolmap: Any) -> Any:
 
 
 def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Write the keypoints and matches of a network into the database and verify them; return what `match` does."""
+    """Write the keypoints and matches of a network into the database and verify them; return what `matched` does."""
     with np.load(job["learned"], allow_pickle=False) as learned:
         pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
         matches = np.split(learned["matches"], ends[:-1])
@@ -113,7 +112,7 @@ def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Match pairs of photographs; return keypoints by photograph, and pairs with their matches that agree with one motion."""
+    """Match pairs of photographs; return what `matched` does."""
     with pycolmap.Database.open(job["database"]) as database:
         order = numbers_of(database, job)
         few = len(order) <= job["exhaustive"]
@@ -132,7 +131,7 @@ def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
-    """Return the keypoints of each photograph, and the pairs with their matches that agree with one motion."""
+    """Return the number of keypoints of each photograph, and for each pair the number of matches that agree with one motion."""
     with pycolmap.Database.open(job["database"]) as database:
         order = numbers_of(database, job)
         keypoints = [database.num_keypoints_for_image(i) for i in order]
@@ -146,7 +145,7 @@ def matched(pycolmap: Any, job: dict[str, Any], tried: int) -> dict[str, Any]:
 
 
 def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = False) -> list[Any]:
-    """Return the models that grow photograph by photograph from a good pair; a kept focal length is EXIF's."""
+    """Return the models that grow photograph by photograph from a good pair; ``keep_focal`` keeps EXIF's focal lengths."""
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = options.mapper.num_threads = 1  # else the rounding depends on which thread finishes first
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = SEED
@@ -167,7 +166,10 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether models with EXIF's focal length hold no fewer photographs than free ones, at nearly the same error."""
+    """Return whether the best of ``kept``, with EXIF's focal length, has at least as many photographs as that of ``free``.
+
+    Its error must be at most `MAX_RATIO` times as large. If a list is empty, return whether ``kept`` has models.
+    """
     if not kept or not free:
         return bool(kept)
     best, other = (max(m, key=lambda r: (r.num_reg_images(), r.num_points3D())) for m in (kept, free))

@@ -16,7 +16,7 @@ LEGEND = (72, 8)  # width and height of a colour bar [px]
 DOT = (240, 78, 35)
 """Colour of dots."""
 MAX_DOT_FRACTION = 0.08
-"""Largest fraction of an image that dots cover: many dots are smaller."""
+"""Fraction of an image above which dots shrink, down to a radius of 0.9 px."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def contact_sheet(
     Args:
         title: Headline.
         lines: Sentences, wrapped to the width of a tile.
-        tiles: At least one; all of one shape [H, W].
+        tiles: At least one; all of one height and width.
         columns: Tiles per row.
         tile_width: Width of a tile [px].
         text: Factor on the font sizes, for a sheet that is shown at a reduced size.

@@ -6,9 +6,9 @@ import numpy as np
 
 
 def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
-    """Return the largest minus the smallest value of images [H, W, 3] at each pixel, averaged over channels, [H, W].
+    """Return the largest minus the smallest value of images [H, W, 3] at each pixel, averaged over channels, shape [H, W].
 
-    For a single image the result is its absolute error to ``reference`` [H, W, 3].
+    For a single image, return its absolute error against ``reference`` [H, W, 3], averaged over channels.
     """
     if len(images) == 1:
         return np.abs(images[0] - reference).mean(-1)
@@ -17,7 +17,7 @@ def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
 
 
 def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
-    """Return the corners (x, y) [px] of the ``count`` windows with the largest sums of ``values`` [H, W], largest first.
+    """Return the top left corners (x, y) [px] of ``count`` windows with the largest sums of ``values`` [H, W], largest first.
 
     Windows do not overlap; fewer are returned if no more fit. If all values are 0, the first window is in the middle.
     """

@@ -10,7 +10,7 @@ MAX_POINTS = 300
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return three to six round numbers, evenly spaced, inside a range."""
+    """Return two to five round numbers, evenly spaced, inside a range."""
     rough = (high - low) / 4
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough)
@@ -28,7 +28,7 @@ def tick_label(value: float) -> str:
 def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
     """Return an SVG chart of ``ys`` over ``xs`` (steps); long series are shown by the means of at most 300 groups.
 
-    Non-finite points are left out; without any finite point the chart has a note.
+    Non-finite points are left out; without any finite point the chart says "no data".
     """
     points = [(x, y) for x, y in zip(xs, ys) if math.isfinite(x) and math.isfinite(y)]
     group = max(1, math.ceil(len(points) / MAX_POINTS))

@@ -25,14 +25,14 @@ _STEP = schema.fields({"step": schema.whole(0)})
 class EventLog:
     """A log to which events are appended; a resumed fit first drops the events after its checkpoint.
 
-    It is the only file that is not replaced as a whole: lines are appended. After a kill only the last line
-    can be incomplete; readers skip it and a resumed fit drops it.
+    The log is the only file of a run that is not replaced as a whole: lines are appended. After a kill only the last line can
+    be incomplete; readers skip this line, and a resumed fit drops it.
     """
 
     _file: BinaryIO | None = None
 
     def __init__(self, path: Path, step: int = 0):
-        """Open the log of a fit that has done ``step`` steps: events of later steps are dropped, 0 starts empty.
+        """Open the log of a fit that has done ``step`` steps, and drop the events of later steps; 0 empties the log.
 
         Raises:
             ResourceError: The file cannot be written.
@@ -41,7 +41,7 @@ class EventLog:
         self.rewind(step)
 
     def rewind(self, step: int) -> None:
-        """Drop the events of later steps than ``step``.
+        """Drop the events of all steps after ``step``; 0 empties the log.
 
         Raises:
             ResourceError: The file cannot be written.
@@ -68,7 +68,7 @@ class EventLog:
             raise self._failure(e) from e
 
     def flush(self) -> None:
-        """Sync everything written to the disk, so that the log never lags behind a checkpoint.
+        """Flush the log and sync it to the disk, so that it never lags behind a checkpoint.
 
         Raises:
             ResourceError: The file cannot be written.

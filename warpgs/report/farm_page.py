@@ -45,7 +45,7 @@ class JobCard:
 
 
 def _address(path: str) -> str:
-    """Return a path as an address, which holds the bytes of names that are not text, too."""
+    """Return a path as an address; bytes of names that are not text are kept."""
     return quote(path, errors="surrogateescape")
 
 

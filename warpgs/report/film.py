@@ -23,7 +23,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
     """Write frames [H, W, 3] in [0, 1], all of one size, as a film in the format that the path's suffix names.
 
     A video (.mp4, .webm) is VP9, which OpenCV's wheels bring and current browsers play; an odd height loses a row, an odd width
-    a column. An animated image (.webp, .gif) runs in a loop. The film is decoded before it takes the place of an older one: the
+    a column. An animated image (.webp, .gif) runs in a loop. The film is decoded before it replaces an older one, because the
     encoder does not report a full disk.
 
     Returns:
@@ -45,8 +45,8 @@ def write_film(path: Path, frames: Iterable[np.ndarray], fps: int = 30) -> int:
         found = _decoded_sizes(film)
         if found != sizes:
             raise ResourceError(
-                f"{path}: cannot be written; read back, {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames are "
-                "whole. The disk is full, or the encoder failed; the old file is untouched. Free some disk space, or "
+                f"{path}: cannot be written; only {sum(f == s for f, s in zip(found, sizes))} of {len(sizes)} frames could be "
+                "read back. The disk is full, or the encoder failed; the old file is untouched. Free some disk space, or "
                 "write elsewhere"
             )
 

@@ -59,7 +59,7 @@ def webp(image: np.ndarray | bytes, width: int = PAGE_WIDTH, quality: int = 82) 
 def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float, float, float]) -> np.ndarray:
     """Return colours with straight alpha, [H, W, 4], of colours over a background [H, W, 3]; black where ``alpha`` is 0.
 
-    Over ``background`` they give the image again; over another colour, the scene in front of that colour.
+    Composited over ``background``, the result is the image again; over another colour, the scene in front of that colour.
     """
     own = image - (1 - alpha[..., None]) * np.float32(background)
     colors = np.divide(own, alpha[..., None], out=np.zeros_like(own), where=alpha[..., None] > 0)
@@ -67,7 +67,7 @@ def straight_alpha(image: np.ndarray, alpha: np.ndarray, background: tuple[float
 
 
 def resized(image: np.ndarray, width: int, height: int):
-    """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged where it shrinks."""
+    """Return colours in [0, 1], [H, W, 3], at another size, as a Pillow image; areas are averaged if the width shrinks."""
     from PIL import Image
 
     pixels = Image.fromarray(np.round(np.clip(image, 0, 1) * 255).astype(np.uint8))
@@ -91,7 +91,7 @@ def error_map(image: np.ndarray, reference: np.ndarray, largest: float = 0.3) ->
 def depth_map(depth: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     """Return colours [H, W, 3] of depth, near warm and far cold, by inverse depth between its 2nd and 98th percentile.
 
-    Gray where less than half of the pixel is covered.
+    Gray where alpha is at most one half, or depth is 0.
     """
     valid = (alpha > 0.5) & (depth > 0)
     colors = np.full((*depth.shape, 3), GRAY, np.float32)

@@ -15,7 +15,7 @@ REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libe
 TIMEOUT = 90
 WIDTH, HEIGHT, VIEW_ANGLE = 1280, 640, 40.0  # [px], [px], vertical [deg]
 OUTSIDE, EDGE = 1.0, 0.15
-"""Margins (`within`) of the points to show, and of those that must be in the image: whole walls, no far background."""
+"""Margins (`within`) of the points to show, and of the points that must be in the image: whole walls, no far background."""
 TRAIN_COLOR, TEST_COLOR = "#149696", "#e08a2c"
 
 PROBE = (
@@ -126,7 +126,7 @@ def render_overview(
     """Render training and held-out cameras among points [N, 3] [u] with colours in [0, 1] [N, 3], ``up`` [3] upwards.
 
     Returns:
-        PNG bytes and an empty string; or None and the reason with a remedy, where this machine cannot render.
+        PNG bytes and an empty string; or None and the reason why there is no image, with a remedy if there is one.
     """
     if not (len(points) and train):
         return None, "no overview image: there are no points or no training cameras to show"

@@ -220,7 +220,7 @@ def _head(page: Page) -> list[str]:
 
 
 def _scores(page: Page) -> list[str]:
-    """Return the sections on views, their scores and how these were made."""
+    """Return the sections on views, their scores, and the protocol of the scores."""
     sections = []
     if page.views:
         heading = "Held-out views" if page.held_out else "Views the fit was trained on"

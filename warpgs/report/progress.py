@@ -103,7 +103,7 @@ class Stages:
     """
 
     def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
-        """Print plain lines with ``show``; ``live`` None writes lines in place, but only without ``show`` and in a terminal."""
+        """Print plain lines with ``show``; ``live`` None writes lines in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
 

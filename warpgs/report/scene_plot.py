@@ -86,7 +86,7 @@ class ScenePlot:
 
 
 def _frustum_size(cameras: list[Camera], reach: float) -> float:
-    """Return the height of camera pyramids [u]: large enough to be seen, and no larger than the cameras are apart."""
+    """Return the height of camera pyramids [u]: 0.8 times the median gap between cameras, in [0.03, 0.12] times ``reach``."""
     if len(cameras) < 2:
         return 0.12 * reach
     centers = np.array([c.center for c in cameras])

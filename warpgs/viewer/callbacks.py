@@ -17,7 +17,7 @@ def said(error: BaseException) -> str:
 
 
 def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
-    """Return a callback that calls another one, and prints one line on stderr if that raises an error."""
+    """Wrap a callback: if it raises an error, print one line on stderr."""
 
     @functools.wraps(callback)
     def call(*args: Any) -> None:

@@ -25,13 +25,13 @@ def fov_y(camera: Camera, aspect: float = math.inf) -> float:
 
     Args:
         camera: The camera.
-        aspect: Width of the window over its height; at least that of the image by default.
+        aspect: Width of the window over its height; by default the window is wider than the image.
     """
     return 2 * math.atan(max(0.5 * camera.height / float(camera.K[1, 1]), 0.5 * camera.width / float(camera.K[0, 0]) / aspect))
 
 
 def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
-    """Return the median depth [u] of the means that a camera sees, or 1 without any; a view turns about this depth."""
+    """Return the median depth [u] of the means that a camera sees, or 1 if it sees none; the view turns about this depth."""
     means = gaussians.means.detach().cpu().double().numpy()
     points = matmul(means, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = points[:, 2]
@@ -51,7 +51,7 @@ def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> 
 
 
 def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> Camera:
-    """Return a camera that sees nine tenths of the means from the front, -z, for a model without cameras."""
+    """Return a camera at -z that sees the box between the 5th and 95th percentiles of the means, for models without cameras."""
     means = gaussians.means.detach().cpu().double().numpy()
     low, high = np.percentile(means, [5, 95], axis=0)
     middle, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-6)

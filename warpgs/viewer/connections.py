@@ -23,7 +23,7 @@ from warpgs.viewer.page import live_page
 MAX_BROWSERS = 16
 """Largest number of websockets at a time."""
 MAX_CONNECTIONS = 64
-"""Largest number of connections at a time, including those without a request so far."""
+"""Largest number of connections at a time, including connections that have sent no request yet."""
 MESSAGES_PER_SECOND = 200.0
 """Rate of messages of one browser; moving a camera sends 50 a second."""
 MAX_BURST = 2000.0
@@ -55,19 +55,19 @@ class Rules:
         if message["type"] == "GuiUpdateMessage":
             try:
                 value = control_value(message["updates"]["value"], self.control_of(message["uuid"]))
-            except DataError:  # as a person types it may be empty for a moment
+            except DataError:  # empty for a moment while the user types
                 return None
             message["updates"] = {"value": value}
         return write_frame(message)
 
     def answer(self, inner: Callable[..., Any] | None, protocol: str, connection: Any, request: Any) -> Any:
-        """Return the answer to a request, None for a websocket that may be opened.
+        """Return the answer to a request; None if its websocket may be opened.
 
         Args:
             inner: viser's own function, which returns files.
             protocol: Name of the protocol that a websocket must speak.
             connection: The connection.
-            request: The request of websockets.
+            request: The request, as websockets passes it.
         """
         from websockets.datastructures import Headers
 

@@ -27,7 +27,7 @@ class Content:
     """A model and its description."""
 
     title: str
-    """Name to show: that of the folder or the file."""
+    """Name to show: the name of the folder or the file."""
     model: FittedModel
     """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
     stem: Path
@@ -85,7 +85,7 @@ def content_of_file(path: Path, device: str = "cpu") -> Content:
     """
     stored, antialiased = read_with_antialiasing(path, None, "file")
     if not len(stored):
-        raise DataError(f"{path}: holds no Gaussian; export the model again")
+        raise DataError(f"{path}: contains no Gaussians; export the model again")
     means = stored.means.double().numpy()
     low, high = np.percentile(means, [5, 95], axis=0)
     normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))

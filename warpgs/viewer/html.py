@@ -45,14 +45,14 @@ HELP = (
     "document.querySelector('#warpgs-help button').addEventListener('click',back);"
     "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
 )
-"""Line of help with a button that returns to the first view; it loads the page again where viser offers no way back."""
+"""Line of help, with a button that returns to the first view; without viser's reset function, the page is reloaded."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
 )
 """Script for a page opened from disk. Browsers reject its blobs as module workers; without the worker that sorts them,
-Gaussians are blended in the order of the file. The script rejects the blob itself, so viser's page starts the worker from a
-data: address, which works."""
+Gaussians are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
+address, which works."""
 WHOLE_IMAGE = (
     "<script>{let fov=OWN;const degrees=180/Math.PI,show=()=>{const c=window.__viserMutable?.camera;"
     "if(!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
@@ -126,11 +126,11 @@ def page_of(
     head = f'<head><meta http-equiv="Content-Security-Policy" content="{POLICY}" />'
     head += f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}</script>{SORT_FROM_DISK}{NO_REMARKS}{NO_SCENE_TREE}"
     text = re.sub(r"<title>[^<]*</title>", lambda _: f"<title>{html.escape(title)}</title>", text, count=1)
-    notes = ["the page shows colours without view dependence; the run and its PLY keep them"]
+    notes = ["the page shows no view-dependent colours; the run and its PLY keep them"]
     if gaussians.sh_degree == 0:
         notes.clear()
     if stored.shortened:
-        notes.append(f"{stored.shortened:,} Gaussians are longer than the page can hold, and are shown shorter")
+        notes.append(f"{stored.shortened:,} Gaussians are longer than the page can store, and are shown shorter")
     text, end, rest = text.replace("<head>", head, 1).rpartition("</body>")
     wide = 0.5 * cameras[0].width / float(cameras[0].K[0, 0])
     script = WHOLE_IMAGE.replace("OWN", f"{fov_y(cameras[0]):.8f}").replace("WIDE", f"{wide:.8f}")

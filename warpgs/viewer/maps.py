@@ -22,9 +22,9 @@ from warpgs.viewer.content import Content
 GAUSSIANS, RENDER, DEPTH, COVERAGE, ERROR = "Gaussians (browser)", "render", "depth", "coverage", "error"
 MAPS = {
     RENDER: "view-dependent colours, by the rasterizer of the fit",
-    DEPTH: "near warm, far cold; gray in nearly empty areas",
-    COVERAGE: "striped magenta: seen by no training view; amber: by one",
-    ERROR: "difference from the photograph, at a camera that you stepped into; brightest from 0.3",
+    DEPTH: "near: warm colours; far: cold colours; gray: opacity of at most one half",
+    COVERAGE: "striped magenta: seen by no training view; amber: seen by one",
+    ERROR: "difference from the photograph at the camera that you stepped into; 0.3 and more is brightest",
 }
 """Images by name, with their descriptions."""
 NEAR = 1e-3
@@ -46,7 +46,7 @@ class Maps:
 
     @torch.no_grad()
     def image(self, kind: str, camera: Camera, gaussians: Gaussians, sh_degree: int) -> tuple[np.ndarray, str]:
-        """Return an image as uint8, shape [H, W, 3], and a sentence on it.
+        """Return an image as uint8, shape [H, W, 3], and its description.
 
         Args:
             kind: One of `MAPS`.
@@ -71,7 +71,7 @@ class Maps:
     def _coverage(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
         model = self.content.model
         if not model.train:
-            return self._render(camera, gaussians, options)[0], "a PLY file has no training cameras; open its run"
+            return self._render(camera, gaussians, options)[0], "a file of Gaussians has no training cameras; open its run"
         if self._depths is None:
             cameras = model.cameras()
             masks = [v.mask if (v := self.content.views.get(n)) else None for n in model.train]
@@ -91,7 +91,7 @@ class Maps:
 
 
 def placed(image: np.ndarray, own: Camera, camera: Camera) -> np.ndarray:
-    """Return an image [H, W, 3] of one camera as another at the same pose shows it; gray outside of it."""
+    """Resample an image [H, W, 3] of the camera ``own`` for a camera at the same pose; gray outside the image."""
     import cv2
 
     K = matmul(np.asarray(camera.K), np.linalg.inv(own.K))  # pixel centres lie at +0.5 here, and at whole numbers in OpenCV

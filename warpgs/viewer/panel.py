@@ -34,7 +34,7 @@ class Shown(Protocol):
         """Send the current image."""
 
     def step_into(self, name: str, client: Any) -> None:
-        """Move a browser's camera to one of the model."""
+        """Move a browser's camera to the model's camera of that name."""
 
     def reset(self, client: Any) -> None:
         """Move a browser's camera back to where pages start."""
@@ -103,7 +103,7 @@ class Panel:
         self._status.content = f"**{_plain(content.title)}**\n\n{', '.join(parts)}"
 
     def explain(self, note: str) -> None:
-        """Write a note on the image; an empty note is hidden."""
+        """Show a note about the image; hide an empty one."""
         self._note.content, self._note.visible = _plain(note), bool(note)
 
     def _add_stepping(self) -> None:

@@ -50,7 +50,7 @@ def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> di
 
     Args:
         camera: Camera in scene units.
-        seconds: Time at which the path is there [s].
+        seconds: Time at which the path reaches the camera [s].
         normalization: Similarity from file to scene units.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The viewer's server: that of viser, bound to this machine, without tunnels, for clients with its full address."""
+"""The viewer's server: viser's, bound to this machine, without tunnels, for clients with its full address."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 PORT = 8080
 """Default port."""
 REMEDY = 'install the extra: pip install "warpgs[view]"'
-OTHER_PORT = "give another with --port (fit: --view-port), or 0 for any free one"
+OTHER_PORT = "choose another port with --port (fit: --view-port), or 0 for any free one"
 
 
 def require_viser() -> None:
@@ -68,7 +68,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
 
     rules, bound = Rules(), loopback_socket(port, OTHER_PORT)
     port = bound.getsockname()[1]
-    # it would print its address; the command prints it instead
+    # viser would print its address; the command prints it instead
     with guarded_server(rules, bound, f"viser-v{viser.__version__}"), contextlib.redirect_stdout(io.StringIO()):
         server = LocalServer(host=HOST, port=port, label=label, verbose=False)
     server.rules = rules

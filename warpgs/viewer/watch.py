@@ -43,7 +43,7 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     Raises:
         DataError: The path is neither a run folder nor a file of Gaussians.
         ResourceError: viser or the device is missing.
-        UsageError: The port is taken.
+        UsageError: The port is taken, or the device is unknown.
     """
     choose_device(device)
     if path.is_dir():

@@ -30,7 +30,7 @@ MAP_SIDE = {"cpu": 480, "cuda": 1280}
 SETTLED = 0.15
 """Time without motion of a browser's camera before an image is rendered for it [s]."""
 HIDDEN = 3.0
-"""Distance from a browser's eye within which cameras are hidden, in sizes of their frusta: they would hide the scene."""
+"""Distance from a browser's eye within which cameras are hidden, in sizes of their frusta, since they would hide the scene."""
 TRAIN_COLOR, TEST_COLOR = (20, 150, 150), (224, 138, 44)
 
 
@@ -43,7 +43,7 @@ class Window:
         Args:
             server: The server, without anything in its scene.
             content: The model.
-            maps: Whether images may be rendered here; not beside a fit in the same process.
+            maps: Whether images may be rendered here: False while a fit runs in this process.
         """
         self.server, self.content = server, content
         cameras = list(content.model.scene_cameras.values())
@@ -65,7 +65,7 @@ class Window:
         self._thread.start()
 
     def _first_camera(self) -> Camera:
-        """Return the middle training camera, or one before a model without cameras."""
+        """Return the middle training camera, or a camera in front of a model without cameras."""
         model = self.content.model
         cameras = middle_first([model.scene_cameras[n] for n in model.train] or list(model.scene_cameras.values()))
         return cameras[0] if cameras else camera_before(model.gaussians())
@@ -167,7 +167,7 @@ class Window:
                 frustum.visible = not frustum.visible
 
     def _eyes(self) -> list[np.ndarray]:
-        """Return the position [3] of each browser's camera: that of the first view until a browser sends its own."""
+        """Return the position [3] of each browser's camera: the first view's until the browser sends its own."""
         eyes = []
         for client in self.server.get_clients().values():
             try:

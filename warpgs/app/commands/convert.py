@@ -19,9 +19,9 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True, kw_only=True)
     class Convert(base):
         source: tyro.conf.Positional[Path]
-        """File of Gaussians to read; or cameras: cameras.json, transforms.json, or a folder of COLMAP."""
+        """File of Gaussians to read; or cameras: cameras.json, transforms.json, or a COLMAP folder."""
         target: tyro.conf.Positional[Path]
-        """File to write; cameras.json, transforms.json or sparse for cameras."""
+        """File to write. For cameras: cameras.json, transforms.json, or sparse (COLMAP)."""
 
     a = parse_flags(Convert, arguments, "warpgs convert", f"{about}\n\n{format_lines()}")
     from warpgs.pipeline.runs.export_model import convert

@@ -31,7 +31,7 @@ def run(arguments: list[str], about: str) -> int:
         seed: int = 0
         """Seed of the textures, and of the shape of an object."""
         object: bool = False
-        """Write a single object instead of a still life: RGBA images, eight of them for training."""
+        """Write a single object instead of a still life; eight of the views are for training."""
         format: str = "transforms"
         """Format of --object: transforms (transforms.json with RGBA images) or colmap (RGB images with cut-out masks)."""
 

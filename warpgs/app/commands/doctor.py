@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
     @dataclass(frozen=True)
     class Doctor:
         warm: bool = False
-        """Compile all kernels of a fit for this machine's devices, and skip the checks."""
+        """Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks."""
         repeat: Path | None = None
         """File not_finite.safetensors of a run: repeat the saved step, name the non-finite values, and skip the checks."""
         device: str = "auto"

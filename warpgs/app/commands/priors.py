@@ -56,7 +56,7 @@ def _show(arguments: list[str]) -> int:
         threads: int = 0
         """CPU threads of the networks; 0 for as many as there are cores."""
         source: str = "sweep"
-        """Method of depth estimation without a network: sweep or flow, as --init.source of a fit."""
+        """Method of depth estimation without a network: sweep or flow, as for --init.source of a fit."""
         priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
 
     a = parse_flags(Show, arguments, "warpgs priors show", "write depth and saliency of each training view as images")

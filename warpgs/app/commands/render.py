@@ -21,7 +21,7 @@ def run(arguments: list[str], about: str) -> int:
         run: tyro.conf.Positional[Path]
         """Run folder of `warpgs fit`, or a file of Gaussians from any program, in a format of `warpgs convert`."""
         cameras: Path | None = None
-        """Cameras for a file of Gaussians: cameras.json, transforms.json, COLMAP's folder, or a scene."""
+        """Cameras for a file of Gaussians: cameras.json, transforms.json, a COLMAP folder, or a scene."""
         rule: str | None = None
         """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
@@ -32,7 +32,7 @@ def run(arguments: list[str], about: str) -> int:
         (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
         """Folder for the images and film.mp4; or only a film: .mp4, .webm, .webp or .gif. Existing files are replaced.
-        Default: RUN/path-PATH."""
+        Default: path-PATH in the run folder, or beside the file."""
         seconds: float | None = None
         """Duration of the film [s]. Default: chosen by the path."""
         fps: int = 30

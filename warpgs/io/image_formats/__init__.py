@@ -1,5 +1,5 @@
 """Formats of image files: `size` reads the header, and `check`, or `decode` of JPEG, checks that the file is complete.
 
-OpenCV decodes damaged files as far as it can, and at most prints a warning. So files are checked first. Both functions take the
-bytes of a file and raise a ValueError whose text is the reason, as part of a sentence.
+OpenCV decodes damaged files as far as it can, and at most prints a warning. So files are checked first. The functions take the
+bytes of a file, and raise a ValueError with the reason as part of a sentence.
 """

@@ -63,7 +63,7 @@ def decode(data: bytes) -> np.ndarray:
     """Return the pixels, uint8, BGR or BGRA, shape [H, W, 3 or 4].
 
     Raises:
-        ValueError: The file is damaged, as far as the decoder sees it.
+        ValueError: The decoder finds damage.
     """
     with open_image(data) as image:
         try:
