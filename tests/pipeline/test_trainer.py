@@ -236,11 +236,13 @@ def test_no_training_view_is_an_error():
 
 
 def test_config_survives_json():
-    """What a run folder stores gives the same configuration back; a foreign field is refused."""
+    """What a run folder stores gives the same configuration back; an unknown field is refused."""
     stored = json.loads(json.dumps(BUSY.to_json()))
     assert FitConfig.from_json(stored) == BUSY and FitConfig.from_json(stored).fingerprint() == BUSY.fingerprint()
     with pytest.raises(UsageError, match="another version"):
         FitConfig.from_json({**stored, "bogus": 1})
+    earlier = {**stored, "loss": stored["loss"] | {"exposure_weight": 0.01}}  # a setting without effect, since removed
+    assert FitConfig.from_json(earlier) == BUSY
     assert all(isinstance(p, FitConfig) and p.preset == name for name, p in PRESETS.items())
 
 

@@ -79,7 +79,7 @@ def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: i
 
     Views too near for depth are skipped: with the weight of their angles, the shared fraction is less than half. If none is
     left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
-    most at the best angles gave fewer depths, and fits were 0.1 to 0.3 dB worse (docs/decisions/013-any-capture.md).
+    most at the best angles gave fewer depths, and mostly lower PSNR (docs/decisions/013-any-capture.md).
 
     Args:
         sight: What pairs of views share.

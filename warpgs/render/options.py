@@ -53,7 +53,7 @@ class RasterizeOptions:
     feature_background: torch.Tensor | None = None
     """Background of the features, shape [D] or [C, D]; None for zeros. Differentiable."""
     tile_size: int = 16
-    """Side of a tile [px]: 8 or 16. The image does not depend on it."""
+    """Side of a tile [px]: 8 or 16. Images depend on the side only with rule `inria`."""
     contributions: bool = False
     """True to also return sum and maximum of each Gaussian's blending weight."""
     median_depth: bool = False

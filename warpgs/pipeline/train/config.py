@@ -169,6 +169,8 @@ class FitConfig:
             values = dict(values)
             parts = {n: tuple(_part(registry, dict(p), n) for p in values.pop(n)) for n, registry in _PARTS.items()}
             own = values.pop("strategy_config")
+            if isinstance(loss := values["loss"], dict):
+                values["loss"] = {n: v for n, v in loss.items() if n != "exposure_weight"}  # stored earlier, without effect
             kind = find_strategy(values["strategy"]).Config
             if own is not None and kind is None:
                 raise SchemaError(f"strategy_config must be null for strategy {values['strategy']}")

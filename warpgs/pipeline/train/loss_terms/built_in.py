@@ -24,7 +24,6 @@ class LossConfig:
     alpha_weight: float = 1.0
     """Weight of the mean absolute difference of rendered and given opacity, for views with an alpha channel, in [0, 1000]; 0 to
     disable."""
-
     smooth_weight: float | None = 0.0
     """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: by the
     number of views."""
@@ -34,11 +33,8 @@ class LossConfig:
     """Weight of 1 - cos of the angle between given normals and normals of rendered depth, for views with given normals, in [0,
     1000]; 0 to disable."""
 
-    exposure_weight: float = 0.01
-    """No effect, in [0, 1000]: the weight of the view module exposure is --exposure.weight."""
-
     def __post_init__(self) -> None:
-        for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight", "exposure_weight"):
+        for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight"):
             if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
                 raise UsageError(f"loss: `{name.replace('_', '-')}` must be between 0 and 1000, not {getattr(self, name)}")
         if not 0 <= self.ssim_weight <= 1:
