@@ -72,7 +72,7 @@ def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor
 def surface_depth(
     gaussians: Gaussians, camera: Camera, ids: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the median depth of each pixel's Gaussians, and the fraction of their weights within `BAND` of that.
+    """Return the median depth of each pixel's Gaussians, and the fraction of their weights within `BAND` of that depth.
 
     Args:
         gaussians: N Gaussians in the units of the camera.

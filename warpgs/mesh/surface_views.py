@@ -35,7 +35,7 @@ class SurfaceView:
     camera: Camera
     """Pinhole camera, arrays of numpy."""
     depth: torch.Tensor
-    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where it is uncertain."""
+    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where the depth is uncertain."""
     weights: torch.Tensor
     """Trust in each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times the opacity of a surface."""
     image: torch.Tensor

@@ -75,7 +75,7 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     if not (fx and fy):
         raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
     if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
-        raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide it by its [2, 2]")
+        raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide K by K[2, 2]")
     if max(abs(skew), abs(below)) > K_TOLERANCE:
         raise ValueError(
             f"{where} has a skew of {skew or below:g} px, which is not supported: K must be [[fx, 0, cx], [0, fy, cy], "

@@ -42,7 +42,7 @@ class RasterizeOptions:
     sh_degree: int | None = None
     """Spherical-harmonics degree to use; None for the stored degree."""
     background: torch.Tensor | None = None
-    """Background colour, shape [3] or [C, 3], with ``colors`` [D] or [C, D]; None for black. Differentiable."""
+    """Background colour, shape [3] or [C, 3]; if ``colors`` has D channels, [D] or [C, D]. None for black. Differentiable."""
     colors: torch.Tensor | None = None
     """Colours that replace the spherical harmonics, shape [N, D], or [C, N, D] for different ones per camera. Any number of
     channels D and finite values of any sign and size are allowed; they are never clamped. `Render.rgb` then has D channels.

@@ -125,7 +125,7 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
 
 
 def _system_memory() -> Memory | None:
-    """Return what psutil finds; its source differs between systems, and access to any of them may be denied."""
+    """Return what psutil finds; None where psutil is missing or the system denies access."""
     try:
         import psutil
 

@@ -116,7 +116,7 @@ def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
 
 
 def is_loopback(address: str) -> bool:
-    """Return whether an address of a socket is one that only this machine reaches."""
+    """Return whether only this machine can reach a socket's address."""
     found = ipaddress.ip_address(address.partition("%")[0])
     return (getattr(found, "ipv4_mapped", None) or found).is_loopback
 
