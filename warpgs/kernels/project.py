@@ -193,7 +193,7 @@ def project(
         window: Left, top, width and height [px] of the part of the image to render; left and top are multiples of
             ``tile_size``. None for the whole image. Gaussians that touch no tile of this part are culled.
         camera_model: Name of the camera model (`warpgs.kernels.cameras`).
-        distortion: Coefficients of the camera model, shape [C, P]; None for a model without. Not differentiable.
+        distortion: Coefficients of the camera model, shape [C, P]; None if it has no coefficients. Not differentiable.
 
     Returns:
         ``projected`` [C, N, 12], with the layout of `PROJECTED_SIZE`, and ``tile_counts`` [C, N] int32, the number of

@@ -200,7 +200,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
 
 def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: EpipolarConfig) -> ViewDepth:
-    """Return the depth of one view by flow to its nearest others.
+    """Return the depth of one view by flow to its nearest other views.
 
     Args:
         views: All views.

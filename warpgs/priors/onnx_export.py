@@ -43,7 +43,7 @@ def onnx_bytes(
     Args:
         network: The network, ready for inference.
         image: An input, shape [1, 3, h, w].
-        outputs: Names of its outputs.
+        outputs: Names of the network's outputs.
         sizes: Sizes that axes of the image may have, by axis; None if only the sizes of ``image`` are allowed.
 
     Raises:

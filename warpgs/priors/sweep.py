@@ -2,7 +2,7 @@
 
 Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996). The method
 is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a parabola between planes.
-Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares it with optical flow.
+Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares sweeps with optical flow.
 """
 
 from __future__ import annotations

@@ -18,8 +18,8 @@ NOISE = (2 / 255) ** 2
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
 UNIT = 4096
-"""Cost 1 in the 16-bit integers of cost volumes: they need half the memory of float32, and first access to memory takes as long
-as the computation."""
+"""Integer that stands for cost 1 in cost volumes of 16 bits. These need half the memory of float32, and the first access to
+memory takes as long as the computation."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
 PLANES_AT_ONCE = 16
@@ -38,7 +38,7 @@ class SweepConfig:
     window: int = 7
     """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
     spacing: float = 0.5
-    """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
+    """Largest step of a match from one plane to the next [px], if `max_planes` allows it."""
     max_planes: int = 256
     """Largest number of planes, at least 8; memory is about 5 bytes per pixel and plane."""
     max_pixels: int = 200_000
@@ -67,7 +67,7 @@ class SweepConfig:
 
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
+    """Project pixels [N, 2] at inverse depths [N] [1/u] into the second image: positions [px], shape [N, 2]; NaN behind it."""
     check_pinhole(first)
     check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)

@@ -84,7 +84,7 @@ class PriorConfig:
             raise UsageError("--depth-output requires --depth-model; add it, or leave --depth-output out")
 
     def flags(self, kind: str) -> dict:
-        """Return the flags of the input of a network, ``kind`` depth or segmentation, keyed by the rest of their names."""
+        """Return the input flags of a network by name without prefix; ``kind`` is depth or segmentation."""
         return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
 
 
@@ -221,7 +221,8 @@ def view_priors(
         config: Networks and their inputs.
         depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
             only if no depth network is given.
-        regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
+        regions: For each view the pixels that show its object, bool [H, W], or None; they replace saliency, or a foreground
+            that the network does not find.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps the maps of networks; no map is kept if the folder is None or ``config.cache`` is False.
         tell: Called with a line for each view.

@@ -188,10 +188,7 @@ _SORTING = threading.RLock()
 
 @contextlib.contextmanager
 def stream_of(device: torch.device):
-    """Run Warp's own work (sorts, scans) on torch's current stream of that device; does nothing on a CPU.
-
-    Kernels started with `launch` need no such context.
-    """
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; `launch` does that itself."""
     if device.type != "cuda":
         yield
         return
@@ -214,9 +211,8 @@ def _copied(struct):
 class _Recorded:
     """A kernel with a launch that is recorded once; later calls only replace its arguments.
 
-    ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
-    here take, and at 140 us on a CPU of 2.6 GHz. The recorded launch keeps the packed arguments; a call writes pointers, sizes
-    and scalars into them.
+    ``wp.launch`` packs and checks every argument anew. That took 47 us on an H200's host and 140 us on a CPU of 2.6 GHz. The
+    recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
     """
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
@@ -281,7 +277,7 @@ def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
 
 
 class _OfThread(threading.local):
-    """Recorded launches on the CPU, for each thread and kernel: two threads may launch a kernel at once with other arguments."""
+    """Recorded launches on the CPU by thread and kernel: two threads may launch a kernel at once, with different arguments."""
 
     def __init__(self):
         self.recorded: dict[object, _Recorded] = {}

@@ -85,7 +85,7 @@ class RankWatch:
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
-        """Return the text ``own`` of each process, once all have called this; if a rank is lost, the thread ends this process."""
+        """Return the text ``own`` of each process, once all called this; if a rank is lost, the thread ends this process."""
         names = [f"text/{r}" for r in range(self.count)]
         self.store.set(names[self.rank], own)
         while not self.store.check(names):

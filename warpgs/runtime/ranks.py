@@ -200,7 +200,7 @@ def join(device: str) -> Ranks:
 
 
 def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool) -> dist.Store:
-    """Return a connection to the store of all ranks; ``home`` is the result of `_stay_home`, ``hosts`` True to hold the store."""
+    """Connect to the store of all ranks; this process holds it if ``hosts``. ``home`` is the result of `_stay_home`."""
     import torch.distributed as dist
 
     own = {}

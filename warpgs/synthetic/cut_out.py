@@ -166,7 +166,7 @@ def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
         height: Image height [px].
 
     Returns:
-        The cameras in the order of the ring; a sphere of radius `REACH` around the origin nearly fills their shorter side.
+        The cameras in the order of the ring; a sphere of radius `REACH` around the origin nearly fills the shorter image side.
     """
     focal = 0.48 * min(width, height) / np.tan(np.arcsin(REACH / DISTANCE))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])

@@ -1,7 +1,7 @@
 """The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
 
 Six images suffice to reconstruct it: everything is smooth and matte, and the training views surround the held-out ones. But
-training images cannot be copied: between neighbouring views the pattern moves by more than half its period, so neither a
+copies of training images do not help: between neighbouring views the pattern moves by more than half its period, so neither a
 training image nor a mean of training images resembles a held-out view pixel by pixel.
 """
 
