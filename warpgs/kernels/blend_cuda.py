@@ -225,7 +225,7 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk: more for larger images. If sums have no fixed order, the fewest are at least CHUNKS[1]."""
+    """Return the instances per chunk: more for larger images, and at least CHUNKS[1] if sums have no fixed order."""
     larger = sum(tiles > most for most in MAX_TILES)
     return CHUNKS[larger if deterministic else max(larger, 1)]
 

@@ -136,7 +136,7 @@ def median_depth(
         origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
-        z-depth of the Gaussian's mean [u], 0 where alpha is below 1/2, shape [C, H, W].
+        Depth of the Gaussian's mean [u] (z; the distance for a fisheye), 0 where alpha is below 1/2, shape [C, H, W].
 
     Raises:
         TypeError: The scalar type is neither float32 nor float64.

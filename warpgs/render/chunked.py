@@ -144,7 +144,7 @@ def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: P
         inputs: The tensors that ``projected`` was projected from.
 
     Returns:
-        z-depth [u], 0 where alpha is below 1/2, shape [C, H, W].
+        Depth [u], 0 where alpha is below 1/2, shape [C, H, W].
     """
     _, _, width, height = frame.settings.window
     depths = projected.new_empty(len(projected), height, width)

@@ -25,7 +25,7 @@ from warpgs.runtime import interop
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
+"""Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected depth [C, H, W]."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def weights_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) 
 
 
 def median_depth_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> torch.Tensor:
-    """Return the z-depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
+    """Return the depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
     return median_depth(projected, tiles, **settings.of_window())
 
 

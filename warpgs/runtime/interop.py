@@ -188,7 +188,10 @@ _SORTING = threading.RLock()
 
 @contextlib.contextmanager
 def stream_of(device: torch.device):
-    """Run Warp's own work (sorts, scans) on torch's current stream of that device; `launch` does that itself."""
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; do nothing on a CPU.
+
+    Kernels started with `launch` need no such context.
+    """
     if device.type != "cuda":
         yield
         return
