@@ -47,7 +47,7 @@ def find_format(choice: str | type[Format] | Format) -> Format:
 
 
 def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format | None = None) -> Format:
-    """Return the format of a file: the given one, else that of its suffix.
+    """Return the given format, or else the format of the file's suffix.
 
     Raises:
         UsageError: No format has the suffix, or the given format has another suffix.

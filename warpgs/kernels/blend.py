@@ -273,7 +273,7 @@ def check_slots(tiles: Tiles) -> None:
         ValueError: The instances have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
-        raise ValueError("gradients and contributions need tiles with slots: make the tiles by bin_tiles(slotted=True)")
+        raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")
 
 
 def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -287,8 +287,8 @@ def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
         raise ValueError(
-            f"tiles were made for another image: {len(tiles.ranges)} tiles, but {sizes['C']} images of {width} x {height} px "
-            f"have {sizes['C'] * columns * rows} of {tiles.size} px"
+            f"tiles were made for another image: found {len(tiles.ranges)} tiles, but {sizes['C']} images of {width} x "
+            f"{height} px have {sizes['C'] * columns * rows} tiles of {tiles.size} px"
         )
 
 

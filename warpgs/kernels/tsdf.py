@@ -251,7 +251,7 @@ def gather_colors(
     points: torch.Tensor, tolerance: float, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
     image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Add to each point the colour that one view sees there, in place, where the point lies on the surface that the view sees.
+    """Add the colours that one view sees to the points that lie on the surface that the view sees, in place.
 
     Args:
         points: Positions [u], shape [N, 3].

@@ -14,7 +14,7 @@ from warpgs.scene import Camera, Gaussians
 CONTRIBUTORS = 32
 """Number of heaviest Gaussians of a pixel that are used."""
 BAND = 0.02
-"""Largest difference from the median depth, as a fraction of it, that counts as the same surface."""
+"""Largest difference from the median depth, as a fraction of the median, that counts as the same surface."""
 MIN_SHARE = 0.5
 """Smallest fraction of the weights within `BAND` of the median for which a pixel shows a surface
 (docs/decisions/027-mesh-depth.md)."""

@@ -46,7 +46,7 @@ class SweepConfig:
     small_step: float = 0.03
     """Penalty for a depth one plane off the neighbouring pixel's (P1); costs are in [0, 1]."""
     large_step: float = 0.5
-    """Penalty for any other depth (P2) where the image is even; less across the image's edges, but at least 1.5 P1."""
+    """Penalty for any other depth (P2) where the image is uniform; less across the image's edges, but at least 1.5 P1."""
     max_round_trip: float = 0.6
     """Largest error [px] of a round trip of a pixel through another view and back by that view's depth."""
     min_parallax: float = 0.5
@@ -56,13 +56,17 @@ class SweepConfig:
         if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
             raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
         if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
-            raise UsageError("sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2")
+            raise UsageError(
+                "sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2; found "
+                f"{self.max_planes}, {self.near_count}, {self.max_pixels}, {self.max_views}"
+            )
         for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
         if not max(self.large_step, 1.5 * self.small_step) <= MAX_LARGE_STEP:
             raise UsageError(
-                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}; the largest cost is 1"
+                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}, not {self.large_step} and "
+                f"{1.5 * self.small_step:g}"
             )
 
 

@@ -255,7 +255,7 @@ class Recorder:
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the current calls; None before there were enough of them."""
+        """Rasterizer of the current calls; None before there were enough equal calls."""
         self.min_calls = MIN_CALLS
         """Number of equal calls in a row before kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False

@@ -53,7 +53,7 @@ class RasterizeOptions:
     feature_background: torch.Tensor | None = None
     """Background of the features, shape [D] or [C, D]; None for zeros. Differentiable."""
     tile_size: int = 16
-    """Side of a tile [px]: 8 or 16. The image does not depend on it."""
+    """Side of a tile [px]: 8 or 16. The image depends on it only under rules with ``square_sigma``, such as inria."""
     contributions: bool = False
     """True to also return sum and maximum of each Gaussian's blending weight."""
     median_depth: bool = False
@@ -86,9 +86,9 @@ class RasterizeOptions:
     must be multiples of ``tile_size`` or edges of the image. None for the whole image."""
     pixels: torch.Tensor | None = None
     """Pixels to render instead of an image: integers (column, row), shape [P, 2], or [C, P, 2] for different ones per camera.
-    Images of `Render` then have P instead of H, W. Their values equal those of the whole image bit for bit, with gradients.
-    Only tiles with a listed pixel are blended. Not with ``window``, ``contributions`` or ``capacity``. None for the whole
-    image."""
+    Images of `Render` then have P instead of H, W. Their values equal the whole image's values at these pixels, bit for bit.
+    Differentiable. Only tiles with a listed pixel are blended. Not with ``window``, ``contributions`` or ``capacity``. None for
+    the whole image."""
     max_instances: int | None = None
     """Largest number of (Gaussian, tile) instances at a time. An image with more is rendered in chunks, and each chunk again
     for its gradients. This gives the same image with less memory and more time. None for no limit. Not with ``capacity``."""

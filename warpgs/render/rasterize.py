@@ -72,7 +72,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
     if options.heaviest < 0:
-        raise UsageError(f"heaviest must be at least 0, not {options.heaviest}")
+        raise UsageError(f"RasterizeOptions.heaviest must be at least 0, not {options.heaviest}")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError(
             "max_instances must be at least 1, and cannot be combined with capacity; found "
@@ -100,7 +100,7 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             listed = isinstance(given, (list, tuple))
-            order = "lists require a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
+            order = f"a list of {name} requires a list of cameras" if listed else "call rasterize(gaussians, camera, options)"
             wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be an instance of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:

@@ -66,6 +66,6 @@ def select_rule(
         else:
             return rule, error
     raise UsageError(
-        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, float32 rounding alone gives {error:.1e}; "
-        "raise max_error, or render float64 tensors"
+        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}; raise "
+        "max_error, or give the Gaussians as float64"
     )
