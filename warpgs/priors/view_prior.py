@@ -44,7 +44,7 @@ class PriorConfig:
     depth_guides: bool = False
     """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
     depth_size: int = 0
-    """Shorter side of the depth network's input [px], unless the file fixes it; 0 for the value of FILE.onnx.json, else 384."""
+    """Shorter input side of the depth network [px], unless the file fixes it; 0 for FILE.onnx.json's value, else 384."""
     depth_multiple: int = 0
     """Divisor of both sides of the depth network's input [px]; 0 for the value of FILE.onnx.json, else 32.
     Depth Anything needs 14."""
@@ -55,7 +55,7 @@ class PriorConfig:
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
     segmentation_size: int = 0
-    """Shorter side of the segmentation network's input [px], unless the file fixes it; 0 for the value of FILE.onnx.json, else 512."""
+    """Shorter input side of the segmentation network [px], unless the file fixes it; 0 for FILE.onnx.json's value, else 512."""
     segmentation_multiple: int = 0
     """Divisor of both sides of the segmentation network's input [px]; 0 for the value of FILE.onnx.json, else 32."""
     segmentation_mean: Colors | None = None
