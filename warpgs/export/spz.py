@@ -60,7 +60,7 @@ def fractional_bits(means: np.ndarray) -> int:
     """Return the number of fractional bits, at most 24, at which all coordinates [N, 3] just fit into 24 signed bits.
 
     Raises:
-        DataError: A coordinate is beyond 2^23, which the format cannot hold.
+        DataError: A coordinate is beyond 2^23 - 1, which the format cannot hold.
     """
     largest = float(np.abs(means).max(initial=0))
     bits = MAX_FRACTIONAL_BITS

@@ -217,8 +217,8 @@ def composite_gradients(
         settings: Settings as given to `composite`.
         saved: Results of `composite` without ``alpha``. Only the channels of ``rgb`` that ``v_images`` has are read.
         v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. That of
-            ``rgb`` may be a slice of channels of an image. On CUDA in float32 it may have fewer than D channels; the others
-            have gradient 0.
+            ``rgb`` may be a slice of channels of an image. On CUDA in float32 it may have fewer than D channels; the other
+            channels have gradient 0.
         allocator: Provider of the gradient's memory.
     """
     v_rgb, v_alpha, v_depth = v_images
@@ -329,7 +329,7 @@ def blend(
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device is wrong, the tiles belong to another image size, or gradients need slots that they lack.
+        ValueError: A shape or device is wrong, or the tiles belong to another image size or lack the slots for gradients.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
     settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)

@@ -85,7 +85,7 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
 
 
 def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
-    """Return how far the points of a map [H, W] are from another view's surface in depth, as a fraction of depth, [H, W].
+    """Return the distance in depth of a map's points to another view's surface, as a fraction of depth, shape [H, W].
 
     A point is compared with the nearest of the four depths around its projection, since depth varies within a pixel on a
     slanted surface. The result is infinite where the pixel has no depth, outside of the other image, and where all four depths

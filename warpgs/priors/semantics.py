@@ -171,8 +171,8 @@ def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] =
 def knows_foreground(maps: SemanticMaps) -> bool:
     """Return whether the maps separate an object from its background.
 
-    They do not if the mean foreground is below 1 % (tabletop scans hold no VOC class), or if the maps have no boundary and the
-    mean foreground is below a half.
+    They do not if the mean foreground is below 1 % (tabletop scans hold no VOC class). They also do not if there is no boundary
+    and the mean foreground is below a half.
     """
     mean = float(maps.foreground.mean())
     return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)

@@ -71,7 +71,7 @@ class SweepConfig:
 
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Project pixels [N, 2] at inverse depths [N] [1/u] into the second image: positions [px], shape [N, 2]; NaN behind it."""
+    """Project pixels [N, 2] at inverse depths [1/u] [N] into the second image; return positions [px] [N, 2], NaN if behind."""
     check_pinhole(first)
     check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)

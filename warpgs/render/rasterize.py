@@ -227,7 +227,8 @@ def rasterize(
         gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
             covariances and opacities (`CovarianceGaussians`).
         camera: One camera ([4, 4], [3, 3]), or a batch of C cameras with one image size ([C, 4, 4], [C, 3, 3]). Or a list of
-            cameras and batches, of any image sizes; then ``gaussians`` and ``options`` may be lists of the same length.
+            cameras and batches, of any image sizes; then ``gaussians`` and ``options`` are lists of the same length, or single
+            values for all cameras.
         options: Options.
 
     Returns:

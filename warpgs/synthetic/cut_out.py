@@ -62,7 +62,7 @@ def _rod(a: np.ndarray, b: np.ndarray, size: float, texture: raycast.Texture) ->
 
 
 def _body(rng: np.random.Generator, surface: Surface) -> raycast.Shape:
-    """Return the bulky shape in the middle: a ball, a box or a drum within 0.55 u of the vertical axis."""
+    """Return the bulky shape in the middle: a ball, a box or a drum within 0.71 u of the vertical axis."""
     size, turn = rng.uniform(0.4, 0.5), rng.uniform(0, TAU)
     kind = rng.integers(3)
     if kind == 0:
