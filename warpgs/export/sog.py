@@ -322,7 +322,7 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
 
 
 def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarray:
-    """Return the labels of the Gaussians from number ``first`` on; DataError if one is not below ``count``."""
+    """Return the labels of the Gaussians from number ``first`` on; DataError if a label is not below ``count``."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
         raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")

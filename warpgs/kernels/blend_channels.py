@@ -51,7 +51,7 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
 
 @functools.cache
 def make_kernels(real, width: int):
-    """Make the kernels that give Gaussians the channels of a pass, ``width`` of them, and split the gradient again."""
+    """Make two kernels: one gives Gaussians the ``width`` channels of a pass, the other splits the pass's gradient again."""
     module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
     geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
     own, rest = wp.constant(width), wp.constant(GEOMETRY + width)

@@ -1,7 +1,7 @@
 """Median depth of binned Gaussians: where the transmittance of a pixel falls to one half.
 
-This is a separate pass, so that `blend` does not become slower. For a tile, it ends as soon as each pixel is half covered. It
-computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at one half.
+This is a separate pass, so that `blend` does not become slower. The pass over a tile ends as soon as each pixel is half
+covered. It computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at one half.
 """
 
 import functools

@@ -132,7 +132,7 @@ def check_round_trip(
         own: Inverse depths of the view [1/u], float64, shape [H, W].
         found: Inverse depths of the other view [1/u], float64, at its size.
         sensitivity: Change of depth per pixel [u/px], float64, contiguous, shape [H, W]; lowered in place where this pair of
-            views has a smaller one.
+            views has a smaller value.
         most: Largest distance [px] between the pixel and the end of the round trip.
         min_parallax: Smallest angle between the two rays [deg].
 

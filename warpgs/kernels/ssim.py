@@ -253,7 +253,7 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         target: Colours of the image to compare with, shape [H, W, 3] or [B, H, W, 3]; no gradient.
 
     Returns:
-        The two sums, shape [2]. The gradient of |image - target| is 0 where they are equal.
+        The two sums, shape [2]. The gradient of |image - target| is 0 where both are equal.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

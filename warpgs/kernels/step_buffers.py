@@ -31,7 +31,7 @@ class Setting(IntEnum):
     GREEN = 4
     BLUE = 5
     STEP = 6
-    """Number of the step, for all its views; an integer from 1, below 2^24."""
+    """Number of the step, the same for all views of a step; an integer from 1, below 2^24."""
 
     @classmethod
     def row(

@@ -50,7 +50,7 @@ class Tiles:
     tile_ids: torch.Tensor
     """Tile of each instance, int32, shape [M]; C * tiles for an entry that belongs to no tile."""
     total: torch.Tensor
-    """M, int64, shape [1], where kernels can read it."""
+    """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
 

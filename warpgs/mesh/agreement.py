@@ -1,4 +1,4 @@
-"""Agreement of views on depth: a mesh omits depths that no other view confirms, unless no other view sees a surface there.
+"""Agreement of views on depth: a mesh omits a depth if other views see a surface there, but none of them at this depth.
 
 A fit of few views constrains depth only where two views look. If only one view sees a surface, such as beside an occluding
 edge, the surface's depth is unconstrained.
@@ -19,7 +19,7 @@ from warpgs.priors.view_choice import matching_views, shared_sight
 from warpgs.scene import Camera
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth, as for coverage (decision 019)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth; coverage has the same limit (decision 019)."""
 NEIGHBOURS = 16
 """Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
 MAX_PIXELS = 2**26
@@ -30,7 +30,7 @@ BOUNDS = (0.02, 0.98)
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of one view, kept while others are compared with it."""
+    """Depth of one view, kept to compare other views with."""
 
     camera: Camera
     """Pinhole camera of the whole image, arrays of numpy."""

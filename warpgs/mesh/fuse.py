@@ -63,7 +63,7 @@ class FusedMesh:
     mesh: Mesh
     """The mesh, in the units of the cameras."""
     plan: GridPlan
-    """Grid that it was made with."""
+    """Grid that the mesh was made with."""
     unseen: float
     """Fraction of the grid points that no view saw."""
     extracted: int

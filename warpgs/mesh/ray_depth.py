@@ -1,7 +1,7 @@
 """Depth of a surface along each ray: where the Gaussians of a pixel are densest, and the fraction of their weight there.
 
-The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. So here the depth of a
-Gaussian is that at which its density along the ray is largest.
+The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. Here, a Gaussian's depth is
+where its density along the ray is largest.
 """
 
 from __future__ import annotations

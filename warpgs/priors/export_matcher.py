@@ -75,7 +75,7 @@ def package_files() -> dict[str, bytes]:
 
 
 def _backbone() -> torch.nn.Module:
-    """Return XFeat's network: an image [1, 3, h, w] to descriptors, logits of keypoints and reliability, one for each cell."""
+    """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
     import torch
 
     files = package_files()

@@ -38,7 +38,7 @@ def folder_for_files() -> Iterator[Path]:
 def onnx_bytes(
     network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
 ) -> bytes:
-    """Return a network that takes one image as the bytes of an ONNX file.
+    """Return the bytes of an ONNX file for a network that takes one image.
 
     Args:
         network: The network, ready for inference.

@@ -54,7 +54,7 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
     """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
 
-    An output that already sums to one is taken for probabilities. Any other output is taken for logits, which are resized
+    An output that already sums to one is treated as probabilities. Any other output is treated as logits, which are resized
     before the softmax.
 
     Returns:

@@ -99,7 +99,7 @@ def _stretch_of(matrix: list[list[float]]) -> float:
 
 
 def _check_pose(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the pose is not rigid; it may mirror, since the mirrored image is right."""
+    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
     _check_finite(matrix, where)
     p, q, r, s = matrix[3]
     if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:

@@ -45,7 +45,7 @@ class RasterizeOptions:
     """Background colour, shape [3] or [C, 3]; if ``colors`` has D channels, [D] or [C, D]. None for black. Differentiable."""
     colors: torch.Tensor | None = None
     """Colours that replace the spherical harmonics, shape [N, D], or [C, N, D] for different ones per camera. Any number of
-    channels D and finite values of any sign and size are allowed; they are never clamped. `Render.rgb` then has D channels.
+    channels D and finite values of any sign and size are allowed; values are never clamped. `Render.rgb` then has D channels.
     Differentiable; ``sh`` has no gradient then. None for the spherical harmonics."""
     features: torch.Tensor | None = None
     """Channels to render besides the colours, shape [N, D] or [C, N, D], with any values as in ``colors``. `Render.features`
@@ -75,7 +75,7 @@ class RasterizeOptions:
     antialiased: bool = False
     """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting. It removes
     the brightness that widening by ``Rule.low_pass`` adds to Gaussians smaller than a pixel. Use it for models trained with
-    it."""
+    antialiasing."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None

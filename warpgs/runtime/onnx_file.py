@@ -24,7 +24,7 @@ ATTRIBUTE_TENSORS, ATTRIBUTE_GRAPHS, ATTRIBUTE_SPARSE = (5, 10), (6, 11), (22, 2
 SPARSE_TENSORS = (1, 2)
 TENSOR_NAME, TENSOR_EXTERNAL, TENSOR_LOCATION = 8, 13, 14
 MAX_FIELD = 2**29 - 1
-"""Largest field number of protobuf; its parser drops the higher bits, so that a larger one would stand for another field."""
+"""Largest field number of protobuf; its parser drops the higher bits, so that a larger number would stand for another field."""
 
 Message = list[tuple[int, "int | memoryview"]]
 

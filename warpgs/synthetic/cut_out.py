@@ -50,7 +50,7 @@ def _frame(axis: np.ndarray, near: tuple[float, float, float] = (0.31, 0.23, 0.9
 
 
 def _around(angle: float, radius: float, z: float) -> np.ndarray:
-    """Return the point [3] at an angle [rad] around the vertical axis, ``radius`` [u] off it, ``z`` [u] high."""
+    """Return the point [3] at an angle [rad] around the vertical axis, at distance ``radius`` [u] and height ``z`` [u]."""
     return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
 
 

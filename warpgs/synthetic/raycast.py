@@ -38,7 +38,7 @@ class Texture:
     phases: np.ndarray
     """Phases [rad]: the three of the checker, then one for every wave, shape [3 + W]."""
     softness: float = 2.8
-    """Gain before the tanh that rounds the checker's edges: a larger one makes crisper edges."""
+    """Gain before the tanh that rounds the checker's edges: a larger gain makes crisper edges."""
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
         """Return the albedo at local positions.
