@@ -199,7 +199,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
     inputs = session.get_inputs()
     if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
         shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)
-        raise DataError(f"{path}: the inputs are {shapes}; export a flow network with two inputs, images [1, 3, h, w]")
+        raise DataError(f"{path}: the inputs are {shapes}, but a flow network takes two images [1, 3, h, w]; export it again")
     factor, offset = RANGES[value_range]
     fixed = [n if isinstance(n, int) else 0 for n in inputs[0].shape[2:]]
 

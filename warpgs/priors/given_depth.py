@@ -91,7 +91,8 @@ def check_given(views: Sequence[View]) -> None:
             low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
             if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
                 raise UsageError(
-                    f"view {v.name}: the map of {name} holds non-finite or out-of-range values; use 0 for missing values"
+                    f"view {v.name}: the map of {name} holds values that are non-finite or out of range; use 0 for missing "
+                    "values"
                 )
         if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
             raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")
