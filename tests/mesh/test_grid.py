@@ -64,7 +64,7 @@ def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
     monkeypatch.setattr(grid, "available_bytes", lambda _: 3 * 10**9)
     assert check_memory(plan, CPU) == "2.0 GiB"
     monkeypatch.setattr(grid, "available_bytes", lambda _: 2 * 10**9)
-    with pytest.raises(ResourceError, match=r"2\.0 GiB of memory on cpu, where 1\.9 GiB are free; give a larger --voxel"):
+    with pytest.raises(ResourceError, match=r"2\.0 GiB of memory on cpu, more than 80 % of the free 1\.9 GiB; give a larger"):
         check_memory(plan, CPU)
     monkeypatch.setattr(grid, "available_bytes", lambda _: 10**15)
     with pytest.raises(ResourceError, match="kernels can index"):

@@ -113,8 +113,8 @@ def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         quats: Rotations [N, 4], components in any order.
 
     Returns:
-        Index of the largest component, int64 [N], and the others in their order [N, 3], each within 1/sqrt(2), with the sign
-        for which the largest is positive.
+        Index of the largest component, int64 [N], and the other components in their order [N, 3]. Each is at most 1/sqrt(2) in
+        magnitude. The sign of the quaternion is chosen so that the largest component is positive.
     """
     q = unit_quats(quats)
     largest = np.abs(q).argmax(axis=1)

@@ -35,7 +35,7 @@ unknown methods as NotImplementedError, and seeks before the start as OSError.""
 
 
 class Format:
-    """A file format of Gaussians. To write one, derive a class that defines `encode`, `decode` or both."""
+    """A file format of Gaussians. To add a format, derive a class that defines `encode`, `decode` or both."""
 
     name: ClassVar[str] = ""
     """Name in the registry."""
@@ -54,7 +54,7 @@ class Format:
     max_degree: ClassVar[int] = 3
     """Highest degree of spherical harmonics that the format supports."""
     note: ClassVar[str] = ""
-    """Note for users on its axes, if programs disagree on them."""
+    """Note for users on the format's axes, if programs disagree on the axes."""
     declares: ClassVar[bool] = False
     """True if a file can declare that its Gaussians are antialiased (`RasterizeOptions.antialiased`)."""
 
@@ -118,7 +118,7 @@ class Format:
         elif gaussians.sh_degree > self.max_degree:
             raise DataError(
                 f"{path}: not written, {self.suffix} files hold harmonics up to degree {self.max_degree}, not "
-                f"{gaussians.sh_degree}. Drop those above with --sh-degree {self.max_degree}, in Python with "
+                f"{gaussians.sh_degree}. Drop higher degrees with --sh-degree {self.max_degree}, in Python with "
                 f"sh[:, :{(self.max_degree + 1) ** 2}], or write .ply"
             )
         write_bytes(path, *self.encode(arrays))

@@ -17,7 +17,7 @@ from warpgs.scene import Camera
 NAMES = ("cameras.json", "transforms.json", "sparse")
 """Names of files, and of a folder, that determine the format."""
 MAX_OFF_CENTER = 0.01
-"""Distance of the principal point from the image centre [px] above which a note reports that the file drops it."""
+"""Distance from the image centre [px] above which a note reports that the file does not store the principal point."""
 
 
 def holds_cameras(path: Path) -> bool:

@@ -1,8 +1,8 @@
 """The compressed PLY of PlayCanvas and SuperSplat: 16 bytes a Gaussian, and one more byte per harmonic and channel.
 
-Chunks of 256 Gaussians share the bounds between which positions (11, 10, 11 bits), log scales (11, 10, 11) and colours (8 each)
-are fractions; rotations have 2 bits for the largest component and 10 for each other. The loss is least when Gaussians that are
-neighbours in the file are neighbours in space; so an export sorts them (``sorted``).
+Positions (11, 10, 11 bits), log scales (11, 10, 11) and colours (8 each) are fractions between bounds, which a chunk of 256
+Gaussians shares. A rotation has 2 bits for the index of its largest component, and 10 bits for each other component. The loss
+is smallest if neighbours in the file are neighbours in space, so an export sorts the Gaussians (``sorted``).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _BITS = (11, 10, 11)
 
 
 def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
-    """Return the bytes of a file, with the antialiasing declared in its header; harmonics beyond 4 are clamped."""
+    """Return the bytes of a file, with antialiasing declared in its header; harmonics above degree 0 are clamped to +-4."""
     n, k = arrays["sh"].shape[:2]
     chunks = np.arange(n) // CHUNK
     colors = base_colors(arrays["sh"][:, :1].astype(np.float64))
@@ -70,7 +70,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def start_of(path: Path) -> bytes:
-    """Return the first bytes of a PLY file, as many as the longest allowed header has; its own header is checked.
+    """Return the first `MAX_HEADER_BYTES` bytes of a PLY file, or the whole file if it is shorter, and check its header.
 
     Raises:
         DataError: The file cannot be read, or is not a PLY file.
@@ -93,7 +93,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     """Return the Gaussians of a file's bytes.
 
     Raises:
-        DataError: The file is malformed or truncated, or needs another render mode.
+        DataError: The file is malformed or truncated, or needs an unsupported render mode.
     """
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     tables = {}
@@ -137,7 +137,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
 
 def _bounds(path: Path, chunk: np.ndarray, group: tuple[str, ...]) -> list[np.ndarray] | None:
-    """Return the least and the largest numbers of each chunk, float64 [C, 3]; None for colours from 0 to 1, in older files."""
+    """Return the bounds of each chunk, two arrays float64 [C, 3]; None for the colours of older files, which span 0 to 1."""
     if group == _GROUPS[2] and "min_r" not in (chunk.dtype.names or ()):
         return None
     return [
@@ -164,7 +164,7 @@ def _harmonics(path: Path, sh: np.ndarray, n: int) -> tuple[Callable[[slice], np
 
 
 def _table(path: Path, data: bytes, element: Element, start: int) -> tuple[np.ndarray, int]:
-    """Return the rows of an element at a byte of the file, and the byte behind them."""
+    """Return the rows of an element that begins at byte ``start`` of the file, and the byte at which the next one begins."""
     names = [name for name, _ in element.properties]
     if len(set(names)) < len(names):
         raise malformed(path, f"a property of {element.name[:40]!r} appears twice")
@@ -184,7 +184,7 @@ def _column(path: Path, table: np.ndarray, name: str, kind: str) -> np.ndarray:
 
 
 def _pack(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Return fractions [N, B] in [0, 1] as one integer each row, the first in the upper bits, int64 [N]."""
+    """Return fractions [N, B] in [0, 1] as one integer per row, the first fraction in the upper bits, int64 [N]."""
     packed = np.zeros(len(fractions), np.int64)
     for column, width in zip(fractions.T, bits):
         most = 2**width - 1

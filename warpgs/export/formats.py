@@ -13,7 +13,7 @@ from warpgs.scene import Gaussians, Normalization
 
 
 def all_formats() -> list[Format]:
-    """Return every registered format with its default options: longer suffixes first, so that each finds its files."""
+    """Return every registered format with its default options: longer suffixes first, so .compressed.ply before .ply."""
     found = [FORMATS.find(name)() for name in FORMATS.names()]
     return sorted(found, key=lambda f: (-len(f.suffix), not type(f).__module__.startswith("warpgs."), f.suffix))
 
@@ -24,7 +24,7 @@ def suffixes() -> list[str]:
 
 
 def find_format(choice: str | type[Format] | Format) -> Format:
-    """Return the format of a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object.
+    """Return a format that is given as a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object.
 
     A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
 
@@ -47,7 +47,7 @@ def find_format(choice: str | type[Format] | Format) -> Format:
 
 
 def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format | None = None) -> Format:
-    """Return the format of a file: the given one, else that of its suffix.
+    """Return the given format, or else the format of the file's suffix.
 
     Raises:
         UsageError: No format has the suffix, or the given format has another suffix.
@@ -129,7 +129,7 @@ def read_gaussians(
 
     Raises:
         warpgs.errors.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
-            a NaN, an infinity or a rotation of zero length.
+            a NaN, an infinity that `read_ply` does not replace, or a rotation of zero length.
         warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
     """

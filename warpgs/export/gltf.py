@@ -1,7 +1,7 @@
-"""The format glTF with the extension KHR_gaussian_splatting, in float32: .glb, or .gltf with its numbers inside.
+"""The format glTF with the extension KHR_gaussian_splatting, in float32: .glb, or .gltf with embedded numbers.
 
-Axis lengths are linear, opacities after the sigmoid, rotations xyzw. Coordinates have y up: a half turn about z from those of
-PLY.
+Axis lengths are stored without a logarithm, opacities after the sigmoid, rotations xyzw. Coordinates have y up: a half turn
+about z from those of PLY.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def encode_glb(arrays: Arrays) -> list[bytes]:
 
 
 def encode_gltf(arrays: Arrays) -> list[bytes]:
-    """Return the bytes of a .gltf file, with its numbers inside as base64."""
+    """Return the bytes of a .gltf file, with its numbers embedded as base64."""
     document, body = _document(arrays)
     document["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(body).decode()
     return [json.dumps(document, separators=(",", ":")).encode()]
@@ -167,7 +167,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
 @dataclass(frozen=True)
 class _Table:
-    """The numbers of an accessor, as they lie in the file."""
+    """The numbers of an accessor, as stored in the file."""
 
     block: np.ndarray
     """float32, or integers that stand for fractions [N, W]."""
@@ -195,7 +195,7 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
             raise malformed(path, "its header is truncated")
         _, version, total, size, kind = struct.unpack_from("<IIIII", data)
         if version != 2 or kind != JSON_CHUNK or not 20 + size <= total <= len(data):
-            raise malformed(path, f"its header announces {total} bytes, but the file has {len(data)}")
+            raise malformed(path, f"its header is invalid: version {version}, {total} bytes, in a file of {len(data)} bytes")
         text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)
@@ -242,7 +242,8 @@ def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     extension = found[0]["extensions"][EXTENSION]
     kernel, space = (extension.get(k) if isinstance(extension, dict) else None for k in ("kernel", "colorSpace"))
     if (kernel, space) != ("ellipse", COLOR_SPACE):
-        raise malformed(path, f"kernel {str(kernel)[:40]!r} in {str(space)[:40]!r}; only 'ellipse' in {COLOR_SPACE!r} is read")
+        given = f"kernel {str(kernel)[:40]!r} or colour space {str(space)[:40]!r} is not supported"
+        raise malformed(path, f"{given} (supported: 'ellipse', {COLOR_SPACE!r})")
     if isinstance(extension, dict) and extension.get("extensions"):
         raise malformed(path, "its Gaussians are compressed by a further extension; export them uncompressed")
     if not isinstance(found[0].get("attributes"), dict):

@@ -41,7 +41,7 @@ def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None =
             to +y, as glTF requires. None for +y. PLY has no upward direction.
 
     Raises:
-        DataError: A number is not finite, a triangle names a vertex that is missing, or the file would be too large.
+        DataError: A number is not finite, a triangle refers to a missing vertex, or the file would be too large.
         ResourceError: The file cannot be written.
         UsageError: The suffix is neither .ply nor .glb.
     """
@@ -73,7 +73,7 @@ def _ply(mesh: Mesh) -> list[bytes]:
 
 
 def linear(colors: np.ndarray) -> np.ndarray:
-    """Return sRGB colours in [0, 1] as linear ones, of the same shape (IEC 61966-2-1), in which glTF stores them."""
+    """Return sRGB colours in [0, 1] as linear colours (IEC 61966-2-1), which glTF stores; the shape is unchanged."""
     c = np.clip(colors.astype(np.float64), 0, 1)
     return np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
 
@@ -83,7 +83,7 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
     x, y, z = np.asarray(up, np.float64) / np.linalg.norm(up)
     if y < -1 + 1e-12:
         return [1.0, 0.0, 0.0, 0.0]
-    q = np.array([-z, 0.0, x, 1.0 + y])  # cross product of up and +y, and 1 plus their product
+    q = np.array([-z, 0.0, x, 1.0 + y])  # cross product of up and +y, and 1 plus their dot product
     unit: list[float] = (q / np.linalg.norm(q)).tolist()
     return unit
 

@@ -29,7 +29,7 @@ from warpgs.scene import Gaussians, Normalization
 CHUNK_ROWS = 65536
 """Number of Gaussians written at a time, so that the interleaved copy of a large model never exists as a whole."""
 OPAQUE = 30.0
-"""Logit that replaces infinity: its opacity is 1 in float32. Its negative replaces minus infinity."""
+"""Logit that replaces infinity: the opacity is 1 in float32. -30 replaces minus infinity."""
 FLAT = math.log(1e-37)
 """Log scale that replaces minus infinity, an axis of length 0: float32 still holds its exponential."""
 
@@ -86,9 +86,9 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
     """Read Gaussians from a PLY file in the INRIA 3DGS layout, binary little endian.
 
     Properties and elements outside the layout are ignored. Other programs write opacities of 0 and 1 as infinite logits, and
-    axes of length 0 as infinite log scales; these become `OPAQUE` and `FLAT`, which look the same. The number of rows is
-    checked against the file size before memory is allocated. A file that declares antialiasing causes a warning: render it with
-    `RasterizeOptions.antialiased`.
+    axes of length 0 as log scales of -inf. These become finite numbers that look the same (`OPAQUE`, `FLAT`). The number of
+    rows is checked against the file size before memory is allocated. A file that declares antialiasing causes a warning: render
+    it with `RasterizeOptions.antialiased`.
 
     Args:
         path: The file, written by `write_ply` or by another program with the same layout.
@@ -194,7 +194,7 @@ def _check_properties(path: Path, vertex: Element) -> int:
 
 
 def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int) -> Gaussians:
-    """Return N Gaussians of structured rows, which are read in their order; DataError where a value cannot be used."""
+    """Return N Gaussians from structured rows, which are read in their order; DataError where a value cannot be used."""
     import torch
 
     k = rest // 3
@@ -221,7 +221,10 @@ def _assemble(path: Path, read: Callable[[slice], np.ndarray], n: int, rest: int
 def _columns(
     path: Path, rows: np.ndarray, first: int, names: list[str] | tuple[str, ...], least: float = -np.inf, most: float = np.inf
 ) -> np.ndarray:
-    """Return columns of structured rows from the row ``first`` on, float32 [N, C]; infinities become ``least`` and ``most``."""
+    """Return columns of structured rows, float32 [N, C]; infinities become ``least`` and ``most``.
+
+    ``first`` is the number of the first row, for messages.
+    """
     out = np.empty((len(rows), len(names)), np.float32)
     # A double beyond float32 becomes an infinity, and the check below names it.
     with np.errstate(over="ignore", invalid="ignore"):

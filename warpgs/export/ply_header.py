@@ -50,7 +50,7 @@ def mode_comments(antialiased: bool) -> tuple[str, str]:
 
 
 def is_antialiased(head: bytes) -> bool:
-    """Return whether a parsed header declares antialiasing; the last comment counts."""
+    """Return whether a parsed header declares antialiasing; the last such comment decides."""
     found = False
     for line in head.partition(b"end_header")[0].decode("ascii").lower().replace(":", " ").splitlines():
         match line.split():

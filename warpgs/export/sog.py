@@ -128,7 +128,7 @@ def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _palette(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return at most 65,536 rows that represent all rows, and for each row the index of its representative, int64 [N].
 
-    If there are more, cells of rows are halved at the median of their widest column; the mean of a cell represents it.
+    If there are more rows, cells of rows are halved at the median of their widest column. A cell's mean represents its rows.
     """
     n = len(rows)
     if n <= PALETTE:
@@ -157,7 +157,7 @@ def _webp(pixels: np.ndarray) -> bytes:
 
 
 def decode(path: Path, file: BinaryIO) -> Arrays:
-    """Return the Gaussians of an open file; images larger than the Gaussians need are not decoded.
+    """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding.
 
     Raises:
         DataError: The file is malformed, truncated, or announces more than its size can hold.
@@ -231,7 +231,7 @@ def _means(part: dict[str, Any], lower: np.ndarray, upper: np.ndarray, n: int) -
 
 
 def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
-    """Return the rotations [N, 4] of their pixels [P, 4]."""
+    """Return the rotations [N, 4] that ``pixels`` [P, 4] store."""
     largest = pixels[:n, 3]
     if (largest < 252).any():
         raise malformed(path, f"the rotation of Gaussian {int(np.argmax(largest < 252))} does not name its largest component")
@@ -241,15 +241,17 @@ def _quats(path: Path, pixels: np.ndarray, n: int) -> np.ndarray:
 
 
 def _check_contents(path: Path, file: BinaryIO, size: int) -> None:
-    """Raise a DataError where the end of an archive announces a large table of contents, or leaves its size to other records.
+    """Raise a DataError if the end record of an archive announces a large table of contents, or is not plain.
 
-    Other records are a comment after the end, and the zip64 locator before it, which archives beyond 4 GiB need.
+    A plain record has no comment after it, and no zip64 locator before it. Archives beyond 4 GiB need the locator.
     """
     file.seek(max(0, size - 42))
     locator, end = (last := file.read())[:-22], last[-22:]
     plain = end[:4] == b"PK\5\6" and end[-2:] == b"\0\0" and locator[:4] != b"PK\6\7"
     if not plain or int.from_bytes(end[12:16], "little") > MAX_CONTENTS_BYTES:
-        raise malformed(path, f"its table of contents is not at its end, or has more than {MAX_CONTENTS_BYTES:,} bytes")
+        raise malformed(
+            path, f"its table of contents is not at the end of the file, or has more than {MAX_CONTENTS_BYTES:,} bytes"
+        )
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: object, most: int) -> bytes:
@@ -320,7 +322,7 @@ def _palette_rows(path: Path, part: dict[str, Any], content: bytes) -> np.ndarra
 
 
 def _within(path: Path, labels: np.ndarray, count: int, first: int) -> np.ndarray:
-    """Return the labels of the Gaussians from number ``first`` on; DataError if one is not below ``count``."""
+    """Return the labels of the Gaussians from number ``first`` on; DataError if a label is not below ``count``."""
     if (labels >= count).any():
         row = first + int(np.argmax(labels >= count))
         raise malformed(path, f"Gaussian {row} refers to harmonics beyond the {count} rows")

@@ -42,7 +42,7 @@ from warpgs.input_files import open_input, unread_reason
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
 VERSION = 3
-"""Version that is written by default: old programs read gzip, too."""
+"""Version that is written by default: gzip, which old programs read, too."""
 VERSIONS = (2, 3, 4)
 """Versions that are read and written."""
 MAGIC = 0x5053474E
@@ -60,7 +60,7 @@ def fractional_bits(means: np.ndarray) -> int:
     """Return the number of fractional bits, at most 24, at which all coordinates [N, 3] just fit into 24 signed bits.
 
     Raises:
-        DataError: A coordinate is beyond 2^23, which the format cannot hold.
+        DataError: A coordinate is beyond 2^23 - 1, which the format cannot hold.
     """
     largest = float(np.abs(means).max(initial=0))
     bits = MAX_FRACTIONAL_BITS
@@ -256,20 +256,20 @@ def _unpack(sections: Iterator[Section], n: int, degree: int, bits: int, version
 
 
 def _fixed(data: np.ndarray) -> np.ndarray:
-    """Return coordinates of 24 bits [P, 9], signed, as integers [P, 3]."""
+    """Return signed 24-bit coordinates, bytes [P, 9], as integers [P, 3]."""
     fixed = np.zeros((len(data), 3, 4), "u1")
     fixed[:, :, 1:] = data.reshape(-1, 3, 3)  # in the upper bytes, since an arithmetic shift down keeps the sign
     return fixed.reshape(-1, 12).view("<i4") >> 8
 
 
 def _quats_2(data: np.ndarray) -> np.ndarray:
-    """Return rotations of version 2 [P, 3] as wxyz [P, 4]."""
+    """Return rotations wxyz [P, 4] from the bytes [P, 3] of version 2."""
     xyz = data / 127.5 - 1
     return np.concatenate([np.sqrt(np.clip(1 - (xyz * xyz).sum(1, keepdims=True), 0, None)), xyz], 1)
 
 
 def _quats(data: np.ndarray) -> np.ndarray:
-    """Return rotations of versions 3 and 4 [P, 4] as wxyz [P, 4]."""
+    """Return rotations wxyz [P, 4] from the bytes [P, 4] of versions 3 and 4."""
     packed = np.ascontiguousarray(data).view("<u4")[:, 0].astype(np.int64)
     components = np.stack([(packed >> s) & 1023 for s in (20, 10, 0)], 1)
     fractions = np.where(components & 512, -1, 1) * (components & 511) / (511 * SQRT2)
@@ -304,7 +304,7 @@ class SPZ(Format):
     declares = True
     note = (
         "SPZ files have y up, as Niantic defines it. SuperSplat, splat-transform 3, gsply and gaussforge expect the axes of "
-        "PLY: use --rotate 1,0,0,180 for files to or from them"
+        "PLY: use --rotate 1,0,0,180 for files to or from these programs"
     )
     decode = staticmethod(decode)
 

@@ -163,7 +163,7 @@ def adam_scheduled(
 
 
 def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas: tuple[float, float], eps: float) -> None:
-    """Launch the generic kernel, which is that of a CPU and of float64."""
+    """Launch the generic kernel, which is used on a CPU and for float64."""
     real, device = interop.real_of(param), param.device
     length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
     flat = [interop.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]

@@ -146,7 +146,8 @@ def composite(
 
     Returns:
         ``rgb`` [C, H, W, D], or ``image``; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last
-        instance that was blended [C, H, W]; states of the chunks (CUDA only, else empty).
+        instance that was blended [C, H, W]; states of the chunks (CUDA in float32 only, else empty). Without ``save``,
+        transmittances and weight sums may be empty.
     """
     if is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
@@ -215,8 +216,9 @@ def composite_gradients(
         backgrounds: Channels behind everything, shape [C, D].
         settings: Settings as given to `composite`.
         saved: Results of `composite` without ``alpha``. Only the channels of ``rgb`` that ``v_images`` has are read.
-        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The first
-            may be a slice of the channels of an image, and on CUDA in float32 have fewer than D: the other gradients are 0.
+        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. That of
+            ``rgb`` may be a slice of channels of an image. On CUDA in float32 it may have fewer than D channels; the other
+            channels have gradient 0.
         allocator: Provider of the gradient's memory.
     """
     v_rgb, v_alpha, v_depth = v_images
@@ -271,7 +273,7 @@ def check_slots(tiles: Tiles) -> None:
         ValueError: The instances have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
-        raise ValueError("gradients and contributions need tiles with slots: make the tiles by bin_tiles(slotted=True)")
+        raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")
 
 
 def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
@@ -285,8 +287,8 @@ def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
         raise ValueError(
-            f"tiles were made for another image: {len(tiles.ranges)} tiles, but {sizes['C']} images of {width} x {height} px "
-            f"have {sizes['C'] * columns * rows} of {tiles.size} px"
+            f"tiles were made for another image: found {len(tiles.ranges)} tiles, but {sizes['C']} images of {width} x "
+            f"{height} px have {sizes['C'] * columns * rows} tiles of {tiles.size} px"
         )
 
 
@@ -322,12 +324,12 @@ def blend(
             of ``projected``, the half sides of the box.
 
     Returns:
-        ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean z-depth [u] under the
-        blending weights, 0 where these sum to less than `SMALLEST_WEIGHT`.
+        ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean depth [u] under the
+        blending weights (z; the distance for a fisheye), 0 where these sum to less than `SMALLEST_WEIGHT`.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.
-        ValueError: A shape or device is wrong, or the tiles belong to another image size.
+        ValueError: A shape or device is wrong, or the tiles belong to another image size or lack the slots for gradients.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
     settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
@@ -352,7 +354,7 @@ def contributions(
 
     Raises:
         TypeError: The scalar type is neither float32 nor float64.
-        ValueError: A shape disagrees, or the tiles belong to another image size.
+        ValueError: A shape disagrees, or the tiles belong to another image size or have no slots.
     """
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()

@@ -51,7 +51,7 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
 
 @functools.cache
 def make_kernels(real, width: int):
-    """Make the kernels that give Gaussians the channels of a pass, ``width`` of them, and split the gradient again."""
+    """Make two kernels: one gives Gaussians the ``width`` channels of a pass, the other splits the pass's gradient again."""
     module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
     geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
     own, rest = wp.constant(width), wp.constant(GEOMETRY + width)
@@ -101,7 +101,7 @@ class _Group(NamedTuple):
     """The channels of one pass."""
 
     channels: slice
-    """Their place among all D."""
+    """Slice of all D channels."""
     projected: torch.Tensor
     """Projected Gaussians that have these channels instead of a colour, shape [C, N, 9 + G]. All groups share the memory."""
     backgrounds: torch.Tensor
@@ -109,7 +109,7 @@ class _Group(NamedTuple):
 
 
 def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
-    """Return values [..., F] as [..., width]: zeros fill them up."""
+    """Return values [..., F], filled up with zeros to [..., width]."""
     return torch.nn.functional.pad(values, (0, width - values.shape[-1]))
 
 
@@ -121,7 +121,7 @@ def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
 def _groups(
     projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
 ) -> Iterator[_Group]:  # fmt: skip
-    """Yield the groups of all channels, ``width`` in each, in order; use each before the next is requested."""
+    """Yield the groups of ``width`` channels, in order; use each group before you request the next."""
     count, real = colors.shape[-1], interop.real_of(colors)
     colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
     inputs = [interop.rows(projected, real), interop.view(tiles.counts, wp.int32), interop.rows(colors, real)]

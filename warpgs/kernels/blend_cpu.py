@@ -17,7 +17,7 @@ from warpgs.kernels.compiler import ROLLED
 from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
 
 BATCH = 64
-"""Gaussians that the forward pass processes at a time, strip by strip; a power of 2, since indices are bounded by its bits."""
+"""Gaussians that the forward pass processes at a time, strip by strip; a power of 2, since BATCH - 1 masks indices."""
 TOGETHER = 16
 """Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
 

@@ -21,11 +21,11 @@ from warpgs.runtime.cuda_source import source
 from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128, 256)
-"""Instances for one warp of the backward pass. Small images use the first number, to have enough warps. Larger images use
-the next ones, to load the pixels less often and to save fewer states. The forward pass saves the state of every pixel at each
-multiple of this number, so that several warps can share a long list. Multiples of 32."""
+"""Instances for one warp of the backward pass, multiples of 32. Small images use the first number, to have enough warps. Larger
+images use the next numbers, to load the pixels less often and to save fewer states. The forward pass saves the state of every
+pixel at each multiple of the number in use, so that several warps can share a long list."""
 MAX_TILES = (4096, 16384)
-"""Numbers of tiles up to which the first and the second of `CHUNKS` are taken (docs/decisions/005-cuda-blending.md)."""
+"""Numbers of tiles up to which the first and the second of `CHUNKS` are used (docs/decisions/005-cuda-blending.md)."""
 STATE = 5
 """Floats of a saved state with three channels: transmittance, colour and depth sum. One more for each further channel."""
 WARPS = 2
@@ -40,8 +40,7 @@ ORDER_THREADS = 256
 STRIDE = 12
 """Stride of the sums of an instance, in floats, with three channels: the size of a projected Gaussian, so that rows are
 16-byte aligned. There are at most twelve sums: two along the rows of the factor, three for the factor, opacity, colour, depth,
-and two of magnitudes.
-Each further channel has one more."""
+and two of magnitudes. Each further channel adds one."""
 
 # 2^-(e1^2 + e2^2) = exp(-|U d|^2 / 2) where e = SCALE U d
 SCALE = "0.84932180028801904272f"  # sqrt(log2(e) / 2)
@@ -226,7 +225,7 @@ def _ints(*tensors: torch.Tensor) -> list[interop.View]:
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
-    """Return the instances per chunk: more for larger images, and not the fewest unless the order is fixed, to save memory."""
+    """Return the instances per chunk: more for larger images, and at least CHUNKS[1] if sums have no fixed order."""
     larger = sum(tiles > most for most in MAX_TILES)
     return CHUNKS[larger if deterministic else max(larger, 1)]
 

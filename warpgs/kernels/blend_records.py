@@ -9,7 +9,7 @@ from warpgs.kernels.blend_batch import TOGETHER
 from warpgs.kernels.falloff import ABREAST, STRIP
 
 COLORS = 3
-"""Channels of a projected Gaussian as `project` makes it: a colour."""
+"""Number of channels of a projected Gaussian as `project` makes it: a colour."""
 VALUES = 10
 """Number of gradient values of an instance with a colour: all values of a projected Gaussian but the last two, its box."""
 WIDTHS = (COLORS, 7, 11)

@@ -47,7 +47,7 @@ class BlendSettings:
     deterministic: bool = True
     """True to sum gradients in a fixed order on every device."""
     absgrad: bool = False
-    """True to sum magnitudes of the mean's gradient over pixels, too, as the gradient of the box."""
+    """True to sum magnitudes of the mean's gradient over pixels, too; the gradient of the box holds these sums."""
 
     @functools.lru_cache(maxsize=256)  # noqa: B019 - to make it takes 20 us, and steps ask for the same ones again
     def struct(self, tile_size: int, real):

@@ -1,4 +1,4 @@
-"""Sizes at which Gaussians do not reach a camera: a fraction of the distance to the nearest camera."""
+"""Largest sizes at which Gaussians do not reach a camera: a fraction of the distance to the nearest camera."""
 
 import functools
 
@@ -8,7 +8,7 @@ import warp as wp
 from warpgs.runtime import interop
 
 SMALLEST = 1e-12
-"""Smallest size [u]: that of a Gaussian at a camera."""
+"""Smallest size [u], for a Gaussian at a camera."""
 
 
 @functools.cache
@@ -44,7 +44,8 @@ def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) ->
         Logarithms of sizes [u], float32, shape [N].
 
     Raises:
-        ValueError: A shape or a type is wrong.
+        TypeError: An argument is not a tensor, or a scalar type is wrong.
+        ValueError: A shape or a device is wrong.
     """
     interop.check(means=(means, "N 3"), centers=(centers, "C 3"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)

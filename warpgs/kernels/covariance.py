@@ -10,7 +10,7 @@ from warpgs.constants import COVARIANCE_TOLERANCE
 
 @functools.cache
 def make_covariance(real):
-    """Make the functions for one scalar type. A covariance is its off-diagonal xy, xz, yz with a 0, and its diagonal."""
+    """Make the functions for one scalar type. A covariance is stored as xy, xz, yz and a 0, and its diagonal."""
     vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     mat33 = wp.types.matrix((3, 3), real)

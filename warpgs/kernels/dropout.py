@@ -31,12 +31,12 @@ def make_kernel():
 def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
     """Return factors for the opacities of ``count`` Gaussians: 0 with probability p, else 1 / (1 - p).
 
-    The expected opacity is unchanged. The factors depend only on p, seed, number and row, so they are the same on every device
-    and in a resumed fit.
+    The expected opacity is unchanged. The factors depend only on p, ``seed``, `Setting.NUMBER` and the Gaussian's row, so they
+    are the same on every device and in a resumed fit.
 
     Args:
         count: Number of Gaussians N.
-        settings: Settings of the step, float32, shape [7]; `Setting.DROPOUT` is p, `Setting.NUMBER` the number.
+        settings: Settings of the step, float32, shape [7]; `Setting.DROPOUT` is p.
         seed: Any 32-bit integer.
 
     Returns:

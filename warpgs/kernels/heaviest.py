@@ -146,8 +146,8 @@ def heaviest(
         origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
-        Ids of Gaussians from 0 to N - 1, int32, shape [C, H, W, k], -1 where fewer than k have a weight above 0; their
-        weights, shape [C, H, W, k], 0 where there are fewer; and the number of blended Gaussians, int32, shape [C, H, W].
+        Ids of Gaussians from 0 to N - 1, int32, shape [C, H, W, k]; weights, shape [C, H, W, k]; and the number of blended
+        Gaussians, int32, shape [C, H, W]. If fewer than k Gaussians have a weight above 0, the other ids are -1, with weight 0.
 
     Raises:
         TypeError: The scalar type is neither float32 nor float64.

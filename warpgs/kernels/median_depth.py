@@ -1,7 +1,7 @@
 """Median depth of binned Gaussians: where the transmittance of a pixel falls to one half.
 
-This is a separate pass, so that `blend` does not become slower. For a tile, it ends as soon as each pixel is half covered. It
-computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at one half.
+This is a separate pass, so that `blend` does not become slower. The pass over a tile ends as soon as each pixel is half
+covered. It computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at one half.
 """
 
 import functools
@@ -136,7 +136,7 @@ def median_depth(
         origin: Left and top [px] of the window that the tiles were made for.
 
     Returns:
-        z-depth of the Gaussian's mean [u], 0 where alpha is below 1/2, shape [C, H, W].
+        Depth of the Gaussian's mean [u] (z; the distance for a fisheye), 0 where alpha is below 1/2, shape [C, H, W].
 
     Raises:
         TypeError: The scalar type is neither float32 nor float64.

@@ -13,7 +13,7 @@ BLOCK = 128
 
 @functools.cache
 def make_functions():
-    """Make the functions, for CUDA; `make_color` has those on colours."""
+    """Make the functions, for CUDA; `make_color` makes the functions on colours."""
     vec12 = wp.types.vector(12, wp.float32)
 
     @wp.func_native(source("native_compact.cu", BLOCK=BLOCK))

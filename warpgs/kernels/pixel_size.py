@@ -8,7 +8,7 @@ import warp as wp
 from warpgs.runtime import interop
 
 SMALLEST = 1e-12
-"""Smallest size [u]: that of a Gaussian at a camera, or in no camera's image."""
+"""Smallest size [u], for a Gaussian at a camera or in no camera's image."""
 COLUMNS = 9
 """Number of values of a camera: centre [u] (3), axis of view in the world (3), focal length [px], cosine of the angle between
 the axis and the border of the image, and 1 if the size of a pixel grows with distance (fisheye), 0 if with depth."""
@@ -55,7 +55,8 @@ def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> t
         Logarithms of sizes [u], float32, shape [N].
 
     Raises:
-        ValueError: A shape or a type is wrong.
+        TypeError: An argument is not a tensor, or a scalar type is wrong.
+        ValueError: A shape or a device is wrong.
     """
     interop.check(means=(means, "N 3"), cameras=(cameras, "C 9"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)

@@ -266,8 +266,8 @@ def plane_costs(
     Args:
         gray: Brightness in [0, 1], float32, shape [H, W].
         others: Brightness of N other images, of any size.
-        homographies: Homographies from pixels of the image to pixels of each other image, both with centres at integers, with
-            a sign that makes the third coordinate positive in front of the other camera, shape [D, N, 3, 3].
+        homographies: Homographies from pixels of the image to pixels of each other image, shape [D, N, 3, 3]. Pixel centres are
+            at integers. The sign makes the third coordinate positive in front of the other camera.
         window: Side of the square in which pixels are correlated [px], odd, at most 2 `MAX_RADIUS` + 1.
         noise: Number that is added to the variance of a window.
         unit: Integer that stands for cost 1, below 2^15.

@@ -1,6 +1,6 @@
-"""Depths of a plane sweep on a CPU: the best plane of each pixel, and whether another view's depth returns to the pixel.
+"""Depths of a plane sweep on a CPU: the best plane of each pixel, and round trips through another view's depth.
 
-In float64, with a task for each pixel. No operations are fused, so depths are the same bits on any processor.
+Kernels use float64 and one task per pixel. No operations are fused, so depths are the same bits on any processor.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from warpgs.runtime import interop
 from warpgs.scene import Camera
 
 BEHIND = 1e-9
-"""Depth, in units of the first view's, up to which a point counts as behind a camera."""
+"""Ratio of a point's depth to its depth in the first view, up to which the point counts as behind a camera."""
 STEP = 1e-3
 """Step of the inverse depth for the central difference of the sensitivity, as a fraction of the inverse depth."""
 
@@ -132,7 +132,7 @@ def check_round_trip(
         own: Inverse depths of the view [1/u], float64, shape [H, W].
         found: Inverse depths of the other view [1/u], float64, at its size.
         sensitivity: Change of depth per pixel [u/px], float64, contiguous, shape [H, W]; lowered in place where this pair of
-            views has a smaller one.
+            views has a smaller value.
         most: Largest distance [px] between the pixel and the end of the round trip.
         min_parallax: Smallest angle between the two rays [deg].
 

@@ -171,10 +171,9 @@ def project(
     """Project N Gaussians into C cameras (EWA, first order).
 
     Differentiable in the seven tensors. A Gaussian is culled if its depth is below ``rule.near`` or above ``rule.far``, its
-    opacity is below the cut, or its box is outside the image. It is also culled if a parameter that is read is not finite or
+    opacity is below the cut, or its box is outside the image. It is also culled if a parameter that is read is non-finite, or
     outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients of
-    culled Gaussians are zero.
-    Derivation of the backward pass: docs/project.md.
+    culled Gaussians are zero. Derivation of the backward pass: docs/project.md.
 
     Args:
         means: World positions [u], shape [N, 3].
@@ -193,7 +192,7 @@ def project(
         window: Left, top, width and height [px] of the part of the image to render; left and top are multiples of
             ``tile_size``. None for the whole image. Gaussians that touch no tile of this part are culled.
         camera_model: Name of the camera model (`warpgs.kernels.cameras`).
-        distortion: Coefficients of the camera model, shape [C, P]; None for a model without. Not differentiable.
+        distortion: Coefficients of the camera model, shape [C, P]; None if it has no coefficients. Not differentiable.
 
     Returns:
         ``projected`` [C, N, 12], with the layout of `PROJECTED_SIZE`, and ``tile_counts`` [C, N] int32, the number of

@@ -1,4 +1,4 @@
-"""The kernels of `project` for CUDA, a thread for each Gaussian; `project_cpu` has those of the CPU."""
+"""The kernels of `project` for CUDA, a thread for each Gaussian; `project_cpu` has the kernels for a CPU."""
 
 import functools
 

@@ -1,7 +1,7 @@
 """Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
 
-The forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window, the backward pass three fields. Images are flat rows of
-width * channels.
+The forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three fields. Images are flat rows
+of width * channels.
 """
 
 import functools
@@ -18,7 +18,7 @@ from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 
 def difference_bytes(sizes: StepSizes) -> int:
-    """Return the bytes of `differences` and its gradient: three partials, the gradient, and on a CPU five sums a block."""
+    """Return the bytes of `differences` and its gradient: three partials, the gradient, and on a CPU five sums per block."""
     images = 4 * CHANNELS * FLOAT * sizes.pixels
     return images + (0 if sizes.cuda else 5 * FLOAT * (CHANNELS * sizes.width + 2 * PADDING) * -(-sizes.height // BLOCK))
 
@@ -245,15 +245,15 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the sums over all pixels and channels of 1 - `ssim` and of |image - target|, for photometric losses.
 
-    One pass computes both, and the backward pass their gradient. For tiny images, and for float64 on CUDA, torch sums the map
-    of `ssim`.
+    One pass computes both sums; the backward pass computes their gradient. For tiny images, and for float64 on CUDA, torch sums
+    the map of `ssim`.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
         target: Colours of the image to compare with, shape [H, W, 3] or [B, H, W, 3]; no gradient.
 
     Returns:
-        The two sums, shape [2]. The gradient of |image - target| is 0 where they are equal.
+        The two sums, shape [2]. The gradient of |image - target| is 0 where both are equal.
 
     Raises:
         TypeError: A scalar type is neither float32 nor float64, or they differ.

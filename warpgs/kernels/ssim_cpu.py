@@ -1,4 +1,4 @@
-"""The window and the score of SSIM, and its CPU kernels: one task per block of rows, whose sums stay in its cache."""
+"""The window and the score of SSIM, and the CPU kernels: one task per block of rows, whose sums stay in the cache."""
 
 import functools
 import math

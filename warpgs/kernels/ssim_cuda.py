@@ -60,7 +60,7 @@ def make_kernels():
 
 
 def _shape(image: torch.Tensor) -> tuple[int, int, int]:
-    """Return the number of blocks, and height and row length [elements] of an image; image [B, H, W, 3]."""
+    """Return the number of blocks, and height and row length [elements], of images [B, H, W, 3]."""
     batch, height, width, channels = image.shape
     return batch * -(-height // SIDE) * -(-width // SIDE), height, width * channels
 

@@ -23,7 +23,7 @@ class Setting(IntEnum):
     DROPOUT = 0
     """Probability that opacity dropout hides a Gaussian, in [0, 1)."""
     NUMBER = 1
-    """Number of the step, or of its view where a step has several; an integer from 1, below 2^24."""
+    """Number of the step, or of the view if a step has several views; an integer from 1, below 2^24."""
     MEANS_LR = 2
     """Learning rate of the means [u]."""
     RED = 3
@@ -31,7 +31,7 @@ class Setting(IntEnum):
     GREEN = 4
     BLUE = 5
     STEP = 6
-    """Number of the step, for all its views; an integer from 1, below 2^24."""
+    """Number of the step, the same for all views of a step; an integer from 1, below 2^24."""
 
     @classmethod
     def row(

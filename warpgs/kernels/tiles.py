@@ -42,7 +42,7 @@ class Tiles:
     """Flat Gaussian number of each instance, int32, shape [M]."""
     slots: torch.Tensor
     """Position of an instance before the tile sort, int32, shape [M]. Before the sort, the instances of a Gaussian are
-    neighbours. So each owns a row for its gradient, and the rows are summed in a fixed order, without atomics."""
+    neighbours. So each instance owns a row for its gradient, and the rows are summed in a fixed order, without atomics."""
     starts: torch.Tensor
     """First slot of each Gaussian that has any, int32, shape [C * N]."""
     counts: torch.Tensor
@@ -50,7 +50,7 @@ class Tiles:
     tile_ids: torch.Tensor
     """Tile of each instance, int32, shape [M]; C * tiles for an entry that belongs to no tile."""
     total: torch.Tensor
-    """M, int64, shape [1], where kernels can read it."""
+    """Actual number of instances, int64, shape [1], for kernels; with a capacity, M is the capacity."""
     visible: int = 0
     """Number of Gaussians that have instances; with a capacity, an upper bound."""
 
@@ -100,7 +100,8 @@ def _checked_counts(projected: torch.Tensor, tile_counts: torch.Tensor) -> torch
     """Return the tile counts by flat Gaussian number, int32, shape [C * N]; ValueError where a shape or type is wrong."""
     sizes = interop.check(projected=(projected, "C N 12"))
     if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
-        raise ValueError(f"tile_counts must be int32 of shape {[sizes['C'], sizes['N']]}, not {list(tile_counts.shape)}")
+        wanted, found = [sizes["C"], sizes["N"]], list(tile_counts.shape)
+        raise ValueError(f"tile_counts must be int32 of shape {wanted}, not {tile_counts.dtype} of shape {found}")
     return tile_counts.contiguous().view(-1)
 
 
@@ -192,7 +193,7 @@ def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, 
 def _sort_by_tile(
     keys: torch.Tensor, slots: torch.Tensor, owners: torch.Tensor, ranges: torch.Tensor, total: int, slotted: bool
 ) -> torch.Tensor:
-    """Sort the instances stably by tile, fill in the range of each, and return their Gaussian numbers, int32, shape [M].
+    """Sort the instances stably by tile, fill in the range of each tile, and return the Gaussian numbers, int32, shape [M].
 
     ``keys`` and ``slots`` are sort buffers [2 M], ``owners`` [M], or [0] without ``slotted``; ``ranges`` [C * tiles, 2].
     """

@@ -85,8 +85,8 @@ def make_write(slotted: bool):
 def make_emit(real, slotted: bool):
     """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `tiles_emit_cpu`).
 
-    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. The rest of the capacity gets the tile
-    number that no tile has.
+    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile number
+    ``no_tile``.
 
     Args:
         real: wp.float32 or wp.float64.

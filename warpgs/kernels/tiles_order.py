@@ -13,7 +13,7 @@ from warpgs.runtime.allocator import TORCH, Allocator
 
 
 def _of_sum(native: bool) -> tuple[int, int]:
-    """Return the number of threads for an entry of the running sums, and of items for a thread."""
+    """Return the number of threads per entry of the running sums, and of items per thread."""
     return (32, EACH) if native else (1, 1)
 
 
@@ -129,9 +129,9 @@ def make_kernels(real, native: bool):
 def running_counts(
     counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
 ) -> torch.Tensor:  # fmt: skip
-    """Return running sums of tile counts and visible Gaussians in one number, int64, shape [S]; `split_sum` splits the last.
+    """Return running sums that count tiles and visible Gaussians in one number each, int64, shape [S].
 
-    A visible Gaussian adds its tile count and 2^`sum_bits`.
+    A visible Gaussian adds its tile count and 2^`sum_bits`. `split_sum` splits the last sum.
 
     Args:
         counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
@@ -158,5 +158,5 @@ def sums_fit(count: int, tiles: int) -> bool:
 
 
 def split_sum(total: int, count: int) -> tuple[int, int]:
-    """Return the number of visible Gaussians and of instances in the last of the `running_counts` of ``count`` Gaussians."""
+    """Split the last of the `running_counts` of ``count`` Gaussians into numbers of visible Gaussians and of instances."""
     return divmod(total, 2 ** sum_bits(count))

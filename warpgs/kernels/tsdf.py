@@ -203,7 +203,7 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
         camera: Pinhole camera of the size of ``depth``, arrays of numpy.
 
     Returns:
-        In [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where it is unknown.
+        Cosines in [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where it is unknown.
 
     Raises:
         UsageError: The camera is not a pinhole.
@@ -217,7 +217,7 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor) -> None:
-    """Add the signed distances of one view to a grid, in place, except for points far behind its surface.
+    """Add the signed distances of one view to a grid, in place, except at points more than a truncation behind the surface.
 
     Args:
         grid: The grid.
@@ -251,7 +251,7 @@ def gather_colors(
     points: torch.Tensor, tolerance: float, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
     image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Add to each point the colour that one view sees there, in place, where the point lies on the surface that the view sees.
+    """Add the colours that one view sees to the points that lie on the surface that the view sees, in place.
 
     Args:
         points: Positions [u], shape [N, 3].

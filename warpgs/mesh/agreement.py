@@ -1,7 +1,7 @@
-"""Agreement of views on depth: a mesh omits depths that no other view confirms, unless no other view sees a surface there.
+"""Agreement of views on depth: a mesh omits a depth if other views see a surface there, but none of them at this depth.
 
-A fit of few views constrains depth only where two of them look. If only one view sees a surface, such as beside an occluding
-edge, its depth is unconstrained.
+A fit of few views constrains depth only where two views look. If only one view sees a surface, such as beside an occluding
+edge, the surface's depth is unconstrained.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from warpgs.priors.view_choice import matching_views, shared_sight
 from warpgs.scene import Camera
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth, as for coverage (decision 019)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth; coverage has the same limit (decision 019)."""
 NEIGHBOURS = 16
 """Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
 MAX_PIXELS = 2**26
-"""Largest number of pixels of all stored maps, 256 MiB; with more, every map is thinned alike."""
+"""Largest number of pixels of all stored maps, 256 MiB; with more, maps store every ``step``-th pixel."""
 BOUNDS = (0.02, 0.98)
-"""Quantiles of a view's depths that are taken as the depths of its nearest and farthest surface."""
+"""Quantiles of a view's depths that are used as the depths of the nearest and farthest surface."""
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """Depth of one view, kept while others are compared with it."""
+    """Depth of one view, kept to compare other views with."""
 
     camera: Camera
     """Pinhole camera of the whole image, arrays of numpy."""
@@ -67,12 +67,12 @@ def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
 def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     """Return a view without the depths that no other view confirms.
 
-    A depth is kept if at least one other view has a surface within `TOLERANCE` of that point. It is also kept if no other view
-    has a surface in that direction, such as outside of all other images. So a single view keeps all its depths.
+    A depth is kept if at least one other view has a surface within `TOLERANCE` of its point. It is also kept if no other view
+    has a surface where the point projects, such as outside of all other images. So a single view keeps all its depths.
 
     Args:
         view: The view.
-        others: Depth of the views that it is compared with.
+        others: Depth maps of the views to compare with.
     """
     shown = torch.isfinite(view.depth) & (view.depth > 0)
     confirmed, questioned = torch.zeros_like(shown), torch.zeros_like(shown)
@@ -85,7 +85,7 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
 
 
 def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
-    """Return the difference in depth of the points of a map [H, W] from another view's surface, as a fraction of the depth.
+    """Return the distance in depth of a map's points to another view's surface, as a fraction of depth, shape [H, W].
 
     A point is compared with the nearest of the four depths around its projection, since depth varies within a pixel on a
     slanted surface. The result is infinite where the pixel has no depth, outside of the other image, and where all four depths

@@ -19,7 +19,7 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
 
 COLOR_TOLERANCE = 1.0
-"""Largest distance, in truncations, between a vertex and the surface of a view that gives it colour."""
+"""Largest distance, in truncations, between a vertex and the surface of a view that colours the vertex."""
 
 MIN_FACES = 4
 """Smallest number of triangles that enclose a volume."""
@@ -32,7 +32,7 @@ class MeshOptions:
     voxel: float | None = None
     """Distance between neighbouring grid points [u]; None to derive it from ``resolution``."""
     resolution: int | None = None
-    """Voxels along the longest side of the grid; None for 256, or fewer if the images resolve less."""
+    """Voxels along the longest side of the surfaces' box; None for 256, or fewer if the images resolve less."""
     max_faces: int = 200_000
     """Largest number of triangles; larger meshes are simplified."""
     depth: str = "median"
@@ -63,7 +63,7 @@ class FusedMesh:
     mesh: Mesh
     """The mesh, in the units of the cameras."""
     plan: GridPlan
-    """Grid that it was made with."""
+    """Grid that the mesh was made with."""
     unseen: float
     """Fraction of the grid points that no view saw."""
     extracted: int
@@ -80,11 +80,11 @@ def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap
     Args:
         views: Surface that each camera sees.
         plan: The grid.
-        maps: Depth of each view, which the others are compared with.
+        maps: Depth map of each view, to compare other views with.
         like: Any tensor of the type and on the device of the grid, shape [...].
 
     Raises:
-        DataError: No depth of a view is confirmed by another.
+        DataError: Other views contradict all depths.
     """
     grid, confirmed = empty_grid(plan.origin, plan.voxel, plan.shape, plan.truncation, like), False
     for view, others in zip(views("fusing depth"), neighbours(maps)):
@@ -118,7 +118,7 @@ def fuse(
         planned: Called with the grid, and its memory as text, before the grid is allocated.
 
     Raises:
-        DataError: No camera sees a surface, or no depth is confirmed by another camera.
+        DataError: No camera sees a surface, or other cameras contradict all depths.
         ResourceError: The grid does not fit into memory.
         UsageError: There is no camera, one has no pinhole of the same K, or an option is out of range.
     """

@@ -14,7 +14,7 @@ from warpgs.runtime.device_memory import available_bytes
 from warpgs.runtime.interop import MAX_SIZE
 
 RESOLUTION = 256
-"""Voxels along the longest side of the grid, if neither ``voxel`` nor ``resolution`` is given."""
+"""Voxels along the longest side of the box around the surfaces, if neither ``voxel`` nor ``resolution`` is given."""
 MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
 TRUNCATION = 4.0
 """Truncation in voxels."""
@@ -26,7 +26,7 @@ QUANTILES = (0.005, 0.995)
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14
-"""Bytes of a grid point in the machine's memory while triangles are made: two copies of the distances, weights and masks."""
+"""Bytes of a grid point in main memory while triangles are made: two copies of the distances, the weights, and two masks."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class GridPlan:
     shape: tuple[int, int, int]
     """Number of points along each axis."""
     inside: float
-    """Fraction of the surface points that the grid holds."""
+    """Fraction of the surface points inside the grid."""
 
     @property
     def points(self) -> int:
@@ -73,17 +73,17 @@ def plan_grid(
 
     Args:
         points: Points of the surfaces [u], shape [N, 3].
-        footprints: Width of a pixel at each [u], shape [N].
+        footprints: Width of a pixel at each point [u], shape [N].
         voxel: Distance between neighbouring grid points [u]; None to derive it from ``resolution``.
         resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
             the median footprint.
 
     Raises:
         DataError: No camera sees a surface.
-        UsageError: A number is out of range.
+        UsageError: ``voxel`` is not positive, or too small for the extent of the points.
     """
     if not len(points):
-        raise DataError("no training view shows a surface: alpha is below 0.5 everywhere; fit again with more steps")
+        raise DataError("no training view shows a surface: alpha is below 0.5, or depth uncertain; fit again with more steps")
     low, high = find_box(points)
     longest = float((high - low).max())
     if voxel is None:
@@ -103,7 +103,7 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
     """Return how much memory a grid takes, as text, before it is allocated.
 
     Raises:
-        ResourceError: The device or the machine has less free memory, or the points are more than kernels can index.
+        ResourceError: The grid needs more than 80 % of the free memory, or has more points than kernels can index.
     """
     cpu = torch.device("cpu")
     needs = {device: plan.points * GRID_BYTES}
@@ -116,7 +116,7 @@ def check_memory(plan: GridPlan, device: torch.device) -> str:
         free = available_bytes(where)
         if needed > 0.8 * free:
             raise ResourceError(
-                f"a grid of {sizes} points takes {format_bytes(needed)} of memory on {where}, where {format_bytes(free)} are "
-                f"free; {remedy}"
+                f"a grid of {sizes} points takes {format_bytes(needed)} of memory on {where}, more than 80 % of the free "
+                f"{format_bytes(free)}; {remedy}"
             )
     return format_bytes(sum(needs.values()))

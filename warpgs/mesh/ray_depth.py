@@ -1,7 +1,7 @@
 """Depth of a surface along each ray: where the Gaussians of a pixel are densest, and the fraction of their weight there.
 
-The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. So here the depth of a
-Gaussian is that at which its density along the ray is largest.
+The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. Here, a Gaussian's depth is
+where its density along the ray is largest.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from warpgs.scene import Camera, Gaussians
 CONTRIBUTORS = 32
 """Number of heaviest Gaussians of a pixel that are used."""
 BAND = 0.02
-"""Largest difference from the median depth, as a fraction of it, that counts as the same surface."""
+"""Largest difference from the median depth, as a fraction of the median, that counts as the same surface."""
 MIN_SHARE = 0.5
 """Smallest fraction of the weights within `BAND` of the median for which a pixel shows a surface
 (docs/decisions/027-mesh-depth.md)."""
@@ -72,7 +72,7 @@ def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor
 def surface_depth(
     gaussians: Gaussians, camera: Camera, ids: torch.Tensor, weights: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the median depth of each pixel's Gaussians, and the fraction of their weights within `BAND` of that.
+    """Return the median depth of each pixel's Gaussians, and the fraction of their weights within `BAND` of that depth.
 
     Args:
         gaussians: N Gaussians in the units of the camera.

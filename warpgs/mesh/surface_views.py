@@ -1,4 +1,4 @@
-"""Surface that each camera sees of a model: depth, how much to trust it, and colour."""
+"""Surface of a model that each camera sees: depth, weight of the depth, and colour."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class SurfaceView:
     camera: Camera
     """Pinhole camera, arrays of numpy."""
     depth: torch.Tensor
-    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where it is uncertain."""
+    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where the depth is uncertain."""
     weights: torch.Tensor
-    """Trust in each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times the opacity of a surface."""
+    """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times the opacity of a surface."""
     image: torch.Tensor
     """Colours, shape [H, W, 3]."""
 
@@ -50,7 +50,7 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
         gaussians: N Gaussians in the units of the camera.
         camera: Camera, arrays of numpy; a lens is replaced by the pinhole of the same K.
         options: Settings of the rasterizer.
-        depth: Depth that is taken, one of `DEPTHS`.
+        depth: Depth to use, one of `DEPTHS`.
 
     Raises:
         UsageError: The camera has no pinhole of the same K, or the depth is unknown.
@@ -84,7 +84,7 @@ class SurfaceViews:
             gaussians: N Gaussians in the units of the cameras.
             cameras: Cameras, arrays of numpy.
             options: Settings of the rasterizer.
-            depth: Depth that is taken, one of `DEPTHS`.
+            depth: Depth to use, one of `DEPTHS`.
             stage: Function that shows a line of progress, before each view.
         """
         self._render = lambda camera: surface_view(gaussians, camera, options, depth)

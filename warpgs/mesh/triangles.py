@@ -36,7 +36,7 @@ def extract(grid: DistanceGrid) -> Mesh:
         grid: The grid.
 
     Raises:
-        DataError: No view saw a surface.
+        DataError: There is no surface inside the grid.
     """
     from skimage.measure import marching_cubes
 
@@ -56,7 +56,7 @@ def extract(grid: DistanceGrid) -> Mesh:
 
 
 def _compact(mesh: Mesh) -> Mesh:
-    """Leave out vertices that no triangle has."""
+    """Remove vertices that no triangle uses."""
     used = np.zeros(len(mesh.vertices), bool)
     used[mesh.faces] = True
     numbers = np.cumsum(used) - 1

@@ -25,7 +25,7 @@ CODE = 1
 def cache_folder() -> Path:
     """Return the cache folder: WARPGS_CACHE if set, else warpgs in the system's folder for caches.
 
-    Without WARPGS_CACHE and a home folder, the maps go to a private folder of this process, and a line on stderr says so.
+    Without WARPGS_CACHE and a home folder, the maps go to a private folder of this process, and a line on stderr reports that.
 
     Raises:
         ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE names an unknown home
@@ -45,7 +45,7 @@ def cache_folder() -> Path:
 
 @dataclass
 class MapCache:
-    """A folder of maps. Damaged entries are computed again; if the folder cannot be written, a note says so."""
+    """A folder of maps. Damaged entries are computed again; a note reports them, and a folder that cannot be written."""
 
     folder: Path
     """Folder of the entries."""

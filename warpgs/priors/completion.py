@@ -7,8 +7,7 @@ import numpy as np
 from warpgs.priors.opencv import single_threaded_opencv
 
 SMOOTHNESS = (1e2, 1e4, 1e6)
-"""Strengths of the smoother, tried in turn; a stronger one reaches farther, and the first that reaches a pixel is used
-there."""
+"""Strengths of the smoother, in order. A stronger smoother reaches farther; each pixel uses the first that reaches it."""
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which the weight between neighbours falls to 1/e."""
 MIN_FRACTION = 1e-3

@@ -16,8 +16,8 @@ CLIP = (0.5, 99.5)
 COLOR_SIGMA = 8.0
 """Colour difference [1/255] at which the smoother's weight between neighbours falls to 1/e."""
 REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
-"""Pairs (length [px] over which consistent depths spread within an even surface, weight): a long length matters only where no
-consistent depth is near."""
+"""Pairs of a length [px], over which consistent depths spread within a surface of uniform colour, and a weight. A long length
+matters only where no consistent depth is near."""
 MAX_ERROR_RATIO = 1e3
 """Largest ratio of an error to the median error; larger ratios are clipped, so no weight is below a millionth."""
 MEAN_WEIGHT = 1e-9
@@ -67,7 +67,7 @@ def network_disparity(network: Network, preprocessing: Preprocessing, image: np.
 
 
 def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, sensitivity: np.ndarray) -> np.ndarray:
-    """Fill the gaps of a depth map in inverse depth, along surfaces of even colour and not across colour edges.
+    """Fill the gaps of a depth map in inverse depth, along surfaces of uniform colour and not across colour edges.
 
     The result is the ratio of smoothed ``w / z`` and smoothed ``w``, by the fast global smoother (Min et al. 2014), a solver
     of weighted least squares that the image guides. The weight w falls with the change of 1 / z for a shift of the match

@@ -31,7 +31,7 @@ class EpipolarConfig:
     max_residual: float = 1.0
     """Largest distance of a match from its epipolar line [px] (NexusGS)."""
     max_round_trip: float = 1.5
-    """Largest distance between a pixel and the end of the flow there and back [px]; infinity switches the check off."""
+    """Largest distance between a pixel and the end of its round trip by flow [px]; infinity switches the check off."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays of a match [deg]; below it depth is noise."""
     near_count: int = 4
@@ -200,7 +200,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
 
 def flow_depth(views: Sequence[View], index: int, flow: FlowBetween, config: EpipolarConfig) -> ViewDepth:
-    """Return the depth of one view by flow to its nearest others.
+    """Return the depth of one view by flow to its nearest other views.
 
     Args:
         views: All views.

@@ -190,7 +190,7 @@ def build(request: ExportRequest) -> torch.nn.Module:
 
 
 def export_network(request: ExportRequest, out: Path) -> list[str]:
-    """Write a network as ONNX; for one that gives maps, also write the JSON file that describes input and output.
+    """Write a network as ONNX; for a network that gives maps, also write the JSON file that describes input and output.
 
     Args:
         request: The network, its weights and its input size.

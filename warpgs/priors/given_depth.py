@@ -21,7 +21,7 @@ from warpgs.scene import DEPTH_KINDS, GivenDepth, PointCloud, View, ViewDepth
 MIN_OVERLAP = 50
 """Smallest number of references in a view with which a map is compared, or to which it is fitted."""
 MAX_RATIO = 1.25
-"""Largest median ratio of metric depth to its references, or its inverse, in a view; a map beyond it is rejected."""
+"""Largest median ratio of metric depth to its references in a view, or inverse of that ratio; other maps are rejected."""
 NEAR = 0.05
 """Relative difference of depths up to which they count as one surface."""
 GOOD, MIN_GOOD = 0.1, 0.5
@@ -75,7 +75,7 @@ def check_given(views: Sequence[View]) -> None:
     """Check the given maps of views that were made in Python; `load_scene` has checked those that it read.
 
     Raises:
-        UsageError: A map has another size than its image, an unknown kind, or values that are not finite or out of range.
+        UsageError: A map has another size than its image, an unknown kind, or non-finite or out-of-range values.
     """
     for v in views:
         size = v.image.shape[:2]
@@ -91,8 +91,8 @@ def check_given(views: Sequence[View]) -> None:
             low, high = (-1.01, 1.01) if name == "normals" else (0, 1 if name == "confidence" else np.inf)
             if not (np.isfinite(found).all() and found.min() >= low and found.max() <= high):
                 raise UsageError(
-                    f"view {v.name}: the map of {name} holds values that are not finite or out of range; use 0 for missing "
-                    f"values"
+                    f"view {v.name}: the map of {name} holds values that are non-finite or out of range; use 0 for missing "
+                    "values"
                 )
         if v.depth is not None and v.depth.kind not in DEPTH_KINDS:
             raise UsageError(f"view {v.name}: depth kind {v.depth.kind!r} is not one of {', '.join(DEPTH_KINDS)}")

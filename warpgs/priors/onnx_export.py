@@ -38,12 +38,12 @@ def folder_for_files() -> Iterator[Path]:
 def onnx_bytes(
     network: torch.nn.Module, image: torch.Tensor, outputs: Sequence[str], sizes: dict[int, Any] | None = None
 ) -> bytes:
-    """Return a network that takes one image as the bytes of an ONNX file.
+    """Return the bytes of an ONNX file for a network that takes one image.
 
     Args:
         network: The network, ready for inference.
         image: An input, shape [1, 3, h, w].
-        outputs: Names of its outputs.
+        outputs: Names of the network's outputs.
         sizes: Sizes that axes of the image may have, by axis; None if only the sizes of ``image`` are allowed.
 
     Raises:

@@ -10,10 +10,9 @@ from collections.abc import Iterator
 def single_threaded_opencv() -> Iterator[None]:
     """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel.
 
-    Many OpenCV calls here are so short that starting threads takes longer than they save. The rounding of some calls depends on
-    the number of threads. With one thread, `cv2.distanceTransform` uses IPP's code, unless `without_ipp` turned it off. The
-    fast global smoother cuts an image into as many stripes as there are threads, and processes the last rows of a stripe by
-    different code.
+    Many OpenCV calls here are so short that starting threads costs time. The rounding of some calls depends on the number of
+    threads. With one thread, `cv2.distanceTransform` uses IPP's code, unless `without_ipp` turned it off. The fast global
+    smoother cuts an image into as many stripes as there are threads, and processes the last rows of a stripe by different code.
     """
     import cv2
 

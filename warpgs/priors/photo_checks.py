@@ -21,15 +21,15 @@ from warpgs.priors.opencv import single_threaded_opencv, without_ipp
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87
-"""Sharpness below which a photograph is reported: untouched ones of five scenes have 0.88 and more, those blurred by a disk of
-3 px 0.5 to 0.85 (docs/decisions/019-thresholds.md)."""
+"""Sharpness below which a photograph is reported. Untouched photographs of five scenes have 0.88 and more; photographs blurred
+by a disk of 3 px have 0.5 to 0.85 (docs/decisions/019-thresholds.md)."""
 MAX_BRIGHTNESS = 1.2
 """Factor of brightness, up or down, beyond which a photograph is reported; it stays below 1.1 at constant exposure."""
 MAX_TINT = 1.1
 """The white balance is reported if a channel's factor differs from the factor of brightness by more than this ratio, up or
 down."""
 NEIGHBORS = 4
-"""Number of nearest photographs that each photograph is compared with; others may choose that photograph, too."""
+"""Number of nearest photographs that each photograph is compared with, besides those to which it is one of the nearest."""
 MIN_MATCHES = 10
 """Smallest number of matches for a comparison of two photographs."""
 MAX_FEATURES = 1000
@@ -59,7 +59,7 @@ class PhotoCheck:
     name: str
     """Name of the view."""
     compared_with: int
-    """Number of photographs that it could be compared with."""
+    """Number of photographs that this one could be compared with."""
     sharpness: float | None
     """Ratio of fine to coarse detail, divided by the same ratio of the other photographs; 1 if equally sharp."""
     brightness: float | None
@@ -96,7 +96,7 @@ class _Places(NamedTuple):
     detail: np.ndarray
     """Logarithm of fine over coarse detail, shape [N]."""
     colors: np.ndarray
-    """Mean colours around them in [0, 1], shape [N, 3]."""
+    """Mean colours around the features, in [0, 1], shape [N, 3]."""
 
 
 def _places(view: View) -> _Places:
@@ -114,7 +114,7 @@ def _places(view: View) -> _Places:
 def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int) -> np.ndarray | None:
     """Return by how much photograph i exceeds photograph j: logarithms of the factors of detail, red, green and blue.
 
-    A factor is NaN where it is unknown; None where too few places match.
+    An unknown factor is NaN. Return None if too few features match.
     """
     a, b = places[i], places[j]
     ids, _ = agreeing_matches(views[i], views[j], a.features, b.features, min_angle=0.0)
@@ -129,7 +129,7 @@ def _difference(views: Sequence[View], places: Sequence[_Places], i: int, j: int
 
 
 def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
-    """Return each pair of a photograph and one of its nearest photographs once, at most `NEIGHBORS` times their number."""
+    """Return the pairs of a photograph and one of its `NEIGHBORS` nearest photographs, each pair once."""
     centers, pairs = np.array([v.camera.center for v in views]), set()
     for i in range(len(views)):
         order = np.argsort(((centers - centers[i]) ** 2).sum(1), kind="stable")
@@ -138,7 +138,10 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _typical(differences: list[float]) -> float | None:
-    """Return the median; of an even number, the middle value nearer to 0: a faulty photograph differs from most others."""
+    """Return the median, or of two middle values the number between them that is nearest to 0; None if all are NaN.
+
+    A faulty photograph differs from most others, so the choice does not hide it.
+    """
     known = sorted(d for d in differences if np.isfinite(d))
     if not known:
         return None
@@ -191,7 +194,7 @@ def _check(name: str, differences: list[np.ndarray]) -> PhotoCheck:
 
 
 def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
-    """Return notes on photographs with faults, and on the number that could not be compared; none without faults."""
+    """Return notes on photographs with faults, and on photographs that could not be compared; an empty list without any."""
     notes = []
     blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
     if blurred:

@@ -1,4 +1,4 @@
-"""Views as a pinhole would show them, for searches along lines (sweeps and flow); and depth at the pixels of the lens again."""
+"""Views resampled to pinholes, for searches along epipolar lines (sweeps and flow), and depth mapped back to the lens."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def pinhole_view(view: View) -> View:
 
 
 def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
-    """Return depth of a view of `pinhole_view` at the pixels of the original camera; invalid where the pinhole sees nothing."""
+    """Map depth found in a `pinhole_view` to the pixels of the original camera; invalid where the pinhole sees nothing."""
     if camera.model == "pinhole":
         return found
     plane = (pixel_grid(camera) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
@@ -80,7 +80,7 @@ def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
 
 
 def _lens_pixels(camera: Camera) -> np.ndarray:
-    """Return the lens pixels [H * W, 2] in the directions of a pinhole's pixels with the same K; far off if there is none."""
+    """Return the lens pixels [H * W, 2] in the directions of a pinhole's pixels with the same K; far off if none exists."""
     plane = (pixel_grid(camera) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     positions = np.concatenate([plane, np.ones((len(plane), 1))], 1)
     with np.errstate(all="ignore"):

@@ -54,7 +54,7 @@ def _softmax(logits: np.ndarray) -> np.ndarray:
 def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
     """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
 
-    An output that already sums to one is taken for probabilities. Any other output is taken for logits, which are resized
+    An output that already sums to one is treated as probabilities. Any other output is treated as logits, which are resized
     before the softmax.
 
     Returns:
@@ -171,8 +171,8 @@ def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] =
 def knows_foreground(maps: SemanticMaps) -> bool:
     """Return whether the maps separate an object from its background.
 
-    There is no separation if the mean foreground stays below 1 % (tabletop scans hold no VOC class), or if every pixel is
-    labelled background with a mean foreground below a half.
+    They do not if the mean foreground is below 1 % (tabletop scans hold no VOC class). They also do not if there is no boundary
+    and the mean foreground is below a half.
     """
     mean = float(maps.foreground.mean())
     return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)

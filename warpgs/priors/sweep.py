@@ -2,7 +2,7 @@
 
 Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996). The method
 is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a parabola between planes.
-Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares it with optical flow.
+Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares sweeps with optical flow.
 """
 
 from __future__ import annotations
@@ -111,14 +111,14 @@ def sweep_depths(
 ) -> list[ViewDepth]:  # fmt: skip
     """Return the depth of every view by sweeping planes against views that see the same surfaces.
 
-    At most ``config.max_views`` views are swept, so that the time is bounded. They are compared with their
-    nearest neighbours among all views, and checked by round trips to one another.
+    At most ``config.max_views`` views are swept, so that the time is bounded. Swept views are compared with their nearest
+    neighbours among all views, and checked by round trips to one another.
 
     Args:
         views: The views; a single one has no consistent depth.
         bounds: Nearest and farthest depth of each view [u], 0 < near < far.
         config: Planes, smoothing and checks.
-        device: Device of costs and paths; the CPU computes them where a GPU has too little memory, or images are tiny.
+        device: Device of costs and paths; the CPU is used if a GPU has too little memory, or images are tiny.
         progress: Called after each view with the number of views swept so far, and their total.
 
     Returns:

@@ -27,7 +27,7 @@ def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_
         costs: Matching costs in units of 1 / `UNIT`, int16, shape [H, W, D], on any device.
         image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
         small_step: Penalty for a change of one plane.
-        large_step: Penalty for any other change, times exp(-step of the image / EDGE).
+        large_step: Penalty for any other change, less across edges of the image (`step_limits`).
 
     Returns:
         Sums in units of 1 / `UNIT`, int16, shape [H, W, D].

@@ -18,8 +18,8 @@ NOISE = (2 / 255) ** 2
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
 UNIT = 4096
-"""Cost 1 in the 16-bit integers of cost volumes: they need half the memory of float32, and first access to memory takes as long
-as the computation."""
+"""Integer that stands for cost 1 in cost volumes of 16 bits. These need half the memory of float32, and the first access to
+memory takes as long as the computation."""
 MAX_LARGE_STEP = 0.99
 """P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
 PLANES_AT_ONCE = 16
@@ -38,7 +38,7 @@ class SweepConfig:
     window: int = 7
     """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
     spacing: float = 0.5
-    """Largest step of a match from one plane to the next [px], while `max_planes` allows it."""
+    """Largest step of a match from one plane to the next [px], if `max_planes` allows it."""
     max_planes: int = 256
     """Largest number of planes, at least 8; memory is about 5 bytes per pixel and plane."""
     max_pixels: int = 200_000
@@ -46,7 +46,7 @@ class SweepConfig:
     small_step: float = 0.03
     """Penalty for a depth one plane off the neighbouring pixel's (P1); costs are in [0, 1]."""
     large_step: float = 0.5
-    """Penalty for any other depth (P2) where the image is even; less across the image's edges, but at least 1.5 P1."""
+    """Penalty for any other depth (P2) where the image is uniform; less across the image's edges, but at least 1.5 P1."""
     max_round_trip: float = 0.6
     """Largest error [px] of a round trip of a pixel through another view and back by that view's depth."""
     min_parallax: float = 0.5
@@ -56,18 +56,22 @@ class SweepConfig:
         if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
             raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
         if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
-            raise UsageError("sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2")
+            raise UsageError(
+                "sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2; found "
+                f"{self.max_planes}, {self.near_count}, {self.max_pixels}, {self.max_views}"
+            )
         for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
         if not max(self.large_step, 1.5 * self.small_step) <= MAX_LARGE_STEP:
             raise UsageError(
-                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}; the largest cost is 1"
+                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}, not {self.large_step} and "
+                f"{1.5 * self.small_step:g}"
             )
 
 
 def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return the positions [px] in the second image, shape [N, 2], of pixels [N, 2] at inverse depths [1/u] [N]; NaN behind."""
+    """Project pixels [N, 2] at inverse depths [1/u] [N] into the second image; return positions [px] [N, 2], NaN if behind."""
     check_pinhole(first)
     check_pinhole(second)
     rotation, translation = geometry.relative_pose(first, second)

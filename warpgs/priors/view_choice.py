@@ -12,7 +12,7 @@ from warpgs.geometry import check_pinhole
 from warpgs.scene import Camera
 
 SAMPLES = 4
-"""Pixels along either side of an image at which sight is sampled."""
+"""Number of sampled pixels along each side of an image."""
 DEPTHS = 3
 """Number of depths at each of these pixels."""
 LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
@@ -43,12 +43,12 @@ def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
 def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
     """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others.
 
-    After the view selection of multi-view stereo (Goesele et al. 2007; Yao et al. 2018 weigh the angle), with sampled points in
-    place of a reconstruction's.
+    The method follows the view selection of multi-view stereo (Goesele et al. 2007; angles are weighted as by Yao et al. 2018),
+    but samples points instead of using reconstructed ones.
 
     Args:
         cameras: Pinhole cameras of V views.
-        bounds: Nearest and farthest depth of each [u], 0 < near < far.
+        bounds: Nearest and farthest depth of each view [u], 0 < near < far.
     """
     turns, shifts = np.stack([c.viewmat[:3, :3] for c in cameras]), np.stack([c.viewmat[:3, 3] for c in cameras])
     K, centers = np.stack([c.K for c in cameras]), np.stack([c.center for c in cameras])
@@ -77,8 +77,8 @@ def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]
 def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
     """Return up to ``count`` views to compare a view with: the nearest cameras (ties by order) that share sight with it.
 
-    Views too near for depth are skipped: with the weight of their angles, the shared fraction is less than half. If none is
-    left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
+    Views too near for depth are skipped: their angles reduce `Sight.matching` to less than half of `Sight.overlap`. If no view
+    is left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
     most at the best angles gave fewer depths, and mostly lower PSNR (docs/decisions/013-any-capture.md).
 
     Args:

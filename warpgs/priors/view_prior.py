@@ -44,7 +44,7 @@ class PriorConfig:
     depth_guides: bool = False
     """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
     depth_size: int = 0
-    """Shorter side of the depth network's input [px], unless fixed; 0 for the value of FILE.onnx.json, else 384."""
+    """Shorter input side of the depth network [px], unless the file fixes it; 0 for FILE.onnx.json's value, else 384."""
     depth_multiple: int = 0
     """Divisor of both sides of the depth network's input [px]; 0 for the value of FILE.onnx.json, else 32.
     Depth Anything needs 14."""
@@ -55,7 +55,7 @@ class PriorConfig:
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
     segmentation_size: int = 0
-    """Shorter side of the segmentation network's input [px], unless fixed; 0 for the value of FILE.onnx.json, else 512."""
+    """Shorter input side of the segmentation network [px], unless the file fixes it; 0 for FILE.onnx.json's value, else 512."""
     segmentation_multiple: int = 0
     """Divisor of both sides of the segmentation network's input [px]; 0 for the value of FILE.onnx.json, else 32."""
     segmentation_mean: Colors | None = None
@@ -84,7 +84,7 @@ class PriorConfig:
             raise UsageError("--depth-output requires --depth-model; add it, or leave --depth-output out")
 
     def flags(self, kind: str) -> dict:
-        """Return the flags of the input of a network, ``kind`` depth or segmentation, keyed by the rest of their names."""
+        """Return the input flags of a network by name without prefix; ``kind`` is depth or segmentation."""
         return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
 
 
@@ -221,7 +221,8 @@ def view_priors(
         config: Networks and their inputs.
         depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
             only if no depth network is given.
-        regions: For each view the pixels that show its object, bool [H, W], or None; it replaces an unknown foreground.
+        regions: For each view the pixels that show its object, bool [H, W], or None; they replace saliency, or a foreground
+            that the network does not find.
         threads: CPU threads of a network; 0 for as many as the process may use.
         cache: Folder that keeps the maps of networks; no map is kept if the folder is None or ``config.cache`` is False.
         tell: Called with a line for each view.

@@ -75,7 +75,7 @@ def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
     if not (fx and fy):
         raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
     if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
-        raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide it by its [2, 2]")
+        raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide K by K[2, 2]")
     if max(abs(skew), abs(below)) > K_TOLERANCE:
         raise ValueError(
             f"{where} has a skew of {skew or below:g} px, which is not supported: K must be [[fx, 0, cx], [0, fy, cy], "
@@ -99,7 +99,7 @@ def _stretch_of(matrix: list[list[float]]) -> float:
 
 
 def _check_pose(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the pose is not rigid; it may mirror, since the mirrored image is right."""
+    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
     _check_finite(matrix, where)
     p, q, r, s = matrix[3]
     if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:

@@ -40,13 +40,13 @@ def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
 
 
 def chunks(frame: ChunkedFrame, inputs: ProjectInputs) -> Iterator[tuple[RenderSettings, torch.Tensor]]:
-    """Yield the settings of windows of at most ``frame.max_instances`` instances, with the tile counts [C, N] in each.
+    """Yield the settings of windows of at most ``frame.max_instances`` instances, with the tile counts [C, N] in each window.
 
-    Windows come from top to bottom; one with more instances is halved.
+    Windows come from top to bottom. A window with more instances is halved, unless it is a single tile.
 
     Args:
         frame: Settings.
-        inputs: The tensors, detached.
+        inputs: Tensors of Gaussians and cameras, detached.
     """
     left = [frame.settings.window]
     while left:
@@ -144,7 +144,7 @@ def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: P
         inputs: The tensors that ``projected`` was projected from.
 
     Returns:
-        z-depth [u], 0 where alpha is below 1/2, shape [C, H, W].
+        Depth [u], 0 where alpha is below 1/2, shape [C, H, W].
     """
     _, _, width, height = frame.settings.window
     depths = projected.new_empty(len(projected), height, width)
@@ -189,7 +189,7 @@ def blend_chunked(
     """Composite projected Gaussians chunk by chunk: the same images as `images_of` gives, to the bit.
 
     The backward pass renders each chunk again and adds up the gradients, so only the inputs are saved for it. This takes
-    about 1.5 times as long as `blend`, and the memory of one chunk's instances.
+    about 1.5 times as long as `blend`, but needs memory only for one chunk's instances.
 
     Args:
         projected: Result of `project` for the frame's window, shape [C, N, 12]; differentiable.

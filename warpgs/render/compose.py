@@ -25,7 +25,7 @@ from warpgs.runtime import interop
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
-"""Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected z-depth [C, H, W]."""
+"""Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected depth [C, H, W]."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Composed:
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
-    """Return an array as a tensor [C, ...] of the type and device of ``like``; for a single camera, it has ``axes`` axes."""
+    """Return an array as a tensor [C, ...] of the type and device of ``like``; ``axes`` is the array's ndim for one camera."""
     tensor: torch.Tensor = array
     if not (isinstance(array, torch.Tensor) and array.dtype == like.dtype and array.device == like.device):
         tensor = torch.as_tensor(array, dtype=like.dtype, device=like.device)
@@ -118,7 +118,7 @@ def bin_projected(
         tile_counts: Number of tiles of the window that each Gaussian touches, int32, shape [C, N].
         settings: Settings of the render.
         memory: Memory of the instances.
-        slotted: True for gradients and `weights_of`; False is faster (`bin_tiles`).
+        slotted: True if gradients or `weights_of` follow; False is faster (`bin_tiles`).
         listed: True for the tiles that get instances, bool, shape [C * tiles]; None for all tiles.
 
     Raises:
@@ -192,7 +192,7 @@ def weights_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) 
 
 
 def median_depth_of(projected: torch.Tensor, tiles: Tiles, settings: RenderSettings) -> torch.Tensor:
-    """Return the z-depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
+    """Return the depth [u] at which transmittance falls to one half, shape [C, H, W] (`median_depth`)."""
     return median_depth(projected, tiles, **settings.of_window())
 
 
@@ -221,7 +221,7 @@ def composite_into(
         backgrounds: Colour behind everything, contiguous, shape [C, 3].
         settings: Settings of the render.
         memory: Memory of the instances; its allocator provides all other tensors.
-        save: True where gradients will be taken.
+        save: True if gradients will be taken.
 
     Returns:
         The instances, and the tensors [...] that `blending.composite` returns.

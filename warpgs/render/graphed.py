@@ -36,8 +36,8 @@ from warpgs.runtime.device_memory import available_bytes
 MIN_CALLS = 3
 """Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and for instances, as multiples of the numbers that a call needs, or that an equal call before
-needed when it exceeded its capacity, if these are larger."""
+"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an equal call exceeded its capacity
+before, the larger number of both calls is used."""
 SPARE = 1024
 """Number that is added to both capacities."""
 MAX_PROJECTED = 2**23
@@ -110,7 +110,7 @@ class GraphedRasterizer:
         self._black: torch.Tensor | None = None
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None):
-        """Return images, projected Gaussians and tile counts; None if the instances exceed the capacity.
+        """Return images, projected Gaussians and tile counts; None if the call exceeds the capacity.
 
         Args:
             inputs: The tensors, without opacity factors.
@@ -142,7 +142,7 @@ class GraphedRasterizer:
         return images, projected, projection[1]
 
     def _inputs(self, gaussians, cameras: torch.Tensor) -> ProjectInputs:
-        """Return all inputs from the tensors of the Gaussians [...] and one flat tensor with those of the cameras, [F]."""
+        """Return all inputs; ``gaussians`` are five tensors [...], and ``cameras`` [F] holds the camera tensors, flattened."""
         first, second = 16 * self.cameras, 25 * self.cameras
         viewmats, Ks = cameras[:first].view(-1, 4, 4), cameras[first:second].view(-1, 3, 3)
         distortion = cameras[second:].view(self.cameras, self._coefficients)
@@ -184,7 +184,7 @@ class GraphedRasterizer:
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
-        """Return gradients of projected Gaussians [C, N, 12], and of backgrounds [C, 3] or None if the latter is not wanted."""
+        """Return gradients of projected Gaussians [C, N, 12], and of backgrounds [C, 3], or None if these are not wanted."""
         v_images = [None if v is None else v.contiguous() for v in v_images]
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:
@@ -255,7 +255,7 @@ class Recorder:
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the current calls; None before there were enough of them."""
+        """Rasterizer of the current calls; None before there were enough equal calls."""
         self.min_calls = MIN_CALLS
         """Number of equal calls in a row before kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
@@ -297,7 +297,7 @@ class Recorder:
             self.graphs.lock.release()
 
     def _make(self, inputs: ProjectInputs, settings: RenderSettings) -> None:
-        """Make the rasterizer, unless its lists would take too much memory."""
+        """Make the rasterizer, unless its instances would take too much memory."""
         needed = count_needed(inputs, settings)
         if self._exceeded[0] == self._key:
             needed = needed.or_more(self._exceeded[1])
@@ -334,9 +334,9 @@ def call_key(
 ) -> tuple | None:  # fmt: skip
     """Return the values that calls must have in common to use one rasterizer.
 
-    None for calls that cannot be captured, and for those that need not be: very large ones. ``backgrounds`` [C, 3] may be None.
-    Calls without ``gradients`` are captured only in the main thread: a viewer renders in another thread, beside a loop that may
-    wait for the whole device.
+    Return None for calls that cannot be captured, and for very large calls, where graphs gain nothing. ``backgrounds`` [C, 3]
+    may be None. Calls without ``gradients`` are captured only in the main thread: a viewer renders in another thread, beside a
+    loop that may wait for the whole device.
     """
     means, viewmats = inputs.means, inputs.viewmats
     cameras = viewmats.shape[0]  # len of a tensor takes ten times as long

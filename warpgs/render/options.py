@@ -42,10 +42,10 @@ class RasterizeOptions:
     sh_degree: int | None = None
     """Spherical-harmonics degree to use; None for the stored degree."""
     background: torch.Tensor | None = None
-    """Background colour, shape [3] or [C, 3], with ``colors`` [D] or [C, D]; None for black. Differentiable."""
+    """Background colour, shape [3] or [C, 3]; if ``colors`` has D channels, [D] or [C, D]. None for black. Differentiable."""
     colors: torch.Tensor | None = None
     """Colours that replace the spherical harmonics, shape [N, D], or [C, N, D] for different ones per camera. Any number of
-    channels D and finite values of any sign and size are allowed; they are never clamped. `Render.rgb` then has D channels.
+    channels D and finite values of any sign and size are allowed; values are never clamped. `Render.rgb` then has D channels.
     Differentiable; ``sh`` has no gradient then. None for the spherical harmonics."""
     features: torch.Tensor | None = None
     """Channels to render besides the colours, shape [N, D] or [C, N, D], with any values as in ``colors``. `Render.features`
@@ -53,7 +53,7 @@ class RasterizeOptions:
     feature_background: torch.Tensor | None = None
     """Background of the features, shape [D] or [C, D]; None for zeros. Differentiable."""
     tile_size: int = 16
-    """Side of a tile [px]: 8 or 16. Images depend on the side only with rule `inria`."""
+    """Side of a tile [px]: 8 or 16. The image depends on it only under rules with ``square_sigma``, such as inria."""
     contributions: bool = False
     """True to also return sum and maximum of each Gaussian's blending weight."""
     median_depth: bool = False
@@ -75,7 +75,7 @@ class RasterizeOptions:
     antialiased: bool = False
     """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting. It removes
     the brightness that widening by ``Rule.low_pass`` adds to Gaussians smaller than a pixel. Use it for models trained with
-    it."""
+    antialiasing."""
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
@@ -86,9 +86,9 @@ class RasterizeOptions:
     must be multiples of ``tile_size`` or edges of the image. None for the whole image."""
     pixels: torch.Tensor | None = None
     """Pixels to render instead of an image: integers (column, row), shape [P, 2], or [C, P, 2] for different ones per camera.
-    Images of `Render` then have P instead of H, W. Their values equal those of the whole image bit for bit, with gradients.
-    Only tiles with a listed pixel are blended. Not with ``window``, ``contributions`` or ``capacity``. None for the whole
-    image."""
+    Images of `Render` then have P instead of H, W. Their values equal the whole image's values at these pixels, bit for bit.
+    Differentiable. Only tiles with a listed pixel are blended. Not with ``window``, ``contributions`` or ``capacity``. None for
+    the whole image."""
     max_instances: int | None = None
     """Largest number of (Gaussian, tile) instances at a time. An image with more is rendered in chunks, and each chunk again
     for its gradients. This gives the same image with less memory and more time. None for no limit. Not with ``capacity``."""

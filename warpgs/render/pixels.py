@@ -55,7 +55,7 @@ def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -
     """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
     (x, y, width, height), size = settings.window, settings.tile_size
     columns, rows = grid(width, height, size)
-    places = (pixels[..., 1] - y) // size * columns + (pixels[..., 0] - x) // size  # the edge of a window lies on tiles
+    places = (pixels[..., 1] - y) // size * columns + (pixels[..., 0] - x) // size  # windows begin at edges of tiles
     places = places + columns * rows * torch.arange(cameras, device=pixels.device)[:, None]
     listed = torch.zeros(cameras * columns * rows, dtype=torch.bool, device=pixels.device)
     listed[places.reshape(-1)] = True

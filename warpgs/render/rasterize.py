@@ -44,23 +44,23 @@ TILE_SIZES = (8, 16)
 """Supported sides of a tile [px]."""
 
 BOUND_ROUNDING = 2.0**-29
-"""Largest rounding error of a float64 render, as a fraction of the largest colour. If every alpha is off by a fraction e, a
-colour is off by at most 2 e: alpha shifts weight between its own colour and those behind, and the weights sum to 1. The unit of
-float64 is 2^29 times finer than that of float32, so e is at most 2^-30 if the error of a float32 alpha is at most one half."""
+"""Largest rounding error of a float64 render, as a fraction of the largest colour. A relative error e of every alpha changes a
+colour by at most 2 e: alpha shifts weight between its own colour and the colours behind, and the weights sum to 1. float64
+rounds 2^29 times finer than float32, so e is at most 2^-30 if the relative error of a float32 alpha is at most 1/2."""
 
 
 WITHOUT_GRADIENT = ("weight_sums", "weight_maxima", "median_depth", "heaviest_weights", "error_bound")
-"""Real-valued outputs without a gradient: `Render` rejects a gradient through them."""
+"""Real-valued outputs without a gradient: a backward pass through them raises an error."""
 
 ARGUMENTS = ((Gaussians, ActivatedGaussians, CovarianceGaussians), (Camera,), (RasterizeOptions,))
 """Types of the arguments of `rasterize`."""
 
 
 def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
-    """Return the rule that the options name, with their near and far plane.
+    """Return the rule that the options name, with the near and far plane of the options.
 
     Raises:
-        UsageError: The rule, the tile size or the camera model is unknown, or options exclude each other.
+        UsageError: The rule, the tile size or the camera model is unknown; or options exclude each other or are out of range.
         ValueError: The near or the far plane is outside its range.
     """
     rule = options.rule if isinstance(options.rule, Rule) else rule_named(options.rule)
@@ -72,14 +72,14 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
         raise UsageError(f"tile size {options.tile_size} is not one of {', '.join(map(str, TILE_SIZES))}")
     check_camera(camera)
     if options.heaviest < 0:
-        raise UsageError(f"heaviest must be at least 0, not {options.heaviest}")
+        raise UsageError(f"RasterizeOptions.heaviest must be at least 0, not {options.heaviest}")
     if options.max_instances is not None and (options.capacity is not None or options.max_instances < 1):
         raise UsageError(
             "max_instances must be at least 1, and cannot be combined with capacity; found "
             f"max_instances={options.max_instances}, capacity={options.capacity}"
         )
     if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
-        raise UsageError("pixels cannot be combined with window, contributions or capacity: leave those out")
+        raise UsageError("pixels cannot be combined with window, contributions or capacity: leave them out")
     if options.capacity is not None and options.capacity > MAX_INSTANCES:
         raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
     if options.error_bound and options.capacity is not None:
@@ -88,19 +88,19 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
 
 
 def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> None:
-    """Check types, and the shapes of the camera; shapes of other tensors are checked where the tensors are used.
+    """Check types, the camera's arrays, and the shape of ``sh``; other shapes are checked where the tensors are used.
 
     Values of Gaussians are not checked; Gaussians with non-finite values are culled.
 
     Raises:
-        TypeError: An argument, or an array of the camera, has the wrong type.
+        TypeError: An argument, a field of the Gaussians, or an array of the camera has the wrong type.
         UsageError: There is a feature background but no features, or the Gaussians have no colours.
-        ValueError: A shape or a number of the camera is wrong (`check_arrays`).
+        ValueError: A shape or a number of the camera (`check_arrays`), or the shape of ``sh``, is wrong.
     """
     for name, given, kinds in zip(("gaussians", "camera", "options"), (gaussians, camera, options), ARGUMENTS, strict=True):
         if not isinstance(given, kinds):
             listed = isinstance(given, (list, tuple))
-            order = "lists require a list of cameras" if listed else "the order is rasterize(gaussians, camera, options)"
+            order = f"a list of {name} requires a list of cameras" if listed else "call rasterize(gaussians, camera, options)"
             wanted = " or ".join(", ".join(kind.__name__ for kind in kinds).rsplit(", ", 1))
             raise TypeError(f"{name} must be an instance of {wanted}, not {type(given).__name__}; {order}")
     if gaussians.sh is None and options.colors is None:
@@ -138,7 +138,7 @@ def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
 
 
 def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInputs) -> torch.Tensor | None:
-    """Return channels [N, D] or [C, N, D] with an axis of cameras, [1, N, D] or [C, N, D].
+    """Return channels, given as [N, D] or [C, N, D], in shape [1, N, D] or [C, N, D].
 
     Raises:
         TypeError: The channels are not a tensor, or have another scalar type than the Gaussians.
@@ -181,7 +181,7 @@ class _Layer(NamedTuple):
 
 
 def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
-    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is that of the option.
+    """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option.
 
     Raises:
         TypeError: The background does not hold real numbers, or is sparse.
@@ -227,7 +227,8 @@ def rasterize(
         gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
             covariances and opacities (`CovarianceGaussians`).
         camera: One camera ([4, 4], [3, 3]), or a batch of C cameras with one image size ([C, 4, 4], [C, 3, 3]). Or a list of
-            these, of any sizes; then ``gaussians`` and ``options`` are shared by all, or lists of the same length.
+            cameras and batches, of any image sizes; then ``gaussians`` and ``options`` are lists of the same length, or single
+            values for all cameras.
         options: Options.
 
     Returns:
@@ -237,11 +238,12 @@ def rasterize(
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than is available.
         TypeError: An argument has the wrong type; or a scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other, a
-            transform of torch.func is active, or a second derivative is requested.
+        UsageError: The rule, the tile size or the camera model is unknown, the window cuts tiles, options exclude each other or
+            are out of range, a transform of torch.func is active, or a second derivative is requested.
         ValueError: A shape or device is wrong (the message names argument, expected and found); the near or far plane is out
             of range; a pixel is outside the image; or lists differ in length. For cameras that are not on a GPU, also: an array
-            has a non-finite number, ``K`` has a skew, ``viewmat`` scales or shears, or either has a wrong last row.
+            has a non-finite number, ``K`` has a skew or a focal length of 0, ``viewmat`` scales or shears, or either matrix has
+            a wrong last row.
     """
     if torch.compiler.is_dynamo_compiling():
         torch._dynamo.graph_break(msg="rasterize runs outside of compiled graphs: leave out fullgraph=True")
@@ -309,7 +311,7 @@ def _refusing_gradients(render: Render) -> Render:
 
 @torch.no_grad()
 def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
-    """Return the bound of the error of colours [..., H, W, D], shape [..., H, W]; see `RasterizeOptions.error_bound`."""
+    """Return a bound [..., H, W] on the error of colours [..., H, W, D]; see `RasterizeOptions.error_bound`."""
 
     def doubled(holder: Any) -> dict[str, Any]:
         values = {f.name: getattr(holder, f.name) for f in fields(holder)}

@@ -66,7 +66,7 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
 def _pixels(
     camera: Camera, K: torch.Tensor, lens: torch.Tensor | None, positions: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the pixels [N, 2] of positions in the camera [N, 3], and the Jacobians [N, 2, 3] of the projection."""
+    """Return projected positions [px], shape [N, 2], of ``positions`` [N, 3] in camera axes, and the Jacobians [N, 2, 3]."""
     z, focal, center = positions[:, 2:], torch.stack([K[0, 0], K[1, 1]]), K[:2, 2]
     size = torch.tensor([camera.width, camera.height], dtype=torch.float64, device=K.device)
 

@@ -43,8 +43,8 @@ def select_rule(
         The name of the rule, and its largest measured error over the views.
 
     Raises:
-        UsageError: No rule keeps the limit, ``cameras`` is empty or one camera, the limit is not a positive number, or the
-            measure is unknown.
+        UsageError: No rule keeps the limit, ``cameras`` is empty or a single camera, ``max_error`` is not a positive number, or
+            the measure is unknown.
     """
     if not (isinstance(max_error, Real) and 0 < max_error < math.inf):
         raise UsageError(f"max_error must be a positive number, such as 0.002, not {max_error!r}")
@@ -66,6 +66,6 @@ def select_rule(
         else:
             return rule, error
     raise UsageError(
-        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, float32 rounding alone gives {error:.1e}; "
-        "raise max_error, or render float64 tensors"
+        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}; raise "
+        "max_error, or give the Gaussians as float64"
     )

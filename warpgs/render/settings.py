@@ -46,11 +46,11 @@ class RenderSettings:
         return ProjectSettings(size, self.window, count, self.rule, self.tile_size, *variant)
 
     def of_window(self) -> dict[str, Any]:
-        """Return size, position and cut-offs of the window, as keyword arguments of binning and blending."""
+        """Return the window's size and position, and the rule, as keyword arguments of binning and blending."""
         x, y, width, height = self.window
         return {"width": width, "height": height, "rule": self.rule, "origin": (x, y)}
 
     def blending(self, deterministic: bool = True) -> BlendSettings:
-        """Return the settings of blending; ``deterministic`` sums gradients in a fixed order."""
+        """Return the settings of blending; True for ``deterministic`` sums gradients in a fixed order."""
         x, y, width, height = self.window
         return BlendSettings((x, y), width, height, self.rule, deterministic, self.absgrad)

@@ -14,7 +14,7 @@ def parse_bytes(text: str) -> int:
     """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes.
 
     Raises:
-        UsageError: The text is not a size, is below one byte, or exceeds 64 bits.
+        UsageError: The text is not a size, or the size is below one byte or not below 2^63.
     """
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}

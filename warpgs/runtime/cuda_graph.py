@@ -1,6 +1,6 @@
 """CUDA graphs of torch's and Warp's kernels: capture, replay, memory, and functions with a graph for each set of addresses.
 
-`CapturedGraph` is one graph. `GraphedFunction` captures a function of tensors wherever it meets the same addresses again.
+`CapturedGraph` is one graph. `GraphedFunction` captures a function of tensors once for each set of addresses, and replays it.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class CapturedGraph:
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
         """Capture the work; nothing runs yet.
 
-        The caller lets ``stream`` wait for what ``work`` reads, and other streams wait for ``stream`` where they need it.
+        The caller lets ``stream`` wait for what ``work`` reads, and lets other streams wait for ``stream`` if necessary.
 
         Args:
             work: A function that neither reads from the device nor loads kernels: call it once before, to load them.

@@ -1,4 +1,4 @@
-"""CUDA text: the bodies of native functions, which lie as files in the folder ``cuda`` of the kernels."""
+"""CUDA text: the bodies of native functions, which are files in the folder ``cuda`` of the kernels."""
 
 import importlib.resources
 import re

@@ -93,7 +93,7 @@ def container_memory(own: Path | None = None, mount: Path | None = None) -> Memo
 
     Only Linux has control groups; on other systems, and without a limit, this is None. Both versions are read, from the
     process's own group up to the root, since every group above counts too (kernel documentation, cgroup-v2 "Memory" and
-    cgroup-v1 "Memory Resource Controller"). Pages of files not used lately count as free: the kernel drops them first.
+    cgroup-v1 "Memory Resource Controller"). Cached files that were not used lately count as free: the kernel drops them first.
 
     Args:
         own: File that lists the process's groups; None for /proc/self/cgroup.
@@ -125,7 +125,7 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
 
 
 def _system_memory() -> Memory | None:
-    """Return what psutil finds; its source differs between systems, and access to any of them may be denied."""
+    """Return what psutil finds; None where psutil is missing or the system denies access."""
     try:
         import psutil
 

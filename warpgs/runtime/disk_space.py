@@ -10,7 +10,7 @@ from pathlib import Path
 from warpgs.files import FULL
 
 WORDS = (*map(os.strerror, FULL), "disk is full", f"[Errno {errno.ENOSPC}]", f"[Errno {errno.EDQUOT}]")
-"""Parts of messages of systems, SQLite and Python on a full disk."""
+"""Parts of the messages that systems, SQLite and Python give for a full disk."""
 MIN_FREE = 2**16
 """Free space below which a disk counts as full [bytes]: some libraries fail without such a message."""
 

@@ -44,10 +44,10 @@ def use_utf8_names() -> None:
 
 @contextlib.contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
-    """Give a name of a file that a library can take: its own if that is UTF-8, else a path through an open folder or file.
+    """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its open folder or of the file.
 
     Args:
-        path: The file. The name of a file to be written must be UTF-8; that of its folder need not.
+        path: The file. A file to be written must have a UTF-8 name; its folder need not.
 
     Raises:
         UsageError: The name is not UTF-8, and this system has no other path to the file.

@@ -41,10 +41,11 @@ CHUNKS_PER_THREAD = 8
 """Ranges per thread of a CPU launch: several, so that a few heavy tiles do not hold up the rest."""
 
 FEW_THREADS = 4
-"""Number of threads above which each gets half as many ranges: Python hands them out one at a time."""
+"""Number of threads above which each gets half as many ranges: Python hands out ranges one at a time."""
 
 SERIAL_WORK = 20_000
-"""Work (items times cost) below which a launch stays on its thread: a hand-over costs 50 us. A range has at least half this."""
+"""Work (items times cost) below which a launch stays on the calling thread: a hand-over costs 50 us. A range has at least half
+as much work, unless there would be fewer ranges than threads."""
 
 MAX_SIZE = 2**31 - 1
 """Largest number of entries of an axis, and of items of a launch: Warp indexes them with signed 32-bit integers."""
@@ -90,7 +91,7 @@ class View(NamedTuple):
     tensor."""
 
     def shape(self) -> tuple[int, ...]:
-        """Return the sizes of the axes that a kernel sees, those of a vector type included."""
+        """Return the sizes of the axes that a kernel sees, and of the axes of a vector type."""
         if self.axes is None:
             return tuple(self.tensor.shape)
         if self.axes == 0:
@@ -141,7 +142,7 @@ def span(tensor: torch.Tensor, dtype) -> View:
 
 
 def warp_device(device: torch.device) -> wp.Device:
-    """Return Warp's object for a torch device, also for one without a number."""
+    """Return Warp's object for a torch device, also for a CUDA device without a number."""
     if device.type == "cuda" and device.index is None:
         device = torch.device("cuda", torch.cuda.current_device())
     return wp.device_from_torch(device)
@@ -155,7 +156,7 @@ def _several_devices() -> bool:
 def _current(device: torch.device):
     """Return a context in which a CUDA device is current; afterwards the caller's device is current again.
 
-    Warp makes a device current when it works there, and leaves it so; torch takes that for the caller's choice.
+    Warp makes a device current when it works there, and does not restore the device before it; torch then uses Warp's device.
     """
     return torch.cuda.device(device) if _several_devices() else contextlib.nullcontext()
 
@@ -180,14 +181,14 @@ def _is_struct(value) -> bool:
 
 _LOADING = threading.Lock()
 """Lock held while a CPU module is loaded, since several threads must not compile at once. In debug mode it is also held while a
-kernel runs, since these kernels are not thread-safe either."""
+kernel runs, since kernels of that mode are not thread-safe."""
 _SORTING = threading.RLock()
 """Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
 
 
 @contextlib.contextmanager
 def stream_of(device: torch.device):
-    """Run Warp's own work (sorts, scans) on torch's current stream of that device; does nothing on a CPU.
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; do nothing on a CPU.
 
     Kernels started with `launch` need no such context.
     """
@@ -213,9 +214,8 @@ def _copied(struct):
 class _Recorded:
     """A kernel with a launch that is recorded once; later calls only replace its arguments.
 
-    ``wp.launch`` packs and checks every argument anew, which was measured at 47 us on an H200's host, more than most kernels
-    here take, and at 140 us on a CPU of 2.6 GHz. The recorded launch keeps the packed arguments; a call writes pointers, sizes
-    and scalars into them.
+    ``wp.launch`` packs and checks every argument anew. That took 47 us on an H200's host and 140 us on a CPU of 2.6 GHz. The
+    recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
     """
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
@@ -280,7 +280,7 @@ def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
 
 
 class _OfThread(threading.local):
-    """Recorded launches on the CPU by kernel, for each thread: two may launch a kernel at once, with different arguments."""
+    """Recorded launches on the CPU by thread and kernel: two threads may launch a kernel at once, with different arguments."""
 
     def __init__(self):
         self.recorded: dict[object, _Recorded] = {}
@@ -371,7 +371,7 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
         The sizes by letter.
 
     Raises:
-        TypeError: An argument is not a tensor, or sparse, or its scalar type is neither float32 nor float64, or types differ.
+        TypeError: An argument is not a tensor or is sparse, a scalar type is neither float32 nor float64, or types differ.
         ValueError: A shape or a device is wrong; the message names the argument and both values, expected and found.
     """
     sizes: dict[str, int] = {}

@@ -51,7 +51,7 @@ def prepare_kernel_cache() -> KernelCache:
 
 
 def choose_kernel_cache(configured: str | None = None) -> KernelCache:
-    """Choose the folder: ``configured``, else WARP_CACHE_PATH, else Warp's default; if that one is unusable, a private folder.
+    """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable.
 
     Args:
         configured: Value of ``warp.config.kernel_cache_dir``: set by the user's program, or by Warp once started.

@@ -1,6 +1,6 @@
 """Guards of all servers: sockets of this machine only, and checks of the clients of a served page.
 
-Any web page can send requests to every port of the machine that shows it, and so can every program of every user of the
+Any web page can send requests to every port of the machine that shows the page, and so can every program of every user of the
 machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start, and checks
 ``Host`` and ``Origin`` first.
 """
@@ -116,7 +116,7 @@ def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
 
 
 def is_loopback(address: str) -> bool:
-    """Return whether an address of a socket is one that only this machine reaches."""
+    """Return whether only this machine can reach a socket's address."""
     found = ipaddress.ip_address(address.partition("%")[0])
     return (getattr(found, "ipv4_mapped", None) or found).is_loopback
 

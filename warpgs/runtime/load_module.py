@@ -1,4 +1,4 @@
-"""Loading of Warp modules: each is compiled by one process, and one thread of it, while all others that need it wait."""
+"""Loading of Warp modules: one thread of one process compiles a module, while all others that need the module wait."""
 
 from __future__ import annotations
 

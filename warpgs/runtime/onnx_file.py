@@ -11,7 +11,7 @@ from pathlib import Path
 from warpgs.errors import DataError
 
 DOMAINS = ("", "ai.onnx", "ai.onnx.ml", "com.microsoft")
-"""Operator sets that onnxruntime has itself; any other needs a library of foreign code, or a function in the file."""
+"""Operator sets that onnxruntime contains; any other needs a library of foreign code, or a function in the file."""
 MAX_NESTING = 32
 """Largest depth of graphs within graphs (If, Loop, Scan) that is accepted."""
 
@@ -24,7 +24,7 @@ ATTRIBUTE_TENSORS, ATTRIBUTE_GRAPHS, ATTRIBUTE_SPARSE = (5, 10), (6, 11), (22, 2
 SPARSE_TENSORS = (1, 2)
 TENSOR_NAME, TENSOR_EXTERNAL, TENSOR_LOCATION = 8, 13, 14
 MAX_FIELD = 2**29 - 1
-"""Largest field number of protobuf; its parser drops the higher bits, so that a larger one would stand for another field."""
+"""Largest field number of protobuf; its parser drops the higher bits, so that a larger number would stand for another field."""
 
 Message = list[tuple[int, "int | memoryview"]]
 
@@ -122,7 +122,7 @@ class _Walk:
 
 
 def check_onnx(data: bytes, path: Path) -> None:
-    """Check that bytes are an ONNX model that needs nothing but itself: no external data, no operators of other domains.
+    """Check that bytes are an ONNX model without external data and without custom operators.
 
     Args:
         data: The whole file.
@@ -136,7 +136,7 @@ def check_onnx(data: bytes, path: Path) -> None:
         model = _message(memoryview(data))
         graphs, functions = list(_parts(model, MODEL_GRAPH)), list(_parts(model, MODEL_FUNCTION))
         if len(graphs) != 1 or not any(n == MODEL_OPSET for n, _ in model):
-            raise ValueError("it has no graph" if not graphs else "it names no operator set")
+            raise ValueError("it has no graph" if not graphs else "it has several graphs, or names no operator set")
         # exporters store compositions of standard operators as functions in the file
         walk = _Walk(path, {(_text(f, FUNCTION_DOMAIN), _text(f, FUNCTION_NAME)) for f in functions})
         walk.graph(graphs[0])

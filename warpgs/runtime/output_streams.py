@@ -34,7 +34,7 @@ def open_missing_descriptors() -> None:
 
 
 def _send_to_null(number: int) -> None:
-    """Point a descriptor at the null device; if no further descriptor can be opened, keep it."""
+    """Point a descriptor at the null device; leave it unchanged if no further descriptor can be opened."""
     with contextlib.suppress(OSError):
         null = os.open(os.devnull, os.O_RDWR)
         if null == number:  # it was closed, and the lowest free descriptor
@@ -134,7 +134,7 @@ class CarefulOutput:
         self.stdout, self.stderr, self.is_product = stdout, stderr, is_product
 
     def exit_code(self, code: int) -> int:
-        """Return ``code``, or that of a ResourceError if the command succeeded but its only result could not be written."""
+        """Return ``code``, or the code of ResourceError if the command succeeded but its only result could not be written."""
         self.stdout.flush()
         self.stderr.flush()
         failure = self.stdout.failure

@@ -15,7 +15,7 @@ def open_to_others(folder: Path, depth: int = 0) -> Path | None:
 
     Args:
         folder: An existing folder, without links in its path.
-        depth: Levels of its contents that are checked as well.
+        depth: Levels of the folder's contents that are checked as well.
     """
     if not hasattr(os, "getuid"):
         return None
@@ -47,7 +47,7 @@ def _writable_by_others(found: os.stat_result, trusted: set[int]) -> bool:
 
 
 def _is_own_group(gid: int) -> bool:
-    """Return whether a group is that of this user alone, which many systems make for each user under the user's number."""
+    """Return whether a group belongs to this user alone: many systems make one per user, with the user's name or number."""
     import grp
     import pwd
 

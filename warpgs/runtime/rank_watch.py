@@ -85,7 +85,7 @@ class RankWatch:
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
-        """Return the text ``own`` of each process, once all have called this; if one is lost, the thread ends this process."""
+        """Return the text ``own`` of each process, once all called this; if a rank is lost, the thread ends this process."""
         names = [f"text/{r}" for r in range(self.count)]
         self.store.set(names[self.rank], own)
         while not self.store.check(names):
@@ -141,7 +141,7 @@ class RankWatch:
         self._keep_store()
 
     def _keep_store(self) -> None:
-        """Wait, as rank 0, until the others have read that the fit ends: the store may end with this process."""
+        """Give the others time, as rank 0, to read that the fit ends: the store may end with this process."""
         if self.rank == 0:
             time.sleep(3 * BEAT_SECONDS)
 

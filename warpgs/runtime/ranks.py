@@ -62,7 +62,7 @@ class Ranks:
         found.copy_(own)
 
     def texts(self, own: str) -> list[str]:
-        """Return the text ``own`` of each process, in the order of ranks; every process must call this once."""
+        """Return the text ``own`` of each process, in the order of ranks; every process must call this exactly once."""
         return [own]
 
     def part(self) -> None:
@@ -200,7 +200,7 @@ def join(device: str) -> Ranks:
 
 
 def _store(address: str, port: int, count: int, home: str | None, *, hosts: bool) -> dist.Store:
-    """Return a connection to the store of all ranks, which this process ``hosts`` or not; ``home`` is that of `_stay_home`."""
+    """Connect to the store of all ranks; this process holds it if ``hosts``. ``home`` is the result of `_stay_home`."""
     import torch.distributed as dist
 
     own = {}
@@ -225,7 +225,7 @@ def _take_gpu(rank: int, local: int) -> None:
 
 
 def _stay_home(address: str) -> str | None:
-    """Have gloo and NCCL listen at the loopback interface where all ranks are on this machine; return its address.
+    """Have gloo and NCCL listen at the loopback interface if all ranks are on this machine; return its address, else None.
 
     Interfaces that the user has set are not changed.
 

@@ -17,7 +17,7 @@ def _array_at(address: int, size: int, dtype: object, device: torch.device) -> w
 def sort_pairs(keys: interop.View, values: interop.View, count: int, **bits: int) -> None:
     """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace.
 
-    On a GPU it runs on the stream of `interop.stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
+    On a GPU the sort runs on the stream of `interop.stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
     """
     arrays = (_array_at(t.data_ptr(), t.numel(), dtype, t.device) for t, dtype, _ in (keys, values))
     wp.utils.radix_sort_pairs(*arrays, count, **bits)

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 FLOAT = 4
 """Bytes of a float32 or int32."""
 BINNING, LOSS, BLENDING, PROJECTION, SAMPLING = "binning", "loss", "blending", "projection", "sampling"
-"""Moments at which a step may need most memory: while instances are sorted, while the loss and its gradient are computed, in
-the backward passes of blending and of projection, and while a sampling event renders a view."""
+"""Moments at which a step may need the most memory: while instances are sorted, while the loss and its gradient are computed,
+in the backward passes of blending and of projection, and while a sampling event renders a view."""
 STEP = (BINNING, LOSS, BLENDING, PROJECTION)
 """Moments of every step."""
 

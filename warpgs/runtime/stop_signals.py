@@ -15,9 +15,9 @@ AGAIN = 0.05
 
 
 def _heeded() -> list[signal.Signals]:
-    """Return the signals that end this process: none that it was started to ignore (nohup, a shell's job in the background).
+    """Return the signals that end this process, without those that it was started to ignore (by nohup, or in the background).
 
-    Only the main thread may handle signals; in another one they keep their default action.
+    The list is empty in other threads than the main thread, which alone may handle signals.
     """
     if threading.current_thread() is not threading.main_thread():
         return []
@@ -49,8 +49,8 @@ def _send(number: signal.Signals) -> None:
 def interrupting_signals() -> Iterator[None]:
     """Raise KeyboardInterrupt in the body when a signal comes.
 
-    Python discards an exception that is raised in a destructor or in a callback of a weak reference. A signal that comes during
-    one is sent again.
+    Python discards an exception that is raised in a destructor or in a callback of a weak reference. A signal that comes there
+    is sent again.
     """
     before = sys.unraisablehook
 
@@ -78,9 +78,9 @@ def interrupting_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[Callable[[], bool]]:
-    """Note the first signal, so that the body can end normally; a second one raises KeyboardInterrupt in it.
+    """Note the first signal, so that the body can end normally; a second one raises KeyboardInterrupt in the body.
 
-    Gives a function that returns whether a signal came.
+    Yields a function that returns whether a signal came.
     """
     came = False
 

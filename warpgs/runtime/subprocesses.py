@@ -18,17 +18,17 @@ ENDS_WITH_PARENT = (
     "import os as _os, threading as _threading\n"
     "_threading.Thread(target=lambda: (_os.read(0, 1), _os._exit(1)), daemon=True).start()\n"
 )
-"""Beginning of a program that ends once its stdin does."""
+"""Beginning of a program that ends once its stdin ends."""
 
 
 def end_with_parent() -> None:
-    """Have this process end with its parent, even if that is killed: the stdin of this process ends then."""
+    """Have this process end with its parent, even if the parent is killed: the stdin of this process ends then."""
     threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
 
 
 @contextlib.contextmanager
 def _stdin_until_our_end() -> Iterator[int]:
-    """Give a child an empty stdin; the child ends once that closes, with the block or with this process."""
+    """Give a child an empty stdin, which closes at the end of the block or of this process; the child then ends."""
     read, write = os.pipe()
     try:
         yield read
@@ -74,7 +74,7 @@ class ProcessFailed(Exception):
     """A process that ended with another exit code than 0."""
 
     def __init__(self, code: int, errors: str):
-        """Keep the exit code, negative for a signal, and what it wrote to stderr."""
+        """Keep the exit code, negative for a signal, and the text that the process wrote to stderr."""
         super().__init__(f"exit code {code}")
         self.code, self.errors = code, errors
 
@@ -125,7 +125,7 @@ class ProgramResult(NamedTuple):
     """Exit code; 1 if the program could not be run or took too long."""
     output: str
     errors: str
-    """Text of stderr, or the reason why it could not be run."""
+    """Text of stderr, or the reason why the program could not be run or was ended."""
 
 
 def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
@@ -153,7 +153,7 @@ class PythonWorker:
     """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
 
     As in `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
-    stops at the end of its stdin, which also follows if the parent is killed.
+    stops at the end of its stdin, which also ends if the parent is killed.
     """
 
     def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):
@@ -186,12 +186,15 @@ class PythonWorker:
         return True
 
     def lines(self) -> Iterator[str]:
-        """Yield the lines that it answers, until it ends."""
+        """Yield the lines that the process answers, until the process ends."""
         assert self._process.stdout is not None
         yield from self._process.stdout
 
     def end(self, seconds: float) -> tuple[int, str]:
-        """Close the stdin of the process, kill it after ``seconds``; return its exit code and the end of its stderr."""
+        """Close the stdin of the process, and kill it if it still runs after ``seconds``.
+
+        Returns its exit code, and the last 2000 bytes of its stderr as text.
+        """
         with contextlib.suppress(OSError):
             if self._process.stdin is not None:
                 self._process.stdin.close()

@@ -43,13 +43,13 @@ def be_quiet() -> None:
 
 
 def say(line: object = "", *, error: bool = False) -> None:
-    """Print one line at once: `printable`, and with codes for the letters that the terminal does not have.
+    """Print one `printable` line at once, with codes for letters that the terminal does not have.
 
-    If it cannot be written, one line is printed on stderr, and the program continues.
+    If stdout cannot be written, one line on stderr reports that, and the program continues.
 
     Args:
         line: The line.
-        error: Whether it goes to stderr, not to stdout.
+        error: True to print on stderr instead of stdout.
     """
     global _lost
     if _quiet and not error:
@@ -93,7 +93,7 @@ def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: 
 
 
 def accept_all_letters() -> None:
-    """Print letters that the terminal does not have as codes, also in the output of other libraries to stdout and stderr."""
+    """Print codes for letters that the terminal does not have, also in the output of other libraries to stdout and stderr."""
     for stream in (sys.stdout, sys.stderr):
         reconfigure = getattr(stream, "reconfigure", None)
         if reconfigure is not None:

@@ -50,7 +50,7 @@ def _frame(axis: np.ndarray, near: tuple[float, float, float] = (0.31, 0.23, 0.9
 
 
 def _around(angle: float, radius: float, z: float) -> np.ndarray:
-    """Return the point [3] at an angle [rad] around the vertical axis, ``radius`` [u] off it, ``z`` [u] high."""
+    """Return the point [3] at an angle [rad] around the vertical axis, at distance ``radius`` [u] and height ``z`` [u]."""
     return np.array([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
@@ -62,7 +62,7 @@ def _rod(a: np.ndarray, b: np.ndarray, size: float, texture: raycast.Texture) ->
 
 
 def _body(rng: np.random.Generator, surface: Surface) -> raycast.Shape:
-    """Return the bulky shape in the middle: a ball, a box or a drum within 0.55 u of the vertical axis."""
+    """Return the bulky shape in the middle: a ball, a box or a drum within 0.71 u of the vertical axis."""
     size, turn = rng.uniform(0.4, 0.5), rng.uniform(0, TAU)
     kind = rng.integers(3)
     if kind == 0:
@@ -166,7 +166,7 @@ def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
         height: Image height [px].
 
     Returns:
-        The cameras in the order of the ring; a sphere of radius `REACH` around the origin nearly fills their shorter side.
+        The cameras in the order of the ring; a sphere of radius `REACH` around the origin nearly fills the shorter image side.
     """
     focal = 0.48 * min(width, height) / np.tan(np.arcsin(REACH / DISTANCE))
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])

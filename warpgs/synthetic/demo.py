@@ -1,7 +1,7 @@
 """The demo scene: a textured still life, ray cast here and written as a COLMAP folder, so that a fit needs no download.
 
 Six images suffice to reconstruct it: everything is smooth and matte, and the training views surround the held-out ones. But
-training images cannot be copied: between neighbouring views the pattern moves by more than half its period, so neither a
+copies of training images do not help: between neighbouring views the pattern moves by more than half its period, so neither a
 training image nor a mean of training images resembles a held-out view pixel by pixel.
 """
 
@@ -137,8 +137,8 @@ def _project(camera: Camera, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.ndarray) -> np.ndarray:
     """Return True for points that a camera sees well enough for a feature detector.
 
-    A point counts if the rays through its projection and 1.5 px around it all hit the point's own shape, and the middle
-    ray hits the point itself. Points on a silhouette, where a pixel mixes two surfaces, do not count.
+    A point counts if the ray through its projection hits the point itself, and the rays 1.5 px around hit the point's own
+    shape. Points on a silhouette, where a pixel mixes two surfaces, do not count.
 
     Args:
         shapes: Shapes of the scene.

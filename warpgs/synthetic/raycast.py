@@ -38,7 +38,7 @@ class Texture:
     phases: np.ndarray
     """Phases [rad]: the three of the checker, then one for every wave, shape [3 + W]."""
     softness: float = 2.8
-    """Gain before the tanh that rounds the checker's edges: a larger one makes crisper edges."""
+    """Gain before the tanh that rounds the checker's edges: a larger gain makes crisper edges."""
 
     def __call__(self, p: np.ndarray) -> np.ndarray:
         """Return the albedo at local positions.
@@ -71,8 +71,8 @@ class Shape(abc.ABC):
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
     """Rotation world_from_local, shape [3, 3]."""
     shading: float = 0.8
-    """Radius of the sphere that casts the shadow of the shape, over that of its bounding sphere; 0 for thin shapes, which cast
-    no shadow, because that of a sphere would be too large."""
+    """Radius of the sphere that casts the shadow of the shape, divided by the radius of its bounding sphere; 0 for thin shapes,
+    which cast no shadow, because a sphere's shadow would be too large."""
 
     @property
     def radius(self) -> float:

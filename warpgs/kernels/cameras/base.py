@@ -31,14 +31,14 @@ class CameraModel:
 
         ``pixel_of(position, K, lens) -> vec2``: The projected position [px].
 
-        ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is evaluated [px]: ``pixel``, clamped to the
-        image plus a margin, because a first-order expansion is too inaccurate far outside the image.
+        ``expansion_point(pixel, width, height) -> vec2``: The pixel at which J is evaluated [px]: ``pixel``, or ``pixel``
+        clamped to the image plus a margin if a first-order expansion would be too inaccurate far outside the image.
 
         ``project_axes(position, K, lens, point, axes) -> Rows``: J times ``axes`` [3, 3], with J at the expansion point
         ``point``. ``Rows`` is a struct with two vec3, ``first`` and ``second``.
 
-        ``axes_backward(position, K, lens, point, v_first, v_second) -> mat33``: The gradient of ``axes`` from that of the two
-        rows.
+        ``axes_backward(position, K, lens, point, v_first, v_second) -> mat33``: The gradient of ``axes`` from the gradients of
+        the two rows.
 
         ``position_backward(position, K, lens, pixel, point, axes, v_first, v_second, v_pixel, v_depth) -> Gradients``: The
         gradients of position and intrinsics from those of the two rows, of the pixel and of the depth.

@@ -1,4 +1,4 @@
-"""Products with a Jacobian of 2 x 3, for camera models that keep it whole."""
+"""Products with a Jacobian of 2 x 3, for camera models that compute the whole Jacobian."""
 
 import functools
 from types import SimpleNamespace
