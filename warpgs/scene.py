@@ -361,8 +361,8 @@ class Render:
     overflow: torch.Tensor | None = None
     """1 if the instances exceeded ``RasterizeOptions.capacity``, so that the images are unusable; else 0. Int32, shape [1]."""
     median_depth: torch.Tensor | None = None
-    """z-depth [u] of the Gaussian at which transmittance falls to one half, shape [..., H, W]; 0 where alpha is below 1/2. Only
-    if requested. It has no gradient: a backward pass through it is an error."""
+    """Depth [u] (along z; for a fisheye the distance) of the Gaussian at which transmittance falls to one half, shape [..., H,
+    W]; 0 where alpha is below 1/2. Only if requested. It has no gradient: a backward pass through it is an error."""
     error_bound: torch.Tensor | None = None
     """Upper bound of the error of ``rgb`` against rule `exact`, over all channels, shape [..., H, W]; see
     ``RasterizeOptions.error_bound``. Only if requested. It has no gradient: a backward pass through it is an error."""
