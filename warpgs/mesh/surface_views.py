@@ -71,7 +71,8 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
 class SurfaceViews:
     """Surfaces that the cameras see, in the order of the cameras; they can be iterated several times.
 
-    Up to `KEPT_PIXELS` pixels are kept; with more, one view is held at a time.
+    If all views together have at most `KEPT_PIXELS` pixels, each view is rendered once and kept. Otherwise every pass renders
+    the views again, one at a time.
     """
 
     def __init__(

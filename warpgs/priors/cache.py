@@ -45,7 +45,7 @@ def cache_folder() -> Path:
 
 @dataclass
 class MapCache:
-    """A folder of maps. Damaged entries are computed again; a note reports them, and a folder that cannot be written."""
+    """A folder of maps. Damaged entries are computed again; notes report them, and report if the folder cannot be written."""
 
     folder: Path
     """Folder of the entries."""

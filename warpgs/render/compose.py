@@ -111,7 +111,7 @@ def bin_projected(
     projected: torch.Tensor, tile_counts: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     slotted: bool = True, listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
-    """Return the instances of each tile of the window.
+    """Return for each tile of the render's window the Gaussians that touch the tile, front to back.
 
     Args:
         projected: Projected Gaussians, shape [C, N, 12].

@@ -22,7 +22,7 @@ VARIANTS = {
     "ssim": "as in 3DGS papers: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
     "ssim_skimage": "scikit-image, as in NeRF papers: the same window, without the border; about 0.005 lower",
 }
-"""Definition of each score, for result files and reports. Scores by other definitions are not comparable."""
+"""Definition of PSNR and SSIM, for result files and reports. Scores by other definitions are not comparable."""
 ALPHA_VARIANTS = {
     "psnr_whole": "of views with an alpha channel: over all unmasked pixels, with the background of the fit behind both images",
     "psnr_foreground": "as psnr_whole, but only over the pixels with an opacity above 0.5",
@@ -178,5 +178,5 @@ def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
 
 
 def variants(lpips: Lpips | None) -> dict[str, str]:
-    """Return the definition of each score; for LPIPS without weights, a note that it was not measured."""
+    """Return the definition of each score but those of `ALPHA_VARIANTS`, and how masks are used; without ``lpips``, a note on it."""
     return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())

@@ -55,7 +55,7 @@ class Merges:
     """Merged Gaussian of each pair: rows of the five tensors, shape [P, ...]."""
 
     def change(self, count: int, taken: int) -> DensityUpdate:
-        """Return the change of a set of ``count`` Gaussians that merges the first ``taken`` pairs."""
+        """Return the change that merges the first ``taken`` pairs in a set of ``count`` Gaussians."""
         stays = torch.ones(count, dtype=torch.bool, device=self.first.device)
         stays[self.first[:taken]] = False
         stays[self.second[:taken]] = False

@@ -89,7 +89,7 @@ class ImportanceSampling(Strategy):
         return self.method.events and self.method.pm
 
     def is_protected(self, step: int | torch.Tensor) -> torch.Tensor:
-        """Return the Gaussians that are protected at a step, bool, shape [N]."""
+        """Return the Gaussians that are young enough for protection at a step, bool, shape [N]."""
         return step - self.context.table.columns["created_step"] <= self.method.protect.steps
 
     def is_layered(self, step: int) -> bool:
