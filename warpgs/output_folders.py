@@ -285,7 +285,7 @@ def _again(root: _Root) -> Folder:
 def _entered(above: Folder, name: str, make: bool) -> Folder:
     """Open a folder in another one, and make it first if it is missing and ``make`` is True."""
     if name == os.pardir:
-        raise RefusedError(f"{above.path / name}: points outside the folder; use a path without {os.pardir}")
+        raise RefusedError(f"{above.path / name}: use a path without {os.pardir} inside the folder")
     try:
         return above.folder(name)
     except FileNotFoundError:

@@ -103,7 +103,7 @@ def test_what_was_chosen_is_said(model):
     assert [(c.width, c.height) for _, c in plan.cameras] == [(64, 20)] * 6 and "there and back" in plan.notes[-1]
     assert 2 * math.atan(10 / plan.cameras[0][1].K[1, 1]) == pytest.approx(0.5)
     plan = plan_film(model, "interpolate", FilmSettings(frames=13))
-    assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 training views in the order of their names")
+    assert plan.notes[-1].startswith("path: interpolate, through 3 of 5 cameras in the given order")
     assert [n for n, _ in plan_film(model, "views", FilmSettings()).cameras] == [f"{i}" for i in range(5)]
     with pytest.raises(UsageError, match="path 'orbit'; choose one of auto, views, turntable, spiral, interpolate, or give"):
         plan_film(model, "orbit", FilmSettings())

@@ -51,7 +51,7 @@ def test_without_networks_the_notes_say_what_stands_in(scene, tmp_path, capsys, 
     """Depth comes from the other views, and some of it is confirmed in every one."""
     assert main(show(scene, "--out", tmp_path / "a", "--source", source)) == 0
     text = capsys.readouterr().out
-    assert "semantics: no network, so saliency is used as foreground" in text and "no scores" not in text
+    assert "semantics: no network, so saliency is used as foreground" in text and "held out" not in text
     assert "depth: from the other views, " in text and "no consistent depth" not in text
     assert not (tmp_path / "cache").exists()
 

@@ -56,7 +56,7 @@ class MapOptions:
             raise UsageError(f"--normal-axes must be one of {', '.join(AXES)}, not {self.normal_axes!r}")
         unit = self.depth_unit
         if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
-            raise UsageError(f"--depth-unit must be a number above 0, not {unit!r}")
+            raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
 
 
 NO_MAPS = MapOptions()

@@ -87,4 +87,4 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
             f"one; rename the images so that they count from 0, or remove mask 0"
         )
     done = [replace(v, score_mask=_fit(masks[i], scene.mask(masks[i]) > 0.5, v)) for i, v in zip(ids, views)]
-    return done, f"scores use only pixels inside the masks in {folder}, matched by image id; the fit uses all pixels"
+    return done, f"scores use only pixels inside the masks in {folder}, matched by image id; the fit ignores these masks"

@@ -74,7 +74,8 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
     server.rules = rules
     if server.get_port() != port or not _refuses_others(port) or not hasattr(server.gui, "_gui_input_handle_from_uuid"):
         stop_server(server)
-        raise ResourceError(f"viser {viser.__version__} is not supported, because its requests cannot be checked; {REMEDY}")
+        why = "because requests to its server cannot be checked"
+        raise ResourceError(f"viser {viser.__version__} is not supported, {why}; {REMEDY}")
     rules.control_of = lambda uuid: _control_of(server, uuid)
     server.gui.configure_theme(show_share_button=False, show_logo=False, dark_mode=True, control_width="medium")
     return server

@@ -120,10 +120,10 @@ def _tour(rig: Rig, train: list[Camera], settings: FilmSettings) -> tuple[list[C
     reaches = [rig.reach(c) for c in train]
     tour = tour_of(cameras, reaches, frames / settings.fps, max(2, frames // MIN_FRAMES_PER_VIEW))
     count = len(tour.keyframes) - tour.closed
-    words = "in the order of their names" if tour.by_name else "from neighbour to neighbour"
+    words = "in the given order" if tour.by_name else "from neighbour to neighbour"
     back = ", and back to the first" if tour.closed else ""
     cameras = through(tour.keyframes, frames, closed=tour.closed)
-    return cameras, f"path: interpolate, through {count} of {len(train)} training views {words}{back}"
+    return cameras, f"path: interpolate, through {count} of {len(train)} cameras {words}{back}"
 
 
 def _keyframes(model: FittedModel, path: Path, rig: Rig, first: Camera, settings: FilmSettings) -> tuple[list[Camera], str]:

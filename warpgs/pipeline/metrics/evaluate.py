@@ -178,5 +178,5 @@ def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
 
 
 def variants(lpips: Lpips | None) -> dict[str, str]:
-    """Return the definition of each score but those of `ALPHA_VARIANTS`, and how masks are used; without ``lpips``, a note on it."""
+    """Return the definition of each score but those of `ALPHA_VARIANTS`, and how masks are used."""
     return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())

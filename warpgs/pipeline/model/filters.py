@@ -72,7 +72,8 @@ def box_of(text: str) -> Box:
     try:
         value = json.loads(text if text.lstrip().startswith("{") else f"[{text}]")
     except (ValueError, RecursionError) as e:
-        raise UsageError(f"--crop {text[:60]}: give six numbers, or JSON with center and size") from e
+        forms = "six numbers with commas between, JSON with center and size, or a .json file"
+        raise UsageError(f"--crop {text[:60]}: give {forms}") from e
     if isinstance(value, list):
         low, high = _numbers(value, (6,), "a box").reshape(2, 3)
         center, size, rotation = (low + high) / 2, high - low, np.eye(3)

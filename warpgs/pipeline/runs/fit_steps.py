@@ -130,9 +130,10 @@ def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteErr
     own = [t.name for t in trainer.terms if t.name in broken and not is_ours(type(t))]
     where = f", in the loss term {' and '.join(broken)}" if broken else ""
     mend = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
+    names = "names the non-finite values of the other terms" if own else "names the non-finite values"
     return NotFiniteError(
         f"{error}, on {name}{where}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
-        f"{out / FAILED}` names the non-finite values. --resume would fail at the same step; {mend} into a new --out"
+        f"{out / FAILED}` {names}. --resume would fail at the same step; {mend} into a new --out"
     )
 
 

@@ -20,7 +20,7 @@ from warpgs.scene import Scene
 CPU_MAX_SIDE = 800
 """Default of the longest side of an image [px] for a fit on a CPU: four times as many steps fit into the time limit, and
 held-out PSNR at full size rises (decision 018)."""
-NO_SCORES = "no scores: all photographs are training views; hold some out with --split every:8"
+NO_SCORES = "no photograph is held out, so new views get no score; hold some out with --split every:8"
 """Note on a fit without held-out views."""
 
 

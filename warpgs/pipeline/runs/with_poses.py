@@ -73,5 +73,5 @@ def lost_lines(out: Path | None) -> list[str]:
 def _notes(record: dict[str, Any]) -> list[str]:
     """Return the report's notes on found poses: the method, and photographs without a pose."""
     lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
-    where = [f"{POSED_SCENE}/{TEXT} in the run folder lists photographs to add"] if record["advice"] else []
+    where = [f"{POSED_SCENE}/{TEXT} in the run folder lists what to photograph next"] if record["advice"] else []
     return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]

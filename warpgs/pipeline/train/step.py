@@ -1,8 +1,8 @@
 """One training step, called eagerly on a CPU and captured as a CUDA graph on a GPU.
 
-With few views and small images, a GPU needs less time for a step than Python needs to launch it. So on a GPU the
-whole step is captured, from the choice of the view to the changes after Adam, and replayed. Learning rates and views of several steps are uploaded at once;
-losses are read at the end of these steps. On a CPU the same function is called for each step.
+With few views and small images, a GPU needs less time for a step than Python needs to launch it. So on a GPU the whole step is
+captured, from the choice of the view to the changes after Adam, and replayed. Learning rates and views of several steps are
+uploaded at once; losses are read at the end of these steps. On a CPU the same function is called for each step.
 """
 
 from __future__ import annotations
