@@ -78,7 +78,7 @@ BY_HAND = {
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
     ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
     ("install.md", "| part | size"): "sizes by du",
-    ("mutation.md", "| sample | run"): "counts that tools/mutation prints",
+    ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
