@@ -21,7 +21,7 @@ C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
 
 def initial_gaussians(scene: warpgs.Scene, count: int, device: torch.device) -> warpgs.Gaussians:
-    """Return Gaussians at up to ``count`` points of a scene, else at random points, in scene units; they require gradients."""
+    """Return trainable Gaussians in scene units, at up to ``count`` points of the scene, or at random points if it has none."""
     generator = np.random.default_rng(0)
     if scene.points is None:
         positions, colors = generator.normal(size=(count, 3)), np.full((count, 3), 0.5)
