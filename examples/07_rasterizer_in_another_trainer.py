@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> float:
     """Run the example; return the gain in PSNR on a held-out view [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
-    parser.add_argument("--out", type=Path, default=Path("render.png"), help="PNG to write; a PLY file comes beside it")
+    parser.add_argument("--out", type=Path, default=Path("render.png"), help="PNG to write; a PLY file is written beside it")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps")
     parser.add_argument("--count", type=int, default=2000, help="largest number of Gaussians")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")

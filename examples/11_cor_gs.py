@@ -242,7 +242,7 @@ def main(arguments: list[str] | None = None) -> float:
     """Run the example; return the gain in held-out PSNR over 3DGS [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
-    parser.add_argument("--split", default="llff:3", help="as in warpgs fit")
+    parser.add_argument("--split", default="llff:3", help="training and held-out views, as in warpgs fit")
     parser.add_argument("--out", type=Path, default=Path("cor_gs.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=1000, help="optimisation steps of each fit")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
