@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 CENTER = torch.tensor([0.0, 0.0, 3.0])
-"""Centre of the ball, with a radius of 1 u."""
+"""Centre of the ball, which has a radius of 1 u."""
 
 
 def discs(points: torch.Tensor, normals: torch.Tensor, radius: float) -> dict[str, torch.Tensor]:

@@ -56,7 +56,8 @@ class CorConfig:
     every: int = 500
     """Steps between two co-prunings."""
     distance: float = 1.0
-    """Largest distance to the nearest Gaussian of the other model, in scene extents; Gaussians farther away are removed."""
+    """Largest distance to the nearest Gaussian of the other model, as a fraction of the scene's extent. Gaussians farther away
+    are removed."""
     noise: float = 0.3
     """Standard deviation of the noise of a random camera's position, as a fraction of the distance to the nearest camera."""
 
