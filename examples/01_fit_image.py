@@ -2,8 +2,8 @@
 
     python examples/01_fit_image.py --image image.jpg --out fitted.png
 
-Without --image, a pattern of coloured rings is fitted. Prints the PSNR before and after; writes target and result side by
-side.
+Without --image, a pattern of coloured rings is fitted. Prints the PSNR before and after the fit; writes target and result side
+by side.
 """
 
 import argparse

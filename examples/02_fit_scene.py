@@ -2,9 +2,9 @@
 
     python examples/02_fit_scene.py path/to/scene --out result
 
-The scene is a folder of images with cameras (COLMAP, transforms.json, LLFF, DTU or Middlebury). Without this argument, a
-synthetic scene is written and fitted. Prints the held-out PSNR; writes a turntable as images and film, the PLY file for
-viewers, and the model.
+The scene is a folder of images with cameras (COLMAP, transforms.json, LLFF, DTU or Middlebury). Without a scene, a synthetic
+one is written and fitted. Prints the held-out PSNR; writes a turntable as images and film, the PLY file for viewers, and the
+model.
 """
 
 import argparse

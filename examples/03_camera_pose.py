@@ -2,8 +2,8 @@
 
     python examples/03_camera_pose.py --out pose.png
 
-A cloud of Gaussians is rendered from a known pose. The camera is moved, and its pose is then optimised. Prints the error of the
-pose before and after; writes the image and the renders from the first and the final pose side by side.
+A cloud of Gaussians is rendered from a known pose. The camera is moved, and its pose is then optimised. Prints the pose error
+before and after; writes the image and the renders from the first and the final pose side by side.
 """
 
 import argparse
@@ -45,7 +45,7 @@ def pose_error(a: torch.Tensor, b: torch.Tensor) -> tuple[float, float]:
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; return the final distance as a fraction of the initial distance."""
+    """Run the example; return the final error of the camera centre as a fraction of the initial error."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("pose.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=200, help="optimisation steps")

@@ -3,9 +3,9 @@
     python examples/04_own_loss.py path/to/scene --out smooth.png
     warpgs fit path/to/scene --out run --loss-terms examples/04_own_loss.py:DepthSmoothness --depth-smoothness.weight 0.5
 
-The class below is the whole term. The second command loads the class from this file, and makes its setting a flag. The first
-command fits a scene with and without the term. It prints roughness and held-out PSNR of both fits, and writes the depth maps of
-a view.
+The class `DepthSmoothness` is the whole term. The second command loads the class from this file, and makes the setting of the
+class a flag. The first command fits a scene with and without the term. It prints roughness and held-out PSNR of both fits, and
+writes the depth maps of a view.
 """
 
 import argparse
@@ -57,7 +57,7 @@ class DepthSmoothness(warpgs.LossTerm):
 
 
 def main(arguments: list[str] | None = None) -> float:
-    """Run the example; return the roughness with the term as a fraction of the roughness without."""
+    """Run the example; return the roughness with the term as a fraction of the roughness without it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
     parser.add_argument("--out", type=Path, default=Path("smooth.png"), help="PNG to write")

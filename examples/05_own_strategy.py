@@ -1,11 +1,11 @@
-"""A density strategy of your own: where Gaussians are added and removed during a fit.
+"""A density strategy of your own: it adds and removes Gaussians during a fit.
 
     python examples/05_own_strategy.py path/to/scene --out sprout.png
     warpgs fit path/to/scene --out run --strategy examples/05_own_strategy.py:Sprout --sprout.growth 0.2
 
-The class below is the whole strategy. The second command loads the class from this file, with its settings as flags. The first
-command fits a scene with the strategy and without growth. It prints the number of Gaussians and the training PSNR of both
-fits, and writes the image and the two renders side by side.
+The class `Sprout` is the whole strategy. The second command loads the class from this file, with its settings as flags. The
+first command fits a scene with the strategy and without growth. It prints the number of Gaussians and the training PSNR of both
+fits, and writes a training image and both renders of it side by side.
 """
 
 import argparse
@@ -44,13 +44,13 @@ class Sprout(warpgs.Strategy):
     Config = SproutConfig
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the one column of the strategy: the sum of each Gaussian's gradient norms since the last update."""
+        """Return the only column of the strategy: the sum of each Gaussian's gradient norms since the last update."""
         return {"pull": Column(0.0, inherited=False)}
 
     def statistics(
         self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
     ) -> Mapping[str, torch.Tensor]:
-        """Return the gradient norms of the projected means, shape [N], which the trainer adds to the column.
+        """Return the gradient norms of the projected means, shape [N]; the trainer adds them to the column `pull`.
 
         ``v_projected`` [1, N, 12] is the gradient with respect to the projected Gaussians; its first two columns belong to the
         means.

@@ -4,8 +4,8 @@ The made-up format of this example is a folder with shots.csv, one line per imag
 
     name, x, y, z, target_x, target_y, target_z, focal_px
 
-with the position of the camera, the point that it looks at (both in any unit, +y down) and the focal length. Images are in the
-same folder.
+A line has the camera's position, the point that the camera looks at (both in any unit, +y down) and the focal length. The
+images are in the same folder.
 
 Run without arguments to write a small scene of that format, read it back and check it (a few seconds on a CPU):
 
@@ -53,7 +53,7 @@ class ShotsReader(Reader):
         return Probe("shots.csv") if (folder / "shots.csv").is_file() else None
 
     def read(self, folder: Path, options: ReadOptions) -> Scene:
-        """Return the scene in file coordinates; an invalid line raises a DataError with its number."""
+        """Return the scene in file coordinates; an invalid line raises a DataError with the line's number."""
         path = folder / "shots.csv"
         scene, views = SceneFolder(folder, options), ViewList()
         with path.open(newline="", encoding="utf-8") as file:

@@ -21,7 +21,7 @@ C0 = 0.28209479177387814  # 1 / (2 sqrt(pi)), the constant spherical harmonic
 
 
 def initial_gaussians(scene: warpgs.Scene, count: int, device: torch.device) -> warpgs.Gaussians:
-    """Return Gaussians at up to ``count`` points of a scene, else at random points, in scene units; they require gradients."""
+    """Return trainable Gaussians in scene units, at up to ``count`` points of the scene, or at random points if it has none."""
     generator = np.random.default_rng(0)
     if scene.points is None:
         positions, colors = generator.normal(size=(count, 3)), np.full((count, 3), 0.5)
@@ -44,7 +44,7 @@ def main(arguments: list[str] | None = None) -> float:
     """Run the example; return the gain in PSNR on a held-out view [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
-    parser.add_argument("--out", type=Path, default=Path("render.png"), help="PNG to write; a PLY file comes beside it")
+    parser.add_argument("--out", type=Path, default=Path("render.png"), help="PNG to write; a PLY file is written beside it")
     parser.add_argument("--steps", type=int, default=300, help="optimisation steps")
     parser.add_argument("--count", type=int, default=2000, help="largest number of Gaussians")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")

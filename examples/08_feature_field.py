@@ -2,7 +2,8 @@
 
     python examples/08_feature_field.py --out features.png
 
-Prints the cosine similarity of the features before and after; writes the three principal components of both images as colours.
+Prints the cosine similarity of the features before and after; writes the three principal components of target and result as
+colours.
 """
 
 import argparse

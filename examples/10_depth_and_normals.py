@@ -3,7 +3,7 @@
     python examples/10_depth_and_normals.py --out depth_and_normals.png
 
 Writes one row of images: expected, accumulated and median depth, normals of the Gaussians, and normals of the expected depth.
-Prints, for both kinds, the mean angle between the rendered normals of the ball and the true normals of a sphere.
+Prints, for both kinds of normals, the mean angle between the rendered normals of the ball and the true normals of a sphere.
 """
 
 import argparse
@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 CENTER = torch.tensor([0.0, 0.0, 3.0])
-"""Centre of the ball, with a radius of 1 u."""
+"""Centre of the ball, which has a radius of 1 u."""
 
 
 def discs(points: torch.Tensor, normals: torch.Tensor, radius: float) -> dict[str, torch.Tensor]:

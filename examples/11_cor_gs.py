@@ -4,8 +4,8 @@
     warpgs fit path/to/scene --out run --preset 3dgs --strategy examples/11_cor_gs.py:CorGS
 
 Two models are trained on the same views. Gaussians without a neighbour in the other model are removed (co-pruning). Both models
-are rendered from random cameras near the training cameras, and a loss compares the renders (co-regularisation). The class below
-is the whole baseline, and docs/add-a-baseline.md explains it. Prints the held-out PSNR of 3DGS and of CoR-GS, and
+are rendered from random cameras near the training cameras, and a loss compares the renders (co-regularisation). The class
+`CorGS` is the whole baseline, and docs/add-a-baseline.md explains it. Prints the held-out PSNR of 3DGS and of CoR-GS, and
 writes both renders.
 """
 
@@ -56,7 +56,8 @@ class CorConfig:
     every: int = 500
     """Steps between two co-prunings."""
     distance: float = 1.0
-    """Largest distance to the nearest Gaussian of the other model, in scene extents; Gaussians farther away are removed."""
+    """Largest distance to the nearest Gaussian of the other model, as a fraction of the scene's extent. Gaussians farther away
+    are removed."""
     noise: float = 0.3
     """Standard deviation of the noise of a random camera's position, as a fraction of the distance to the nearest camera."""
 
@@ -72,7 +73,8 @@ def nearest(points: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
 def random_cameras(views: list[TrainingView], noise: float, count: int, generator: torch.Generator) -> torch.Tensor:
     """Return the view matrices (camera_from_world) of random cameras, float64, shape [count, 4, 4].
 
-    Each has the position of a training camera, with noise, and the mean orientation of that camera and its nearest neighbour.
+    Each random camera has the position of a training camera plus noise, and the mean orientation of this training camera and
+    its nearest neighbour.
     """
     poses = torch.stack([torch.as_tensor(v.camera.viewmat) for v in views]).double().cpu()
     rotations = poses[:, :3, :3]
@@ -94,8 +96,7 @@ def random_cameras(views: list[TrainingView], noise: float, count: int, generato
 class CorGS(CloneSplit):
     """Two models of one scene, pruned and regularised where they disagree; the first model is the result.
 
-    A step is captured as a CUDA graph. So all random numbers are sampled before the first step, and looked up by the number of
-    the step.
+    A step is captured as a CUDA graph. So all random numbers are sampled before the first step, and each step looks up its own.
     """
 
     Config = CorConfig
@@ -137,7 +138,7 @@ class CorGS(CloneSplit):
 
     @torch.no_grad()
     def _measure(self) -> None:
-        """Choose the renderer: on CUDA, one with a fixed capacity for instances, so that a graph can capture it."""
+        """Choose the renderer: on CUDA, one with a fixed capacity for (Gaussian, tile) pairs, for capture as a graph."""
         context, options = self.context, self.context.render_options()
         self.render = eager_renderer(options, None)
         if context.device.type == "cuda":
@@ -146,7 +147,7 @@ class CorGS(CloneSplit):
             self.render = captured_renderer(options, SPARE * most + MIN_INSTANCES, self.overflow)
 
     def _image(self, table: Table, viewmat: torch.Tensor, K: torch.Tensor) -> warpgs.Render:
-        """Return the render of one camera, [1, 4, 4] and [1, 3, 3], with colours [H, W, 3]."""
+        """Return the render of the camera with view matrix [1, 4, 4] and intrinsics [1, 3, 3]; its colours are [H, W, 3]."""
         camera = dataclasses.replace(self.context.views[0].camera, viewmat=viewmat, K=K)
         return self.render(table.gaussians, camera, table.gaussians.sh_degree, None, None)
 
@@ -242,7 +243,7 @@ def main(arguments: list[str] | None = None) -> float:
     """Run the example; return the gain in held-out PSNR over 3DGS [dB]."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, nargs="?", help="scene folder; default: a synthetic scene")
-    parser.add_argument("--split", default="llff:3", help="as in warpgs fit")
+    parser.add_argument("--split", default="llff:3", help="training and held-out views, as in warpgs fit")
     parser.add_argument("--out", type=Path, default=Path("cor_gs.png"), help="PNG to write")
     parser.add_argument("--steps", type=int, default=1000, help="optimisation steps of each fit")
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")

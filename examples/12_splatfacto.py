@@ -5,7 +5,7 @@
 `warpgs.load_scene` is the dataparser. Gaussians are split and duplicated by absgrad (`Render.means2d.absgrad`), and culled by
 opacity. Random backgrounds prevent fog, and `scale_loss` prevents needles. Each training camera has a learned pose correction.
 Prints the number of Gaussians, the PSNR of a held-out view and the pose error of the training cameras, before and after; writes
-the image beside the render.
+the held-out image beside its render.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def moved(viewmat: torch.Tensor, twist: torch.Tensor) -> torch.Tensor:
 
 def degrees_off(poses: torch.Tensor, true_poses: torch.Tensor) -> float:
     """Return the mean angle [degrees] between poses and true poses [V, 4, 4], after removal of their common rotation."""
-    turns = poses[:, :3, :3].mT @ true_poses[:, :3, :3]  # in world axes: the Gaussians follow a common rotation
+    turns = poses[:, :3, :3].mT @ true_poses[:, :3, :3]  # in world axes: Gaussians absorb a common rotation
     u, _, v = torch.linalg.svd(turns.mean(0))
     return float(torch.rad2deg(2 * torch.arcsin((turns - u @ v).norm(dim=(1, 2)).div(8**0.5).clamp_max(1))).mean())
 
@@ -62,7 +62,7 @@ def degrees_off(poses: torch.Tensor, true_poses: torch.Tensor) -> float:
 def scale_loss(log_scales: torch.Tensor) -> torch.Tensor:
     """Return the mean excess of the axis ratio, longest to shortest, over `MAX_RATIO`, shape [].
 
-    After PhysGaussian (Xie et al. 2024).
+    The loss follows PhysGaussian (Xie et al. 2024).
     """
     ratios = (log_scales.amax(1) - log_scales.amin(1)).exp()
     return (ratios.clamp_min(MAX_RATIO) - MAX_RATIO).mean()

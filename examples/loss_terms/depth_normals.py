@@ -27,9 +27,9 @@ EDGE = 10.0
 
 
 def unevenness(normals: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
-    """Return the weighted mean of 1 - cos of the angle between neighbours' normals, shape [], in [0, 2]; 0 without any.
+    """Return the weighted mean of 1 - cos of the angle between neighbours' normals, shape [], in [0, 2]; 0 if no pair counts.
 
-    ``normals`` have length 1, or 0 where there is none, shape [H, W, 3]; ``image`` has shape [H, W, 3].
+    ``normals`` have length 1, or 0 where a pixel has no normal, shape [H, W, 3]; ``image`` has shape [H, W, 3].
     """
     shown = normals.detach().square().sum(-1) > 0.5
     difference, weights = normals.new_zeros(()), normals.new_zeros(())

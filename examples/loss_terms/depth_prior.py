@@ -3,9 +3,9 @@
     warpgs fit scene --out run --loss-terms examples/loss_terms/depth_prior.py:DepthCorrelation --depth-correlation.weight 0.05
 
 The term is 1 - rho, where rho is Pearson's correlation of inverse rendered depth with the view's relative disparity. The term
-follows the global depth loss of FSGS (Zhu et al. 2024). But FSGS takes the better of two such correlations, does not divide
-depth by alpha and ends with a weight of 0.001. The disparity comes from a network (--depth-model), or from a start by sweep or
-flow. Without a disparity, the term and its gradient are 0.
+follows the global depth loss of FSGS (Zhu et al. 2024). Differences: FSGS takes the better of two such correlations, does not
+divide depth by alpha and ends with a weight of 0.001. The disparity comes from a network (--depth-model), or from the depth
+sweep or flow of the start. Without a disparity, the term and its gradient are 0.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def depth_disagreement(
     a, b = (centred(m, fraction, pixels) for m in (mean / depth, disparity))
     of_a, of_b = total(a * a) / pixels, total(b * b) / pixels
     flat = (of_a <= FLAT**2) | (of_b <= FLAT**2)
-    # roots in float64: float32's have other last digits on other processors (MKL)
+    # roots in float64: the last digits of float32 roots depend on the processor (MKL)
     spread = torch.where(flat, 1, of_a).double().sqrt() * torch.where(flat, 1, of_b).double().sqrt()
     return torch.where(flat, 0, 1 - total(a * b) / pixels / spread.to(a.dtype))
 
