@@ -205,7 +205,7 @@ def adam_step(
         head: How many numbers, from the start of a row, take ``head_lr``; 0 for none.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)

@@ -280,7 +280,7 @@ def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     """Check that tiles were made for an image of ``width`` x ``height`` px and for projected Gaussians [C, N, 12].
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, or the tiles belong to another image size.
     """
     sizes = interop.check(projected=(projected, "C N 12"), **backgrounds)
@@ -328,7 +328,7 @@ def blend(
         blending weights (z; the distance for a fisheye), 0 where these sum to less than `SMALLEST_WEIGHT`.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, or the tiles belong to another image size or lack the slots for gradients.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))

@@ -223,7 +223,7 @@ def blend_channels(
         The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, there is no channel, or the tiles belong to another image size.
     """
     shared = "1" if len(colors) == 1 else "C"

@@ -199,7 +199,7 @@ def project(
         tiles that each Gaussian touches (0 where culled; no gradient).
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera model is unknown.
         ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
     """
@@ -222,7 +222,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
         Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
         ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
     """

@@ -229,7 +229,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         Similarities in [-1, 1], of the images' shape; their mean is the usual score.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong.
     """
     _check(image, target)
@@ -256,7 +256,7 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         The two sums, shape [2]. The gradient of |image - target| is 0 where both are equal.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong.
     """
     _check(image, target)

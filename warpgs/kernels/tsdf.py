@@ -228,7 +228,7 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
 
     Raises:
         ResourceError: The grid has more points than kernels can index.
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera is not a pinhole.
         ValueError: A shape or device is wrong.
     """
@@ -264,7 +264,7 @@ def gather_colors(
         weights: Sums of weights so far, shape [N].
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera is not a pinhole.
         ValueError: A shape or device is wrong.
     """

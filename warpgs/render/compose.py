@@ -1,7 +1,7 @@
 """Project, bin, blend: the steps from Gaussians to images.
 
-`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. The camera
-model, the degree, the cut-offs and the window of a render are in `RenderSettings`, and nowhere else.
+`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to allocate
+memory. Only `RenderSettings` holds the camera model, the spherical-harmonics degree, the cut-offs and the window of a render.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
 
     Raises:
         TypeError: The covariances or the factors have another scalar type than the means.
-        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's
-            number of intrinsics or lenses is neither 1 nor that of its poses.
+        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's number of
+            intrinsics or lenses is neither 1 nor the number of its poses.
     """
     means = gaussians.means
     viewmats = as_batch(camera.viewmat, means)
@@ -143,7 +143,7 @@ def compose(
 
     Raises:
         ResourceError: There are more instances than memory allows.
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera model is unknown.
         ValueError: A shape or a device disagrees.
     """

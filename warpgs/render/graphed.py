@@ -1,9 +1,10 @@
 """Rasterizer calls that repeat: on CUDA their kernels are captured as graphs, and replayed.
 
-At training sizes, launching twenty kernels takes the host longer than running them takes the GPU. A training loop calls the
-rasterizer with the same tensors, new values and another camera. The loop's memory requests repeat as well, so torch allocates
-at the same addresses. A captured graph is replayed if a call has the addresses of the capture; otherwise the kernels are
-launched one by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
+At training sizes, launching twenty kernels takes the host longer than running them takes the GPU. Each step of a training loop
+calls the rasterizer with the same tensors, which hold new values, and with another camera. The memory requests of the steps
+repeat as well, so torch allocates at the same addresses. A captured graph is replayed if a call has the addresses of the
+capture; otherwise the kernels are launched one by one. Both give the same bits. Replays need more memory only for the spare
+capacity for instances.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ from warpgs.runtime.device_memory import available_bytes
 MIN_CALLS = 3
 """Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an equal call exceeded its capacity
-before, the larger number of both calls is used."""
+"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an earlier equal call exceeded its
+capacity, the larger number that either call needed is used."""
 SPARE = 1024
-"""Number that is added to both capacities."""
+"""Number that is added to the capacities for visible Gaussians and for instances."""
 MAX_PROJECTED = 2**23
 """Largest number of projected Gaussians of a captured call. Larger calls take the GPU so long that a graph has no gain."""
 MAX_MEMORY_FRACTION = 0.05
@@ -359,8 +360,8 @@ def _can_capture(device: torch.device) -> bool:
     """Return whether calls can be captured now, on this device.
 
     Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors.
-    Checkpointing has such hooks, and needs the same number of saved tensors each time. Nor are they captured where torch
-    allocates each tensor from the driver, or Warp checks for errors after each kernel.
+    Activation checkpointing sets such hooks, and needs the same number of saved tensors each time. Nor are they captured where
+    torch allocates each tensor from the driver, or Warp checks for errors after each kernel.
     """
     if _UNCACHED or wp.config.verify_cuda:
         return False

@@ -224,16 +224,16 @@ def rasterize(
     supported, and torch.compile breaks its graph here.
 
     Args:
-        gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
-            covariances and opacities (`CovarianceGaussians`).
+        gaussians: N Gaussians, given by log scales and logits of opacities (`Gaussians`), by scales and opacities
+            (`ActivatedGaussians`), or by covariances and opacities (`CovarianceGaussians`).
         camera: One camera ([4, 4], [3, 3]), or a batch of C cameras with one image size ([C, 4, 4], [C, 3, 3]). Or a list of
             cameras and batches, of any image sizes; then ``gaussians`` and ``options`` are lists of the same length, or single
             values for all cameras.
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera; a list of renders for a list of cameras. Read
-        ``render.means2d`` before the backward pass; after the pass, it holds the gradients of the projected means.
+        The images, without a leading axis for a single camera; a list of renders for a list of cameras. Read ``render.means2d``
+        before the backward pass. Its ``grad`` then holds the gradients of the projected means.
 
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than is available.

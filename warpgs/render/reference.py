@@ -23,7 +23,7 @@ class _Ellipses:
     pixels: torch.Tensor
     """Projected means [px], shape [N, 2]."""
     half: torch.Tensor
-    """Half sides [px] of the box that holds every pixel with alpha at or above the cut, shape [N, 2]."""
+    """Half sides [px] of the box that holds every pixel with alpha at or above the cut-off, shape [N, 2]."""
     power: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
     """Factors of dx^2, dx dy and dy^2 in the exponent, each of shape [N, 1]."""
     opacities: torch.Tensor

@@ -24,7 +24,7 @@ class KernelCache(NamedTuple):
     """Folder of compiled kernels."""
 
     folder: Path
-    """Folder, without the part that names Warp's version."""
+    """Folder, without the subfolder that names Warp's version."""
     refused: str
     """Reason why the usual folder is not used; empty if it is used."""
 

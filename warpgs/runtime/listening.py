@@ -1,4 +1,4 @@
-"""Guards of all servers: sockets of this machine only, and checks of the clients of a served page.
+"""Guards of all servers: sockets that only this machine reaches, and checks of requests for a served page.
 
 Any web page can send requests to every port of the machine that shows the page, and so can every program of every user of the
 machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start, and checks
@@ -94,7 +94,7 @@ def listening_at(process: int | None = None) -> list[tuple[str, int]]:
 
 
 def listeners() -> list[tuple[str, str, int]]:
-    """Return name, address and port of everything that this process and its children listen at."""
+    """Return program name, address and port of every listening socket of this process and its children."""
     import psutil
 
     found = [("this process", *at) for at in listening_at()]
@@ -108,7 +108,7 @@ def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
     """Print in one line what other machines can reach, if anything.
 
     Args:
-        found: Name, address and port of what listens.
+        found: Program name, address and port of each listening socket.
     """
     reached = [f"{who} at {ip}, port {port}" for who, ip, port in found if not is_loopback(ip)]
     if reached:

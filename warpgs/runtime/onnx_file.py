@@ -65,7 +65,7 @@ def _parts(message: Message, *numbers: int) -> Iterator[Message]:
 
 
 def _text(message: Message, number: int) -> str:
-    """Return the text of a field, maybe empty; of duplicates the last, as in protobuf."""
+    """Return the text of a field, maybe empty; of duplicate fields the last one, as in protobuf."""
     texts = [v for n, v in message if n == number and isinstance(v, memoryview)]
     return bytes(texts[-1]).decode("utf-8", "replace") if texts else ""
 
@@ -129,8 +129,7 @@ def check_onnx(data: bytes, path: Path) -> None:
         path: Its name, for messages.
 
     Raises:
-        DataError: The bytes are not an ONNX model, keep weights elsewhere (even where that file exists), or use custom
-            operators.
+        DataError: The bytes are not an ONNX model, keep weights in another file (even if it exists), or use custom operators.
     """
     try:
         model = _message(memoryview(data))

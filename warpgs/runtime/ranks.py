@@ -69,7 +69,7 @@ class Ranks:
         """End all exchange, once all processes have done the same steps."""
 
     def leave(self) -> None:
-        """End normally; all but the first wait for the first to end."""
+        """End normally; all ranks but the first wait for the first to end."""
 
 
 ALONE = Ranks()

@@ -80,7 +80,7 @@ class ProcessFailed(Exception):
 
 
 def _environment(more: dict[str, str] | None) -> dict[str, str]:
-    """Return variables with which a process imports this package from its place, and nothing from the current folder."""
+    """Return variables with which a process imports this package as this process does, and nothing from the current folder."""
     home = str(Path(__file__).parents[2])
     search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
     own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}

@@ -15,11 +15,11 @@ T = TypeVar("T")
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Categories of characters that move the cursor, change the direction of text, end a line, or are surrogates."""
 JOINERS = "\u200c\u200d"
-"""Exceptions that scripts and emoji need; they affect only adjacent letters."""
+"""Exceptions to `HIDDEN` that scripts and emoji need; they affect only adjacent letters."""
 
 
 class Detail(str):
-    """A note without need for action: for the files of a run and its report's last section, not the terminal."""
+    """A note that needs no action: it goes to the files of a run and the last section of its report, not to the terminal."""
 
     __slots__ = ()
 
