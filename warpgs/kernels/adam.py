@@ -48,7 +48,7 @@ def make_kernel(real, split: bool, lanes: int):
 
     Args:
         real: wp.float32 or wp.float64.
-        split: True where the head of each row has a learning rate of its own, which costs some arithmetic.
+        split: True where the first numbers of each row have a learning rate of their own, which costs some arithmetic.
         lanes: Number of elements that are updated at a time.
     """
     values = wp.types.vector(lanes, real)
@@ -126,7 +126,7 @@ def make_scheduled_kernel():
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
-    """Return the corrected learning rates of a row's first numbers and of the others, and the root of the second correction."""
+    """Return corrected learning rates of a row's first and other numbers, and the root of the second moment's correction."""
     correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
     return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
 

@@ -1,4 +1,4 @@
-"""Pixel sizes at Gaussians: for each, a fraction of the size [u] of the smallest pixel of the training cameras that see it."""
+"""Pixel sizes at Gaussians: a fraction of the smallest pixel size [u] of the training cameras that see each Gaussian."""
 
 import functools
 

@@ -171,9 +171,9 @@ def project(
     """Project N Gaussians into C cameras (EWA, first order).
 
     Differentiable in the seven tensors. A Gaussian is culled if its depth is below ``rule.near`` or above ``rule.far``, its
-    opacity is below the cut, or its box is outside the image. It is also culled if a parameter that is read is non-finite, or
-    outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients of
-    culled Gaussians are zero. Derivation of the backward pass: docs/project.md.
+    opacity is below the cut-off, or its box is outside the image. It is also culled if a parameter that is read is non-finite,
+    or outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients
+    of culled Gaussians are zero. Derivation of the backward pass: docs/project.md.
 
     Args:
         means: World positions [u], shape [N, 3].

@@ -1,7 +1,7 @@
 """Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
 
-The forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three fields. Images are flat rows
-of width * channels.
+For images a and b, the forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three fields.
+Images are flat rows of width * channels.
 """
 
 import functools

@@ -19,7 +19,7 @@ from warpgs.runtime.sorting import sort_pairs
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
 
 LIST_BYTES = 20
-"""Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
+"""Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the Gaussian number."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 """Bytes of an instance with its gradient slot and its part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
@@ -60,13 +60,13 @@ class Tiles:
 
 
 class Visible(NamedTuple):
-    """Capacity for visible Gaussians where nothing is read from the device."""
+    """Capacity for visible Gaussians, for renders that read nothing from the device."""
 
     sums: torch.Tensor
     """Running sums of `running_counts`, int64, shape [S]."""
     capacity: int
-    """Number of visible Gaussians to allocate for, at most the number of all. If there are more, which the last of the sums
-    shows, the lists must not be used."""
+    """Number of visible Gaussians to allocate for, at most the number of all Gaussians. If the last of the sums shows more, the
+    lists must not be used."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class InstanceMemory:
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
     visible: Visible | None = None
-    """Capacity for visible Gaussians, if there is one for instances; None to sort all Gaussians."""
+    """Capacity for visible Gaussians, if instances have a capacity too; None to sort all Gaussians."""
 
 
 AS_NEEDED = InstanceMemory()
@@ -118,7 +118,7 @@ def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
-    """Return the bytes of the lists at each moment of a step; the owners of instances are freed after the sort."""
+    """Return the bytes of the lists at each moment of a step; owners (Gaussian numbers) are freed after the sort."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
     ranges = 2 * FLOAT * columns * rows + (FLOAT + 8) * sizes.count  # of each tile; first slots and ends of each Gaussian
     sorting = (2 * 2 * FLOAT + 2 * 8) * sizes.count  # depths and order twice, two running sums of int64

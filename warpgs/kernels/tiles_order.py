@@ -129,7 +129,7 @@ def make_kernels(real, native: bool):
 def running_counts(
     counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
 ) -> torch.Tensor:  # fmt: skip
-    """Return running sums that count tiles and visible Gaussians in one number each, int64, shape [S].
+    """Return running sums, each of which counts both tiles and visible Gaussians in one number, int64, shape [S].
 
     A visible Gaussian adds its tile count and 2^`sum_bits`. `split_sum` splits the last sum.
 
