@@ -146,7 +146,7 @@ def adam_scheduled(
         skip: Flag, int32, shape [1]; nothing is updated if it is not 0.
         head: How many numbers, from the start of a row, take the first learning rate; 0 for none.
         betas: Decay of the two running means.
-        eps: Number added to the root.
+        eps: Number added to the square root of the second moment.
     """
     if param.numel() == 0:
         return
@@ -200,7 +200,7 @@ def adam_step(
         lr: Learning rate.
         step: Number of this step, from 1.
         betas: Decay rates of the two moments.
-        eps: Number added to the root.
+        eps: Number added to the square root of the second moment.
         head_lr: Learning rate of the first ``head`` numbers of each of the N rows; None for ``lr``.
         head: How many numbers, from the start of a row, take ``head_lr``; 0 for none.
 

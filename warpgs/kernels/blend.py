@@ -136,7 +136,7 @@ def composite(
     Args:
         projected: Projected Gaussians, contiguous, shape [C, N, 9 + D]. D is one of `WIDTHS`: 3 channels of a colour, or more
             channels instead.
-        tiles: Their instances.
+        tiles: Their (Gaussian, tile) instances.
         backgrounds: Channels behind everything, contiguous, shape [C, D].
         settings: Settings.
         save: True where gradients will be taken.

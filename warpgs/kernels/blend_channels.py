@@ -205,7 +205,7 @@ def blend_channels(
     """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
 
     Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The gradients of
-    position, factor and opacity are sums over passes, in order: as repeatable as those of `blend`.
+    position, factor and opacity are added up over passes in a fixed order, so they repeat as those of `blend` do.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

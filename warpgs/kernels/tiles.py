@@ -221,7 +221,7 @@ def bin_tiles(
         rule: Cut-offs, the same as given to `project`.
         tile_size: Side of a tile [px].
         origin: Left and top [px] of the window given to `project`, multiples of ``tile_size``.
-        memory: Memory of the instances; if it has a capacity, M is the capacity.
+        memory: Memory that the (Gaussian, tile) instances may take; if it has a capacity, the lists have this length.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
         listed: True for the tiles that get instances, bool, shape [C * tiles]; the others stay empty. None for all tiles.
 

@@ -19,7 +19,8 @@ from warpgs.priors.view_choice import matching_views, shared_sight
 from warpgs.scene import Camera
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth; coverage has the same limit (decision 019)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth; scores of coverage use the same limit (decision
+019)."""
 NEIGHBOURS = 16
 """Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
 MAX_PIXELS = 2**26

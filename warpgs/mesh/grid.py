@@ -54,7 +54,7 @@ class GridPlan:
 
 
 def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper corner, shape [3] each, of the box around points without the outliers along each axis.
+    """Return the lower and upper corner, shape [3] each, of the box around points, except outliers along each axis.
 
     Points far behind all others, such as a background at infinity, are cut off.
 

@@ -37,7 +37,7 @@ class SurfaceView:
     depth: torch.Tensor
     """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where the depth is uncertain."""
     weights: torch.Tensor
-    """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times the opacity of a surface."""
+    """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times alpha if there is a surface."""
     image: torch.Tensor
     """Colours, shape [H, W, 3]."""
 

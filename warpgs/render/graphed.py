@@ -35,7 +35,8 @@ from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
-"""Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
+"""Number of calls in a row with equal keys (`call_key`) before kernels are captured. It doubles after a capture that is
+replayed fewer than `MIN_REPLAYS` times."""
 CAPACITY_FACTOR = 1.05
 """Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an earlier equal call exceeded its
 capacity, the larger number that either call needed is used."""
@@ -65,7 +66,7 @@ class Capacity(NamedTuple):
 
 
 class GraphedRasterizer:
-    """Render and gradients of one set of tensors for any camera, as four graphed functions."""
+    """Render and gradients of one set of tensors for any camera, as four functions with graphs (`GraphedFunction`)."""
 
     def __init__(
         self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
@@ -256,12 +257,12 @@ class Recorder:
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the current calls; None before there were enough equal calls."""
+        """Rasterizer of the calls with the current key; None before there were enough of them."""
         self.min_calls = MIN_CALLS
         """Number of equal calls in a row before kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
         self._exceeded: tuple[tuple | None, Capacity] = (None, Capacity(0, 0))
-        """Key of the last call that exceeded its capacity, and what it needed."""
+        """Key of the last call that exceeded its capacity, and the capacity that this call needed."""
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
         """Return the result of `GraphedRasterizer.render`; None if the call must run without graphs.

@@ -96,7 +96,7 @@ def check_file_path(path: Path) -> None:
 
 
 def check_free(folder: Path) -> None:
-    """Check that no process holds a folder, without writing; a folder that cannot be read counts as free.
+    """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free.
 
     Raises:
         FolderHeldError: Another process holds it.

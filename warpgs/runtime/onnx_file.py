@@ -71,7 +71,7 @@ def _text(message: Message, number: int) -> str:
 
 
 class _Walk:
-    """A walk through every node and tensor of a model that rejects what needs other files or foreign code."""
+    """A walk through every node and tensor of a model; it rejects models that need other files or foreign code."""
 
     def __init__(self, path: Path, own: set[tuple[str, str]]):
         self.path, self.own = path, own

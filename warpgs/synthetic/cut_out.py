@@ -236,7 +236,7 @@ def write_object(
     Args:
         folder: Target folder, new or empty.
         form: ``transforms``: transforms.json with RGBA images. ``colmap``: a COLMAP model with a few exact points, RGB images,
-            grey where nothing is, and masks that hold the alpha, white for the object.
+            grey outside the object, and masks that hold the alpha, white for the object.
         views: Number of images, at least 9; eight of them are training views.
         width: Image width [px].
         height: Image height [px].
