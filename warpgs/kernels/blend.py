@@ -268,10 +268,10 @@ def without_gradients(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 def check_slots(tiles: Tiles) -> None:
-    """Check that the instances have slots.
+    """Check that the tiles were made with slots, which gradients need.
 
     Raises:
-        ValueError: The instances have no slots.
+        ValueError: The tiles have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
         raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")

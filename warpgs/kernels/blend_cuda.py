@@ -1,4 +1,4 @@
-"""Blending kernels for CUDA in float32, with native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
+"""Blending kernels for CUDA in float32, with native bodies. Warps own 8 x 4 blocks of pixels, and sum gradients in chunks.
 
 Warp has no shuffles, no ballots and no 16-byte loads, so the bodies are CUDA. They compute what the generic kernels of
 blend_cpu.py compute (docs/blend.md); tests compare both.
@@ -239,7 +239,7 @@ def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
 
 
 def order_bytes(sizes: StepSizes) -> int:
-    """Return the bytes of the order of the tiles, which the forward pass frees at its end."""
+    """Return the bytes of the tile order, which the forward pass frees at its end."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
     return FLOAT * RANKS * columns * rows
 

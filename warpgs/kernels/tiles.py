@@ -183,7 +183,7 @@ def _depth_order(
 
 
 def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, allocator: Allocator) -> torch.Tensor:
-    """Return one past the last slot of each visible Gaussian from front to back, int64, shape [max(visible, 1)]."""
+    """Return the slot after the last slot of each visible Gaussian, front to back, int64, shape [max(visible, 1)]."""
     ends = allocator.saved((max(visible, 1),), torch.int64, counts.device)
     inputs = [interop.view(order, wp.int32), interop.view(counts, wp.int32), interop.view(ends, wp.int64)]
     interop.launch(kernel, visible, inputs, counts.device)

@@ -29,7 +29,7 @@ def sum_entries(count: int, native: bool) -> tuple[int, int]:
 
 @functools.cache
 def make_kernels(real, native: bool):
-    """Make the kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for a warp's items."""
+    """Make the kernels for one scalar type; ``native`` is True for CUDA, where each warp has one entry of the running sums."""
     lanes = make_native() if native else None
     width, each = (wp.constant(n) for n in _of_sum(native))
     ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)

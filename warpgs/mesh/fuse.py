@@ -103,7 +103,7 @@ def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
     stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
-    """Make a mesh of the surfaces of a model that cameras see.
+    """Make a mesh of the model's surfaces that cameras see.
 
     Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
     for distances and for colours. If the views have up to 16 million pixels in all, they are rendered once and kept. Otherwise
@@ -151,7 +151,7 @@ def vertex_colors(mesh: Mesh, views: SurfaceViews, truncation: float) -> tuple[n
     Args:
         mesh: The mesh, V vertices.
         views: Surface that each camera sees, at least one.
-        truncation: Truncation of the distances in the grid of the mesh [u].
+        truncation: Truncation of the grid's distances [u].
 
     Returns:
         Colours in [0, 1], float32, shape [V, 3], and the number of vertices that no view sees.

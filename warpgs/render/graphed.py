@@ -49,7 +49,7 @@ MAX_MEMORY_FRACTION = 0.05
 
 
 class Capacity(NamedTuple):
-    """Numbers of a render that memory is allocated for."""
+    """Numbers of Gaussians and instances for which a render allocates memory."""
 
     visible: int
     """Number of Gaussians that touch a tile."""
@@ -76,7 +76,7 @@ class GraphedRasterizer:
         Args:
             settings: Settings of the render.
             cameras: Number of images at a time.
-            capacity: Numbers to allocate memory for.
+            capacity: Numbers of Gaussians and instances to allocate memory for.
             graphs: Pool to capture graphs in.
             gradients: True to keep what the backward pass needs.
         """

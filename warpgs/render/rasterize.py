@@ -361,7 +361,7 @@ def _rasterize(
 
 
 def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **maps: torch.Tensor | None) -> Render:
-    """Return the result; without a leading axis for a single camera."""
+    """Return the render, with tensors that have no leading axis for a single camera."""
     single = len(camera.viewmat.shape) == 2
 
     def own(image: torch.Tensor) -> torch.Tensor:

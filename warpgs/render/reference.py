@@ -113,7 +113,7 @@ def reference_image(
     """Return the colours in a window of one camera's image under rule ``exact``, in float64.
 
     Gaussians are evaluated at all pixels of a block, with matrices (Kerbl et al. 2023, section 4 and eq. 3). Use it for
-    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: many Gaussians are slow.
+    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: the time grows with their number.
 
     Args:
         gaussians: N Gaussians of any scalar type, all finite.

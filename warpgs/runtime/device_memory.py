@@ -111,7 +111,7 @@ def container_memory(own: Path | None = None, mount: Path | None = None) -> Memo
 
 
 def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
-    """Yield folders of memory groups with the names of their files: limit, use, and file pages in ``memory.stat``."""
+    """Yield each memory group's folder, with the names of its limit file, its use file and a row of its ``memory.stat``."""
     rows = [row.split(":", 2) for row in _text(own).splitlines()]
     paths = {"": "/", "memory": "/"} | {c: p for _, names, p in (r for r in rows if len(r) == 3) for c in names.split(",")}
     versions = {

@@ -91,7 +91,7 @@ class View(NamedTuple):
     tensor."""
 
     def shape(self) -> tuple[int, ...]:
-        """Return the sizes of the axes that a kernel sees, followed by the sizes of a vector type."""
+        """Return the sizes of the axes that a kernel sees, followed by the shape of an element."""
         if self.axes is None:
             return tuple(self.tensor.shape)
         if self.axes == 0:
@@ -101,7 +101,7 @@ class View(NamedTuple):
         return (count,) if self.axes == 1 else (count // max(width, 1), width)
 
     def array(self) -> wp.array:
-        """Return the same memory as a Warp array of the shape [...], without a copy and without gradient."""
+        """Return the tensor's memory as a Warp array of the shape [...], without a copy and without gradient."""
         tensor = self.tensor.detach()
         if self.axes is not None:
             tensor = tensor.view(self.shape()) if self.axes else tensor.as_strided(self.shape(), (1,))

@@ -105,7 +105,7 @@ def listeners() -> list[tuple[str, str, int]]:
 
 
 def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
-    """Print in one line what other machines can reach, if anything.
+    """Print in one line which of the found sockets other machines can reach, if any.
 
     Args:
         found: Program name, address and port of each listening socket.

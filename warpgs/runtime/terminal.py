@@ -66,7 +66,7 @@ def answer(line: object) -> None:
     """Print one line to the process that started this one.
 
     Raises:
-        OSError: That process has ended, so the answer is not needed.
+        OSError: The other process has ended, so the answer is not needed.
     """
     _print(line, False)
 
