@@ -234,7 +234,7 @@ def make_kernel():
 
 
 def _packed(gray: np.ndarray) -> np.ndarray:
-    """Return colours with their right neighbours in the upper half, int32, with a border of one pixel of the colour outside."""
+    """Return colours, int32, with a border of one outside pixel; the upper half of each number holds the right neighbour."""
     framed = np.ones((gray.shape[0] + 3, gray.shape[1] + 2), np.int32)
     framed[1:-2, 1:-1] = _whole(gray) + LOW
     framed = framed.ravel()

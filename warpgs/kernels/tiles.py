@@ -112,7 +112,7 @@ def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int
     if tiles > interop.MAX_SIZE:
         raise ResourceError(
             f"{cameras:,} images of {width} x {height} px have {tiles:,} tiles of {tile_size} px, beyond the "
-            f"{interop.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
         )
     return tiles
 
@@ -151,8 +151,8 @@ def _depth_order(
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
 
     With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds. Invisible
-    ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N],
-    ``tiles`` the tiles of an image.
+    ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the
+    number of tiles of an image.
     """
     device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)

@@ -88,7 +88,7 @@ def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, in
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     """Return a mesh of at most about ``max_faces`` triangles, without colours; open edges stay where they are.
 
-    Edges collapse in the order of the quadric error (Garland and Heckbert 1997), by VTK. This part of VTK needs no graphics
+    VTK collapses edges in the order of their quadric error (Garland and Heckbert 1997). This part of VTK needs no graphics
     library.
 
     Args:

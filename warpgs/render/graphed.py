@@ -38,8 +38,8 @@ MIN_CALLS = 3
 """Number of calls in a row with equal keys (`call_key`) before kernels are captured. It doubles after a capture that is
 replayed fewer than `MIN_REPLAYS` times."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an earlier equal call exceeded its
-capacity, the larger number that either call needed is used."""
+"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an earlier call with the same key
+exceeded its capacity, the larger number that either call needed is used."""
 SPARE = 1024
 """Number that is added to the capacities for visible Gaussians and for instances."""
 MAX_PROJECTED = 2**23
@@ -186,7 +186,7 @@ class GraphedRasterizer:
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
-        """Return gradients of projected Gaussians [C, N, 12], and of backgrounds [C, 3], or None if these are not wanted."""
+        """Return gradients of projected Gaussians [C, N, 12] and of backgrounds [C, 3], with None for unwanted backgrounds."""
         v_images = [None if v is None else v.contiguous() for v in v_images]
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:

@@ -211,7 +211,7 @@ class GraphedFunction:
         self._places = [arena.place(t) for t in found]
 
     def _capture(self, key: tuple[int, ...], arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> CapturedGraph | None:
-        """Return a new graph; None where it would not pay or is not possible."""
+        """Return a new graph; None if a capture would not pay or is not possible."""
         if self.graphs.failed or self.captures - FREE_CAPTURES > self.replays // MIN_REPLAYS:
             return None  # too many captures: addresses change too often
         self.captures += 1

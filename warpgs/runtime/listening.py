@@ -54,7 +54,7 @@ def loopback_socket(port: int, fix: str, host: str = HOST) -> socket.socket:
 
 
 def loopback_of(name: str) -> str | None:
-    """Return the loopback address of a host name or address, 127.0.0.1 before ::1; None for other hosts."""
+    """Return the loopback address of a host name or address, 127.0.0.1 rather than ::1; None for other hosts."""
     try:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
     except (OSError, UnicodeError):  # the name cannot be resolved; connecting raises the error

@@ -52,7 +52,7 @@ def _message(data: memoryview) -> Message:
         else:
             length, at = _varint(data, at) if wire == 2 else ({1: 8, 5: 4}.get(wire, -1), at)
             if not 0 <= length <= len(data) - at:
-                raise ValueError(f"a field of wire type {wire} runs over the end")
+                raise ValueError(f"a field of wire type {wire} reaches beyond the data")
             value, at = data[at : at + length], at + length
         if not 0 < number <= MAX_FIELD:
             raise ValueError(f"invalid field number {number}")

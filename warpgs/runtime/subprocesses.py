@@ -49,7 +49,7 @@ def run_python(
         code: The code.
         arguments: Its ``sys.argv[1:]``; paths must be absolute.
         timeout: Seconds until the process is ended.
-        environment: Variables beside those of this process.
+        environment: Variables in addition to those of this process.
 
     Raises:
         subprocess.TimeoutExpired: The process took too long.
@@ -97,7 +97,7 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
         module: Full name of the module, run as ``__main__``.
         arguments: Its ``sys.argv[1:]``; paths must be absolute.
         folder: Folder to work in.
-        environment: Variables beside those of this process.
+        environment: Variables in addition to those of this process.
 
     Raises:
         ProcessFailed: The process ended with another exit code than 0.
@@ -162,7 +162,7 @@ class PythonWorker:
         Args:
             module: Full name of the module, run as ``__main__``.
             arguments: Its ``sys.argv[1:]``.
-            environment: Variables beside those of this process.
+            environment: Variables in addition to those of this process.
         """
         self._errors = tempfile.TemporaryFile()  # closed by `end`
         self._process = subprocess.Popen(

@@ -79,7 +79,7 @@ def _print(line: object, error: bool) -> None:
 
 
 def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
-    """Yield items, and print before each how many are done: ``scoring: 3 of 12 views``.
+    """Yield items; before each item, print how many are done: ``scoring: 3 of 12 views``.
 
     Args:
         items: The items.

@@ -147,7 +147,7 @@ def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.
         index: Index of the shape of each point, shape [N].
 
     Returns:
-        True where seen, shape [N].
+        True where the camera sees the point, shape [N].
     """
     xy, depth = _project(camera, x)
     size = np.array([camera.width, camera.height])
