@@ -102,7 +102,7 @@ def make_kernel(real, split: bool, lanes: int):
 
 @functools.cache
 def make_scheduled_kernel():
-    """Make the update kernel for CUDA in float32: four elements per thread; learning rates in memory, so graphs can replay it."""
+    """Make the CUDA update kernel in float32: four elements per thread, learning rates in memory, so a graph can replay it."""
 
     @wp.func_native(source("adam_update.cu"))
     def update_body(

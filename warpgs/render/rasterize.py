@@ -274,7 +274,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
         raise UsageError(
-            f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render the other channels in a second call"
+            f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
         )
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
