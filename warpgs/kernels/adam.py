@@ -48,7 +48,7 @@ def make_kernel(real, split: bool, lanes: int):
 
     Args:
         real: wp.float32 or wp.float64.
-        split: True where the head of each row has a learning rate of its own, which costs some arithmetic.
+        split: True where the first numbers of each row have a learning rate of their own, which costs some arithmetic.
         lanes: Number of elements that are updated at a time.
     """
     values = wp.types.vector(lanes, real)
@@ -102,7 +102,7 @@ def make_kernel(real, split: bool, lanes: int):
 
 @functools.cache
 def make_scheduled_kernel():
-    """Make the update for CUDA in float32: four elements a thread, learning rates in memory, so that a graph can replay it."""
+    """Make the CUDA update kernel in float32: four elements per thread, learning rates in memory, so a graph can replay it."""
 
     @wp.func_native(source("adam_update.cu"))
     def update_body(
@@ -126,7 +126,7 @@ def make_scheduled_kernel():
 
 
 def scheduled_lrs(lr: float, step: int, betas: tuple[float, float] = BETAS, head_lr: float | None = None) -> list[float]:
-    """Return the corrected learning rates of a row's first numbers and of the others, and the root of the second correction."""
+    """Return corrected learning rates of a row's first and other numbers, and the root of the second moment's correction."""
     correction1, correction2 = 1 - betas[0] ** step, 1 - betas[1] ** step
     return [(lr if head_lr is None else head_lr) / correction1, lr / correction1, correction2**0.5]
 
@@ -146,7 +146,7 @@ def adam_scheduled(
         skip: Flag, int32, shape [1]; nothing is updated if it is not 0.
         head: How many numbers, from the start of a row, take the first learning rate; 0 for none.
         betas: Decay of the two running means.
-        eps: Number added to the root.
+        eps: Number added to the square root of the second moment.
     """
     if param.numel() == 0:
         return
@@ -200,12 +200,12 @@ def adam_step(
         lr: Learning rate.
         step: Number of this step, from 1.
         betas: Decay rates of the two moments.
-        eps: Number added to the root.
+        eps: Number added to the square root of the second moment.
         head_lr: Learning rate of the first ``head`` numbers of each of the N rows; None for ``lr``.
         head: How many numbers, from the start of a row, take ``head_lr``; 0 for none.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, a tensor to be updated is not contiguous, or ``step`` is below 1.
     """
     pattern = " ".join(str(s) for s in param.shape)

@@ -40,12 +40,12 @@ SUMMED = 16
 
 @functools.cache
 def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
-    """Make the kernels that sum over the slots of each Gaussian, in slot order and so repeatably.
+    """Make the kernels that sum the gradient slots of each Gaussian, always in slot order, so that sums repeat bit for bit.
 
     Args:
         real: wp.float32 or wp.float64.
         values: Number of values of a gradient.
-        width: Number of values of a projected Gaussian; those without gradient come last.
+        width: Number of values of a projected Gaussian; values without a gradient come last.
     """
     reals = wp.types.vector(values, real)
     record = wp.types.vector(width, real)
@@ -97,7 +97,7 @@ def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
 
 
 def is_native(projected: torch.Tensor) -> bool:
-    """Return whether the CUDA kernels apply to projected Gaussians [C, N, 9 + D]; else the generic ones do."""
+    """Return whether the CUDA kernels apply to projected Gaussians [C, N, 9 + D]; otherwise the generic kernels do."""
     return projected.is_cuda and projected.dtype == torch.float32
 
 
@@ -134,9 +134,9 @@ def composite(
     """Return the images, and the data for the backward pass. Nothing is checked, and no gradient is recorded.
 
     Args:
-        projected: Projected Gaussians, contiguous, shape [C, N, 9 + D] with D channels instead of the colour, D out of
-            `WIDTHS`; [C, N, 12] with a colour.
-        tiles: Their instances.
+        projected: Projected Gaussians, contiguous, shape [C, N, 9 + D]. D is one of `WIDTHS`: 3 channels of a colour, or more
+            channels instead.
+        tiles: Their (Gaussian, tile) instances.
         backgrounds: Channels behind everything, contiguous, shape [C, D].
         settings: Settings.
         save: True where gradients will be taken.
@@ -145,8 +145,8 @@ def composite(
             may have fewer than D channels: then only the first ones are written. None for new memory.
 
     Returns:
-        ``rgb`` [C, H, W, D], or ``image``; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; one past the last
-        instance that was blended [C, H, W]; states of the chunks (CUDA in float32 only, else empty). Without ``save``,
+        ``rgb`` [C, H, W, D], or ``image``; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; the index after that
+        of the last blended instance [C, H, W]; states of the chunks (CUDA in float32 only, else empty). Without ``save``,
         transmittances and weight sums may be empty.
     """
     if is_native(projected):
@@ -215,9 +215,10 @@ def composite_gradients(
         tiles: Their tiles.
         backgrounds: Channels behind everything, shape [C, D].
         settings: Settings as given to `composite`.
-        saved: Results of `composite` without ``alpha``. Only the channels of ``rgb`` that ``v_images`` has are read.
-        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. That of
-            ``rgb`` may be a slice of channels of an image. On CUDA in float32 it may have fewer than D channels; the other
+        saved: Results of `composite` without ``alpha``. Only those channels of ``rgb`` are read that have a gradient in
+            ``v_images``.
+        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The gradient
+            of ``rgb`` may be a slice of channels of an image. On CUDA in float32 it may have fewer than D channels; the other
             channels have gradient 0.
         allocator: Provider of the gradient's memory.
     """
@@ -262,15 +263,15 @@ class _Blend(torch.autograd.Function):
 
 
 def without_gradients(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-    """Return tensors of any shape [...]; detached where autograd is off, since leaves would request gradients."""
+    """Return tensors of any shape [...], detached if autograd is off: leaf tensors would otherwise still require gradients."""
     return tensors if torch.is_grad_enabled() else tuple(t.detach() for t in tensors)
 
 
 def check_slots(tiles: Tiles) -> None:
-    """Check that the instances have slots.
+    """Check that the tiles were made with slots, which gradients need.
 
     Raises:
-        ValueError: The instances have no slots.
+        ValueError: The tiles have no slots.
     """
     if len(tiles.slots) != len(tiles.gaussian_ids):
         raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")
@@ -280,7 +281,7 @@ def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     """Check that tiles were made for an image of ``width`` x ``height`` px and for projected Gaussians [C, N, 12].
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, or the tiles belong to another image size.
     """
     sizes = interop.check(projected=(projected, "C N 12"), **backgrounds)
@@ -308,11 +309,11 @@ def blend(
 
     Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
     Derivation of the backward pass: docs/blend.md. Images repeat bit for bit, on CUDA and on any number of CPU threads;
-    gradients do if ``deterministic`` is True.
+    gradients repeat if ``deterministic`` is True.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Instances of `bin_tiles` for the same image size.
+        tiles: Result of `bin_tiles` for the same image size.
         backgrounds: Colour behind everything, shape [C, 3].
         width: Image width [px].
         height: Image height [px].
@@ -320,15 +321,15 @@ def blend(
         deterministic: True to sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less
             memory but is not repeatable to the bit; elsewhere it has no effect.
         origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: True to also sum magnitudes of the mean's gradient over pixels. They are the gradient of the last two values
-            of ``projected``, the half sides of the box.
+        absgrad: True to also sum magnitudes of the mean's gradient over pixels. The sums take the place of the gradient of the
+            last two values of ``projected``, the half sides of the box.
 
     Returns:
         ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean depth [u] under the
-        blending weights (z; the distance for a fisheye), 0 where these sum to less than `SMALLEST_WEIGHT`.
+        blending weights (z; the distance for a fisheye), 0 where the weights sum to less than `SMALLEST_WEIGHT`.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, or the tiles belong to another image size or lack the slots for gradients.
     """
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
@@ -339,11 +340,11 @@ def blend(
 def contributions(
     projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return sum and maximum over pixels of each Gaussian's blending weight alpha * T in each image. Not differentiable.
+    """Return for each Gaussian and image the sum and maximum of its blending weights alpha * T over pixels. Not differentiable.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Instances of `bin_tiles` for the same image size.
+        tiles: Result of `bin_tiles` for the same image size.
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.

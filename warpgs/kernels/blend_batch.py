@@ -1,4 +1,4 @@
-"""Batches of Gaussians in the backward blending kernel of the CPU: their values, and the rows of a tile that each reaches."""
+"""Batches of Gaussians in the CPU's backward blending: their values, and the rows of a tile that each Gaussian reaches."""
 
 import functools
 from types import SimpleNamespace
@@ -17,8 +17,8 @@ TOGETHER = 16
 def make_batches(real, tile_size: int, channels: int):
     """Make the record of a batch and its functions, for one scalar type, tile size and number of channels.
 
-    A tile is stored in columns as wide as a strip, one after the other. The strips of a column that a Gaussian reaches are
-    contiguous, since an ellipse is convex. They are stored as their first row and one past the last.
+    A tile is stored in columns as wide as a strip (`STRIP` pixels), one after the other. The strips of a column that a Gaussian
+    reaches are contiguous, since an ellipse is convex. So only the first of their rows and one past the last are stored.
     """
     f = make_functions(real)
     record = wp.types.vector(9 + channels, real)

@@ -1,7 +1,7 @@
 """Compositing of any number of channels: each Gaussian has D values instead of a colour.
 
 The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). More channels take several passes over the same
-instances, and no more memory than the image and the gradient (docs/blend.md, section 3).
+instances, but no memory besides the image and the gradient (docs/blend.md, section 3).
 """
 
 import functools
@@ -42,8 +42,8 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
     """Return the number of channels of a pass over projected Gaussians [C, N, 12].
 
     The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an H100
-    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except for magnitudes, which need one
-    pass.
+    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except with ``absgrad``, which needs a
+    single pass.
     """
     narrow = projected.is_cuda and not is_native(projected) and not absgrad
     return width_of(channels, WIDTHS[:1] if narrow else WIDTHS)
@@ -51,7 +51,7 @@ def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
 
 @functools.cache
 def make_kernels(real, width: int):
-    """Make two kernels: one gives Gaussians the ``width`` channels of a pass, the other splits the pass's gradient again."""
+    """Make two kernels: one gives Gaussians the ``width`` channels of a pass, the other takes the pass's gradient apart."""
     module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
     geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
     own, rest = wp.constant(width), wp.constant(GEOMETRY + width)
@@ -205,11 +205,11 @@ def blend_channels(
     """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
 
     Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The gradients of
-    position, factor and opacity are sums over passes, in order: as repeatable as those of `blend`.
+    position, factor and opacity are added up over passes in a fixed order, so they repeat as those of `blend` do.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Instances of `bin_tiles` for the same image size.
+        tiles: Result of `bin_tiles` for the same image size.
         colors: Finite values of any size and sign, shape [C, N, D] with D at least 1; or [1, N, D], the same for all images.
         backgrounds: Values behind everything, shape [C, D].
         width: Image width [px].
@@ -223,7 +223,7 @@ def blend_channels(
         The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, there is no channel, or the tiles belong to another image size.
     """
     shared = "1" if len(colors) == 1 else "C"

@@ -1,4 +1,4 @@
-"""Blending kernels for CUDA in float32, with native bodies: warps that own 8 x 4 blocks of pixels, and gradients by chunks.
+"""Blending kernels for CUDA in float32, with native bodies. Warps own 8 x 4 blocks of pixels, and sum gradients in chunks.
 
 Warp has no shuffles, no ballots and no 16-byte loads, so the bodies are CUDA. They compute what the generic kernels of
 blend_cpu.py compute (docs/blend.md); tests compare both.
@@ -32,7 +32,7 @@ WARPS = 2
 """Independent warps in a block."""
 LARGE_GAUSSIAN = 8
 """Mean number of tiles per visible Gaussian at which a warp of the forward pass takes two blocks of pixels instead of one. This
-halves the instances that are loaded and tested; few of them touch only one block (docs/decisions/005-cuda-blending.md)."""
+halves the instances that are loaded and tested; few instances touch only one block (docs/decisions/005-cuda-blending.md)."""
 RANKS = 33
 """Number of ranks of tiles; the rank of a tile is the number of bits of its list's length, 0 to 32."""
 ORDER_THREADS = 256
@@ -156,7 +156,8 @@ def make_backward(
         tile_size: Side of a tile [px].
         with_depth: True for gradients of depth and alpha, too.
         chunk: Instances per warp.
-        atomic: True to add each sum to that of its Gaussian atomically, in no fixed order; False to store it in its slot.
+        atomic: True to add each instance's sum to its Gaussian's sum atomically, in no fixed order; False to store it in the
+            instance's slot.
         channels: Number of channels, out of `WIDTHS`.
         absgrad: True to sum magnitudes of the mean's gradient, too (`BlendSettings.absgrad`).
     """
@@ -238,7 +239,7 @@ def instance_bytes(sizes: StepSizes) -> tuple[int, int]:
 
 
 def order_bytes(sizes: StepSizes) -> int:
-    """Return the bytes of the order of the tiles, which the forward pass frees at its end."""
+    """Return the bytes of the tile order, which the forward pass frees at its end."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
     return FLOAT * RANKS * columns * rows
 

@@ -22,7 +22,7 @@ def make_records(real, tile_size: int, channels: int, absgrad: bool):
 
     A tile is stored in columns as wide as a strip, one after the other; entries of its pixels follow in that order. Vectors
     are one row longer than the tile: see `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the
-    two magnitudes follow them if ``absgrad`` is set.
+    two magnitudes follow the channels if ``absgrad`` is set.
     """
     # The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in two lines.
     lead_reals = wp.types.vector(2, real)

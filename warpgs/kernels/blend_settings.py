@@ -37,7 +37,7 @@ class BlendSettings:
     """Window, cut-offs and order of sums."""
 
     origin: tuple[int, int]
-    """Left and top of the window [px]; a tile's corner."""
+    """Left and top of the window [px], at the corner of a tile."""
     width: int
     """Width of the window [px]."""
     height: int

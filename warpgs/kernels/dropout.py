@@ -31,8 +31,8 @@ def make_kernel():
 def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
     """Return factors for the opacities of ``count`` Gaussians: 0 with probability p, else 1 / (1 - p).
 
-    The expected opacity is unchanged. The factors depend only on p, ``seed``, `Setting.NUMBER` and the Gaussian's row, so they
-    are the same on every device and in a resumed fit.
+    The expected opacity is unchanged. The factors depend only on p, ``seed``, the number of the step or view (`Setting.NUMBER`)
+    and the Gaussian's row, so they are the same on every device and in a resumed fit.
 
     Args:
         count: Number of Gaussians N.

@@ -15,7 +15,7 @@ ABREAST = 4
 
 @functools.cache
 def make_falloffs(real, count: int):
-    """Make exp(-x / 2) of ``count`` numbers x >= 0; in float32 a polynomial, since calls to the C library do not vectorise."""
+    """Make exp(-x / 2) for ``count`` numbers x >= 0: a polynomial in float32, since calls to the C library do not vectorise."""
     reals = wp.types.vector(count, real)
 
     if real is wp.float64:

@@ -138,7 +138,7 @@ def heaviest(
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Instances of `bin_tiles` for the same image size.
+        tiles: Result of `bin_tiles` for the same image size.
         k: Number of Gaussians, at least 1.
         width: Image width [px].
         height: Image height [px].

@@ -1,7 +1,8 @@
 """Median depth of binned Gaussians: where the transmittance of a pixel falls to one half.
 
 This is a separate pass, so that `blend` does not become slower. The pass over a tile ends as soon as each pixel is half
-covered. It computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at one half.
+covered. It computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at which a pixel
+becomes half covered.
 """
 
 import functools
@@ -123,13 +124,13 @@ def median_depth(
 ) -> torch.Tensor:
     """Return the depth of the Gaussian at which a pixel's transmittance falls to one half or below. Not differentiable.
 
-    This is the median of depth under the weights of blending and of the background. At an edge it does not mix both surfaces,
-    unlike the mean depth of `blend`. A pixel has no median depth if its alpha in `blend` is below 1/2. Results repeat bit for
-    bit with any number of threads.
+    This is the weighted median of depth; the weights are those of blending, and the background has the rest. At an edge it does
+    not mix both surfaces, unlike the mean depth of `blend`. A pixel has no median depth if its alpha in `blend` is below 1/2.
+    Results repeat bit for bit with any number of threads.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Instances of `bin_tiles` for the same image size.
+        tiles: Result of `bin_tiles` for the same image size.
         width: Image width [px].
         height: Image height [px].
         rule: Cut-offs.

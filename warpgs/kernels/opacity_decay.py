@@ -34,7 +34,7 @@ def make_kernel():
 
 
 def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
-    """Return the logits of opacities that are multiplied by a factor.
+    """Return the logits after multiplying the opacities by a factor.
 
     Args:
         logits: Logits of opacities, float32, shape [N]; a NaN stays NaN.

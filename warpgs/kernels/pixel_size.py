@@ -1,4 +1,4 @@
-"""Pixel sizes at Gaussians: for each, a fraction of the size [u] of the smallest pixel of the training cameras that see it."""
+"""Pixel sizes at Gaussians: a fraction of the smallest pixel size [u] of the training cameras that see each Gaussian."""
 
 import functools
 
@@ -41,10 +41,10 @@ def make_kernel():
 
 
 def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return log(``fraction`` times the size of the smallest pixel that sees each mean), at least log(`SMALLEST`).
+    """Return log(``fraction`` times the smallest pixel size at each mean), at least log(`SMALLEST`).
 
-    A pixel of a camera measures depth over focal length, or distance over focal length for a fisheye (Yu et al. 2024,
-    Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
+    The pixel size of a camera is depth / focal length, or distance / focal length for a fisheye (Yu et al. 2024, Mip-Splatting,
+    section 4.1). Cameras that do not see a mean are ignored. A camera sees the points in the cone around its image.
 
     Args:
         means: Positions [u], float32, shape [N, 3].

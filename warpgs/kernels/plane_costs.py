@@ -19,19 +19,19 @@ from warpgs.runtime import interop
 LANES = 16
 """Neighbouring pixels or planes that are computed together, in a loop that vectorises."""
 ROWS = 32
-"""Rows of a task. The rows of a window above and below them are computed by two tasks."""
+"""Rows of a task. Windows also need some rows above and below, which the neighbouring tasks compute as well."""
 PLANES = 16
 """Planes of a task: 32 bytes of each pixel's costs, half a cache line."""
 WHITE = 4095
 """Brightness 1 as an integer: so fine that rounding is far below the noise of 8-bit images."""
 LOW = WHITE + 1
-"""Added to colours while they are interpolated, so that colours outside, -`WHITE`, are above 0."""
+"""Added to colours while they are interpolated, so that the colour outside of an image, -`WHITE`, becomes positive."""
 MIDDLE = 2048
 """Subtracted from colours before they are multiplied, which keeps sums small."""
 MAX_RADIUS = 3
 """Largest half side of a window [px]: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign."""
 NEUTRAL = 0.5
-"""Cost of correlation 0: where a plane leaves the other image, or nothing has texture."""
+"""Cost of correlation 0: where a plane projects outside of the other image, or a window has no texture."""
 
 
 @functools.cache
@@ -234,7 +234,7 @@ def make_kernel():
 
 
 def _packed(gray: np.ndarray) -> np.ndarray:
-    """Return colours with their right neighbours in the upper half, int32, in a frame of one pixel that is outside."""
+    """Return colours, int32, with a border of one outside pixel; the upper half of each number holds the right neighbour."""
     framed = np.ones((gray.shape[0] + 3, gray.shape[1] + 2), np.int32)
     framed[1:-2, 1:-1] = _whole(gray) + LOW
     framed = framed.ravel()

@@ -20,7 +20,7 @@ from warpgs.scene import Camera
 BEHIND = 1e-9
 """Ratio of a point's depth to its depth in the first view, up to which the point counts as behind a camera."""
 STEP = 1e-3
-"""Step of the inverse depth for the central difference of the sensitivity, as a fraction of the inverse depth."""
+"""Step of the central difference that gives the change of depth per pixel, as a fraction of the inverse depth."""
 
 
 @functools.cache
@@ -97,7 +97,7 @@ def make_kernels():
 
 
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return the inverse depth [1/u], float64, shape [H, W], of least cost, refined by the parabola through three costs.
+    """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola through three costs, float64, shape [H, W].
 
     Args:
         costs: Integers, int16, shape [H, W, P] with P at least D.
@@ -114,7 +114,7 @@ def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
 
 
 def _between(first: Camera, second: Camera) -> tuple[wp.mat33d, wp.vec3d]:
-    """Return the turn [3, 3] and shift [3] with which a pixel (x, y, 1) at inverse depth w lies at turn p + w shift."""
+    """Return the turn [3, 3] and shift [3] that map a pixel p = (x, y, 1) at inverse depth w to turn p + w shift."""
     rotation, translation = geometry.relative_pose(first, second)
     turn = geometry.matmul(geometry.matmul(second.K, rotation), geometry.inverse(first.K))
     return wp.mat33d(*turn.ravel()), wp.vec3d(*geometry.matmul(second.K, translation[:, None])[:, 0])
@@ -124,7 +124,7 @@ def check_round_trip(
     first: Camera, second: Camera, own: np.ndarray, found: np.ndarray, sensitivity: np.ndarray, *, most: float,
     min_parallax: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return a mask of the pixels that a round trip through another view's depth returns to, with enough parallax.
+    """Return a mask of the pixels with enough parallax to which a round trip through another view's depth leads back.
 
     Args:
         first: Camera of the view.

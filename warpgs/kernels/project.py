@@ -171,9 +171,9 @@ def project(
     """Project N Gaussians into C cameras (EWA, first order).
 
     Differentiable in the seven tensors. A Gaussian is culled if its depth is below ``rule.near`` or above ``rule.far``, its
-    opacity is below the cut, or its box is outside the image. It is also culled if a parameter that is read is non-finite, or
-    outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients of
-    culled Gaussians are zero. Derivation of the backward pass: docs/project.md.
+    opacity is below the cut-off, or its box is outside the image. It is also culled if a parameter that is read is non-finite,
+    or outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients
+    of culled Gaussians are zero. Derivation of the backward pass: docs/project.md.
 
     Args:
         means: World positions [u], shape [N, 3].
@@ -199,7 +199,7 @@ def project(
         tiles that each Gaussian touches (0 where culled; no gradient).
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera model is unknown.
         ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
     """
@@ -222,7 +222,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
         Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
         ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
     """

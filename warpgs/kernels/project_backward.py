@@ -13,7 +13,7 @@ from warpgs.kernels.project_inputs import PROJECTED_SIZE
 
 @functools.cache
 def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int, lanes: bool = False):
-    """Make the functions that compute the gradients of a Gaussian's parameters from those of the projected Gaussian.
+    """Make the functions that compute the gradients of a Gaussian's parameters from the gradient of the projected Gaussian.
 
     Args:
         real: wp.float32 or wp.float64.
@@ -21,7 +21,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
         antialiased: True where opacities were multiplied by `compensation`.
         bases: Number of basis values that a colour may have (`sh.bases_for`).
-        lanes: As in `make_projection`. Functions then take a projected Gaussian and its gradient as vectors, not as rows of
+        lanes: As in `make_projection`. If True, functions take a projected Gaussian and its gradient as vectors, not as rows of
             arrays.
     """
     m = make_projection(real, camera_model, parameters, lanes)

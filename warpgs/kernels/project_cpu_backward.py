@@ -13,7 +13,7 @@ from warpgs.kernels.project_lanes import LANES, make_lanes
 
 @functools.cache
 def make_backward(real, camera_model: str, parameters: str, antialiased: bool, bases: int, camera_gradients: bool):
-    """Make the kernel, over all cameras, so that no sum needs atomics.
+    """Make the kernel. Each task sums over all cameras, so no sum needs atomics.
 
     Args:
         real: wp.float32 or wp.float64.

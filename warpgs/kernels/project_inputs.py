@@ -17,7 +17,7 @@ from warpgs.runtime.derivatives import first_order
 PROJECTED_SIZE = 12
 """Number of values of a projected Gaussian, whose rows are 16-byte aligned in float32:
 0:2 mean [px], 2:5 factor u11 u12 u22 [1/px], 5 opacity, 6:9 colour, 9 depth [u] (z; the distance for a fisheye),
-10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut."""
+10:12 half width and half height [px] of the box that holds every pixel with alpha at or above the cut-off."""
 
 OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
 """Rows and columns of the entries of a covariance above the diagonal, in the order in which they are packed."""
@@ -58,9 +58,9 @@ class ProjectInputs(NamedTuple):
     quats: torch.Tensor
     """Rotations wxyz, or entries xy, xz, yz of covariances and a 0 (`ProjectSettings.parameters`), shape [N, 4]."""
     log_scales: torch.Tensor
-    """Logarithm of the axis lengths [u], the lengths, or the diagonals of covariances, shape [N, 3]."""
+    """Logarithm of the axis lengths [u], the lengths themselves, or the diagonals of covariances, shape [N, 3]."""
     logit_opacities: torch.Tensor
-    """Inverse sigmoid of the opacity, or the opacity, shape [N]."""
+    """Inverse sigmoid of the opacity, or the opacity itself, shape [N]."""
     sh: torch.Tensor
     """Spherical-harmonics coefficients of the colour, shape [N, K, 3]."""
     viewmats: torch.Tensor

@@ -103,7 +103,7 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
 
 
 def _ways(height: int, width: int, down: torch.Tensor, across: torch.Tensor):
-    """Return the number of lines, their length, steps of pixels, limits and steps of limits, along rows, then columns."""
+    """Return the number of lines, their length, strides of pixels, limits and strides of limits: along rows, then columns."""
     return (height, width, (width, 1), across, (width - 1, 1)), (width, height, (1, width), down, (1, width))
 
 

@@ -1,7 +1,7 @@
 """Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
 
-The forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three fields. Images are flat rows
-of width * channels.
+For images a and b, the forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three fields.
+Images are flat rows of width * channels.
 """
 
 import functools
@@ -229,7 +229,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         Similarities in [-1, 1], of the images' shape; their mean is the usual score.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong.
     """
     _check(image, target)
@@ -256,7 +256,7 @@ def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         The two sums, shape [2]. The gradient of |image - target| is 0 where both are equal.
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong.
     """
     _check(image, target)

@@ -15,7 +15,7 @@ SIGMA = 1.5
 C1 = 0.01**2
 """(K1 L)^2 of Wang et al. 2004 for a data range L of 1."""
 C2 = 0.03**2
-"""(K2 L)^2 of the same paper."""
+"""(K2 L)^2 of Wang et al. 2004."""
 
 
 def _window() -> list[float]:
@@ -114,7 +114,7 @@ def make_kernels(real, summed: bool):
     """Make the kernels for a CPU, of one task per block of rows.
 
     The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
-    elements; the last step starts early, to end with the row, and repeated elements get the same values.
+    elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
 
     Args:
         real: wp.float32 or wp.float64.

@@ -1,4 +1,4 @@
-"""Structural similarity for CUDA in float32: both passes of the window in shared memory, one launch each way."""
+"""Structural similarity for CUDA in float32: both window passes in shared memory, one launch forward and one backward."""
 
 import functools
 from types import SimpleNamespace

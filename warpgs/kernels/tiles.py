@@ -19,7 +19,7 @@ from warpgs.runtime.sorting import sort_pairs
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
 
 LIST_BYTES = 20
-"""Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the owner."""
+"""Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the Gaussian number."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 """Bytes of an instance with its gradient slot and its part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
@@ -60,13 +60,13 @@ class Tiles:
 
 
 class Visible(NamedTuple):
-    """Capacity for visible Gaussians where nothing is read from the device."""
+    """Capacity for visible Gaussians, for renders that read nothing from the device."""
 
     sums: torch.Tensor
     """Running sums of `running_counts`, int64, shape [S]."""
     capacity: int
-    """Number of visible Gaussians to allocate for, at most the number of all. If there are more, which the last of the sums
-    shows, the lists must not be used."""
+    """Number of visible Gaussians to allocate for, at most the number of all Gaussians. If the last of the sums shows more, the
+    lists must not be used."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class InstanceMemory:
     allocator: Allocator = TORCH
     """Provider of the lists' memory."""
     visible: Visible | None = None
-    """Capacity for visible Gaussians, if there is one for instances; None to sort all Gaussians."""
+    """Capacity for visible Gaussians, if instances have a capacity too; None to sort all Gaussians."""
 
 
 AS_NEEDED = InstanceMemory()
@@ -112,13 +112,13 @@ def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int
     if tiles > interop.MAX_SIZE:
         raise ResourceError(
             f"{cameras:,} images of {width} x {height} px have {tiles:,} tiles of {tile_size} px, beyond the "
-            f"{interop.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each"
+            f"{interop.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
         )
     return tiles
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
-    """Return the bytes of the lists at each moment of a step; the owners of instances are freed after the sort."""
+    """Return the bytes of the lists at each moment of a step; owners (Gaussian numbers) are freed after the sort."""
     columns, rows = grid(sizes.width, sizes.height, TILE_SIZE)
     ranges = 2 * FLOAT * columns * rows + (FLOAT + 8) * sizes.count  # of each tile; first slots and ends of each Gaussian
     sorting = (2 * 2 * FLOAT + 2 * 8) * sizes.count  # depths and order twice, two running sums of int64
@@ -151,8 +151,8 @@ def _depth_order(
     """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
 
     With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds. Invisible
-    ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N],
-    ``tiles`` the tiles of an image.
+    ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the
+    number of tiles of an image.
     """
     device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
@@ -183,7 +183,7 @@ def _depth_order(
 
 
 def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, allocator: Allocator) -> torch.Tensor:
-    """Return one past the last slot of each visible Gaussian from front to back, int64, shape [max(visible, 1)]."""
+    """Return the slot after the last slot of each visible Gaussian, front to back, int64, shape [max(visible, 1)]."""
     ends = allocator.saved((max(visible, 1),), torch.int64, counts.device)
     inputs = [interop.view(order, wp.int32), interop.view(counts, wp.int32), interop.view(ends, wp.int64)]
     interop.launch(kernel, visible, inputs, counts.device)
@@ -221,7 +221,7 @@ def bin_tiles(
         rule: Cut-offs, the same as given to `project`.
         tile_size: Side of a tile [px].
         origin: Left and top [px] of the window given to `project`, multiples of ``tile_size``.
-        memory: Memory of the instances; if it has a capacity, M is the capacity.
+        memory: Memory that the (Gaussian, tile) instances may take; if it has a capacity, the lists have this length.
         slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
         listed: True for the tiles that get instances, bool, shape [C * tiles]; the others stay empty. None for all tiles.
 

@@ -1,4 +1,4 @@
-"""Kernels of binning that write the (Gaussian, tile) instances, and find those of each tile in the sorted lists."""
+"""Kernels of binning that write the (Gaussian, tile) instances, and find each tile's instances in the sorted lists."""
 
 import functools
 
@@ -8,7 +8,7 @@ from warpgs.kernels.functions import make_spans
 from warpgs.kernels.native import make_functions as make_native
 
 EACH = 4
-"""Items of a thread of short kernels on CUDA: with a single item, waiting for its load would take longer than the work."""
+"""Number of items per thread in short kernels on CUDA: with one item, waiting for its load would take longer than the work."""
 
 
 @functools.cache
@@ -90,7 +90,8 @@ def make_emit(real, slotted: bool):
 
     Args:
         real: wp.float32 or wp.float64.
-        slotted: True to write the slot and the owner of each instance; False to write only its owner, in place of the slot.
+        slotted: True to write the slot and the Gaussian number of each instance; False to write the number in place of the
+            slot.
     """
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)

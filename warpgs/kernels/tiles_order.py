@@ -29,7 +29,7 @@ def sum_entries(count: int, native: bool) -> tuple[int, int]:
 
 @functools.cache
 def make_kernels(real, native: bool):
-    """Make the kernels for one scalar type; ``native`` is for CUDA, where a running sum has one entry for a warp's items."""
+    """Make the kernels for one scalar type; ``native`` is True for CUDA, where each warp has one entry of the running sums."""
     lanes = make_native() if native else None
     width, each = (wp.constant(n) for n in _of_sum(native))
     ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)
@@ -129,7 +129,7 @@ def make_kernels(real, native: bool):
 def running_counts(
     counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
 ) -> torch.Tensor:  # fmt: skip
-    """Return running sums that count tiles and visible Gaussians in one number each, int64, shape [S].
+    """Return running sums, each of which counts both tiles and visible Gaussians in one number, int64, shape [S].
 
     A visible Gaussian adds its tile count and 2^`sum_bits`. `split_sum` splits the last sum.
 

@@ -29,7 +29,7 @@ class DistanceGrid:
     truncation: float
     """Largest distance from a surface that is stored [u]."""
     distances: torch.Tensor
-    """Mean distance in front of the surface over ``truncation``, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
+    """Mean distance in front of the surface divided by ``truncation``, in [-1, 1], shape [X, Y, Z]; undefined at weight 0."""
     weights: torch.Tensor
     """Sum of the weights of the views that saw the point, shape [X, Y, Z]."""
 
@@ -228,7 +228,7 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
 
     Raises:
         ResourceError: The grid has more points than kernels can index.
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera is not a pinhole.
         ValueError: A shape or device is wrong.
     """
@@ -251,7 +251,7 @@ def gather_colors(
     points: torch.Tensor, tolerance: float, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
     image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Add the colours that one view sees to the points that lie on the surface that the view sees, in place.
+    """Add the colours of one view, in place, to the points that lie on the surface that the view sees.
 
     Args:
         points: Positions [u], shape [N, 3].
@@ -264,7 +264,7 @@ def gather_colors(
         weights: Sums of weights so far, shape [N].
 
     Raises:
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera is not a pinhole.
         ValueError: A shape or device is wrong.
     """

@@ -1,1 +1,1 @@
-"""Meshes of fitted models: rendered depth is fused into a grid of signed distances, and its surface becomes triangles."""
+"""Meshes of fitted models: rendered depth is fused into a grid of signed distances, whose zero surface becomes triangles."""

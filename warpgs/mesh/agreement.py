@@ -1,4 +1,4 @@
-"""Agreement of views on depth: a mesh omits a depth if other views see a surface there, but none of them at this depth.
+"""Agreement of views on depth: a mesh omits a point if other views see surfaces there, but none at the point's depth.
 
 A fit of few views constrains depth only where two views look. If only one view sees a surface, such as beside an occluding
 edge, the surface's depth is unconstrained.
@@ -19,11 +19,12 @@ from warpgs.priors.view_choice import matching_views, shared_sight
 from warpgs.scene import Camera
 
 TOLERANCE = 0.02
-"""Largest difference of two depths of one surface, as a fraction of the depth; coverage has the same limit (decision 019)."""
+"""Largest difference of two depths of one surface, as a fraction of the depth; scores of coverage use the same limit (decision
+019)."""
 NEIGHBOURS = 16
 """Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
 MAX_PIXELS = 2**26
-"""Largest number of pixels of all stored maps, 256 MiB; with more, maps store every ``step``-th pixel."""
+"""Largest number of depths in all maps together, 256 MiB; if images have more pixels, maps store every ``step``-th pixel."""
 BOUNDS = (0.02, 0.98)
 """Quantiles of a view's depths that are used as the depths of the nearest and farthest surface."""
 
@@ -47,7 +48,7 @@ def depth_map(view: SurfaceView, views: int) -> DepthMap:
 
     Args:
         view: The view.
-        views: Number of views that are kept.
+        views: Number of views with a depth map.
     """
     step = max(1, int(np.ceil((view.depth.numel() * views / MAX_PIXELS) ** 0.5)))
     depth = view.depth[step // 2 :: step, step // 2 :: step]
@@ -67,8 +68,9 @@ def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
 def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
     """Return a view without the depths that no other view confirms.
 
-    A depth is kept if at least one other view has a surface within `TOLERANCE` of its point. It is also kept if no other view
-    has a surface where the point projects, such as outside of all other images. So a single view keeps all its depths.
+    A depth is kept if at least one other view has a surface within `TOLERANCE` of the depth's point. A depth is also kept if
+    its point projects onto no surface in any other view, such as outside of all other images. So a single view keeps all its
+    depths.
 
     Args:
         view: The view.
@@ -85,7 +87,7 @@ def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
 
 
 def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
-    """Return the distance in depth of a map's points to another view's surface, as a fraction of depth, shape [H, W].
+    """Return how far one view's points are from another view's surface in depth, as a fraction of depth, shape [H, W].
 
     A point is compared with the nearest of the four depths around its projection, since depth varies within a pixel on a
     slanted surface. The result is infinite where the pixel has no depth, outside of the other image, and where all four depths

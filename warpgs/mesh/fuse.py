@@ -19,7 +19,7 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
 
 COLOR_TOLERANCE = 1.0
-"""Largest distance, in truncations, between a vertex and the surface of a view that colours the vertex."""
+"""Largest distance between a vertex and the surface of a view that colours it, as a multiple of the grid's truncation."""
 
 MIN_FACES = 4
 """Smallest number of triangles that enclose a volume."""
@@ -32,7 +32,7 @@ class MeshOptions:
     voxel: float | None = None
     """Distance between neighbouring grid points [u]; None to derive it from ``resolution``."""
     resolution: int | None = None
-    """Voxels along the longest side of the surfaces' box; None for 256, or fewer if the images resolve less."""
+    """Voxels along the longest side of the box around the surfaces; None for 256, or fewer if the images resolve less."""
     max_faces: int = 200_000
     """Largest number of triangles; larger meshes are simplified."""
     depth: str = "median"
@@ -81,7 +81,7 @@ def integrate_views(views: SurfaceViews, plan: GridPlan, maps: Sequence[DepthMap
         views: Surface that each camera sees.
         plan: The grid.
         maps: Depth map of each view, to compare other views with.
-        like: Any tensor of the type and on the device of the grid, shape [...].
+        like: Any tensor with the scalar type and device that the grid gets, shape [...].
 
     Raises:
         DataError: Other views contradict all depths.
@@ -103,11 +103,11 @@ def fuse(
     gaussians: Gaussians, cameras: Sequence[Camera], render: RasterizeOptions, options: MeshOptions = MeshOptions(), *,
     stage: Callable[[str], object] = lambda line: None, planned: Callable[[GridPlan, str], object] = lambda plan, memory: None,
 ) -> FusedMesh:  # fmt: skip
-    """Make a mesh of the surfaces of a model that cameras see.
+    """Make a mesh of the model's surfaces that cameras see.
 
     Areas that no camera sees, or on which cameras disagree, stay open. Views are used three times: for the extent of the scene,
-    for distances and for colours. Up to 16 million pixels in all are rendered once and kept. With more, each use renders one
-    view at a time, and only the depths are kept.
+    for distances and for colours. If the views have up to 16 million pixels in all, they are rendered once and kept. Otherwise
+    each use renders them again, one at a time, and only depths are kept.
 
     Args:
         gaussians: N Gaussians in the units of the cameras.
@@ -120,7 +120,7 @@ def fuse(
     Raises:
         DataError: No camera sees a surface, or other cameras contradict all depths.
         ResourceError: The grid does not fit into memory.
-        UsageError: There is no camera, one has no pinhole of the same K, or an option is out of range.
+        UsageError: There is no camera, a camera has no pinhole of the same K, or an option is out of range.
     """
     if not cameras:
         raise UsageError("fuse needs at least one camera that sees the surfaces")
@@ -151,7 +151,7 @@ def vertex_colors(mesh: Mesh, views: SurfaceViews, truncation: float) -> tuple[n
     Args:
         mesh: The mesh, V vertices.
         views: Surface that each camera sees, at least one.
-        truncation: Truncation of the distances in the grid of the mesh [u].
+        truncation: Truncation of the grid's distances [u].
 
     Returns:
         Colours in [0, 1], float32, shape [V, 3], and the number of vertices that no view sees.

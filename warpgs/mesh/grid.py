@@ -17,12 +17,12 @@ RESOLUTION = 256
 """Voxels along the longest side of the box around the surfaces, if neither ``voxel`` nor ``resolution`` is given."""
 MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
 TRUNCATION = 4.0
-"""Truncation in voxels."""
+"""Largest distance from a surface that the grid stores, in voxels."""
 FENCE = 3.0
 """Distance outside the quartiles, in interquartile ranges, beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
 Data Analysis)."""
 QUANTILES = (0.005, 0.995)
-"""Quantiles of the surface points along an axis that bound the grid, unless `FENCE` gives a tighter bound."""
+"""Quantiles of the surface points' coordinates; they bound the grid along each axis, unless `FENCE` bounds it more tightly."""
 GRID_BYTES = 8
 """Bytes of a grid point on the device: distance and weight."""
 HOST_BYTES = 14
@@ -31,7 +31,7 @@ HOST_BYTES = 14
 
 @dataclass(frozen=True)
 class GridPlan:
-    """A grid of points along the axes of the world."""
+    """A regular grid of points, parallel to the axes of the world."""
 
     origin: tuple[float, float, float]
     """Position of the first point [u]."""
@@ -54,7 +54,7 @@ class GridPlan:
 
 
 def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper corner, shape [3] each, of the box around points without the outliers along each axis.
+    """Return the lower and upper corner, shape [3] each, of the box around points, except outliers along each axis.
 
     Points far behind all others, such as a background at infinity, are cut off.
 
@@ -83,7 +83,9 @@ def plan_grid(
         UsageError: ``voxel`` is not positive, or too small for the extent of the points.
     """
     if not len(points):
-        raise DataError("no training view shows a surface: alpha is below 0.5, or depth uncertain; fit again with more steps")
+        raise DataError(
+            "no training view shows a surface: alpha is below 0.5 or depth uncertain everywhere; fit again with more steps"
+        )
     low, high = find_box(points)
     longest = float((high - low).max())
     if voxel is None:

@@ -12,18 +12,18 @@ from warpgs.geometry import rotation_matrices
 from warpgs.scene import Camera, Gaussians
 
 CONTRIBUTORS = 32
-"""Number of heaviest Gaussians of a pixel that are used."""
+"""Number of Gaussians that are used for a pixel: those with the largest blending weights."""
 BAND = 0.02
 """Largest difference from the median depth, as a fraction of the median, that counts as the same surface."""
 MIN_SHARE = 0.5
-"""Smallest fraction of the weights within `BAND` of the median for which a pixel shows a surface
+"""A pixel shows a surface if at least this fraction of its weights is within `BAND` of the median depth
 (docs/decisions/027-mesh-depth.md)."""
 BLOCK = 2**15
-"""Pixels at a time: 38 MB for the matrices of their contributors."""
+"""Number of pixels that are processed at a time: 38 MB for the matrices of their Gaussians."""
 
 
 def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return maps from camera space to spaces in which each Gaussian is isotropic, up to scale, and the Gaussians' means.
+    """Return for each Gaussian a linear map of camera space that makes the Gaussian isotropic; and the Gaussians' means.
 
     Args:
         gaussians: N Gaussians.
@@ -31,7 +31,7 @@ def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch
 
     Returns:
         Matrices, shape [N, 3, 3], and the means in camera space [u], shape [N, 3]. Each row of a matrix is a unit axis of the
-        Gaussian, times the shortest scale over the scale of that axis.
+        Gaussian, times the smallest scale divided by the scale of this axis.
     """
     view = torch.as_tensor(camera.viewmat, dtype=gaussians.means.dtype, device=gaussians.means.device)
     axes = rotation_matrices(torch.nn.functional.normalize(gaussians.quats, dim=1))
@@ -45,13 +45,13 @@ def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch
 def densest_depths(matrices: torch.Tensor, means: torch.Tensor, rays: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
     """Return the z-depth [u] at which each of k Gaussians is densest along a ray, shape [P, k].
 
-    If that depth is not above 0 or not finite, the depth of the mean is returned.
+    The depth of the mean replaces a depth that is 0, negative or not finite.
 
     Args:
         matrices: Matrices of `whitening`, shape [N, 3, 3].
         means: Means in camera space [u], shape [N, 3].
         rays: Directions in camera space with z = 1, shape [P, 3].
-        ids: Numbers of the Gaussians, shape [P, k].
+        ids: Indices of the Gaussians, shape [P, k].
     """
     own, mean = matrices[ids], means[ids]
     along = (own * rays[:, None, None]).sum(-1)
@@ -77,7 +77,7 @@ def surface_depth(
     Args:
         gaussians: N Gaussians in the units of the camera.
         camera: Pinhole camera, arrays of numpy.
-        ids: Gaussians of each pixel, -1 for none, shape [H, W, k].
+        ids: Indices of each pixel's Gaussians, -1 for none, shape [H, W, k].
         weights: Their blending weights, 0 for none, shape [H, W, k].
 
     Returns:

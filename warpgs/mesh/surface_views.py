@@ -17,7 +17,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 DEPTHS = ("median", "mean")
-"""Depths that can be fused."""
+"""Kinds of rendered depth that can be fused."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface."""
 EMPTY = 0.02
@@ -25,7 +25,7 @@ EMPTY = 0.02
 SAMPLES = 200_000
 """Number of pixels of all views that are sampled to find the extent of the surfaces."""
 KEPT_PIXELS = 2**24
-"""Largest number of pixels of all views that are kept after one render, 320 MiB; with more, every use renders again."""
+"""Largest number of pixels of all views together for which renders are kept, 320 MiB; otherwise every use renders again."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class SurfaceView:
     depth: torch.Tensor
     """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where the depth is uncertain."""
     weights: torch.Tensor
-    """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times the opacity of a surface."""
+    """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times alpha if there is a surface."""
     image: torch.Tensor
     """Colours, shape [H, W, 3]."""
 
@@ -71,15 +71,15 @@ def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions
 class SurfaceViews:
     """Surfaces that the cameras see, in the order of the cameras; they can be iterated several times.
 
-    If all views together have at most `KEPT_PIXELS` pixels, each view is rendered once and kept. Otherwise every pass renders
-    the views again, one at a time.
+    If all views together have at most `KEPT_PIXELS` pixels, each view is rendered once and kept. Otherwise every iteration
+    renders the views again, one at a time.
     """
 
     def __init__(
         self, gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str,
         stage: Callable[[str], object] = lambda line: None,
     ) -> None:  # fmt: skip
-        """Prepare to render the cameras of a model.
+        """Prepare to render a model from all cameras.
 
         Args:
             gaussians: N Gaussians in the units of the cameras.

@@ -1,4 +1,4 @@
-"""Triangles from a grid of signed distances: marching cubes where the grid was seen, small parts removed, fewer triangles."""
+"""Triangles from a grid of signed distances: marching cubes where it was seen, removal of small parts, simplification."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from warpgs.kernels.tsdf import DistanceGrid
 from warpgs.scene import Mesh
 
 MAX_JUMP = 1.1
-"""Largest difference of the distances at two neighbouring grid points with a surface between them, in truncations. A smaller
-limit leaves out surfaces at grazing angles; with a larger one, false triangles extend behind depth edges. The limit and the
-truncation were chosen on a demo scene of another seed than the reported one (docs/decisions/019-thresholds.md)."""
+"""Largest difference, in units of the truncation, of the distances at two neighbouring grid points with a surface between them.
+A smaller limit leaves out surfaces at grazing angles; with a larger one, false triangles extend behind depth edges. The limit
+and the truncation were chosen on a demo scene with another seed than the scene of the results
+(docs/decisions/019-thresholds.md)."""
 NO_SURFACE = (
     "no surface inside the grid; give a larger --voxel (a smaller one if voxels are as large as the scene), or fit "
     "with more steps"
@@ -22,7 +23,7 @@ MIN_PART = 0.002
 
 
 def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Return a mesh [V, 3], [F, 3] that has no colours yet."""
+    """Return a mesh of vertices [V, 3] and triangles [F, 3], without colours."""
     return Mesh(vertices, faces.astype(np.int32), np.full(vertices.shape, 0.5, np.float32))
 
 
@@ -76,7 +77,7 @@ def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
 
 
 def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, int]:
-    """Return a mesh without connected parts of fewer triangles than ``fraction`` of all, and the number of parts removed."""
+    """Return a mesh without connected parts of less than ``fraction`` of all triangles, and the number of removed parts."""
     number, part = parts(mesh)
     sizes = np.bincount(part, minlength=number)
     keep = sizes >= max(1.0, fraction * len(mesh.faces))
@@ -87,7 +88,7 @@ def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, in
 def decimate(mesh: Mesh, max_faces: int) -> Mesh:
     """Return a mesh of at most about ``max_faces`` triangles, without colours; open edges stay where they are.
 
-    Edges collapse in the order of the quadric error (Garland and Heckbert 1997), by VTK. This part of VTK needs no graphics
+    VTK collapses edges in the order of their quadric error (Garland and Heckbert 1997). This part of VTK needs no graphics
     library.
 
     Args:

@@ -1,4 +1,4 @@
-"""Checks of the arrays of a camera. Values on a GPU are not checked: that would wait for the device."""
+"""Checks of the arrays of a camera. Values on a GPU are not checked: reading them would wait for the device."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from warpgs.scene import Camera
 
 
 def check_arrays(camera: Camera) -> None:
-    """Check types and shapes of a camera's arrays, the type of its size, and the values of arrays in main memory.
+    """Check types and shapes of a camera's arrays, the types of width and height, and the values of arrays in main memory.
 
     Raises:
         TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real or have half
@@ -61,7 +61,7 @@ def _check_type(name: str, array: Any) -> None:
 
 
 def _skew_of(matrix: list[list[float]]) -> float:
-    """Return the sum of the errors of the fixed entries of K; non-finite if an entry of K is, or if a focal length is 0."""
+    """Return the sum of the errors of K's constant entries; non-finite if an entry of K is, or if a focal length is 0."""
     (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
     if not (fx and fy):
         return math.inf
@@ -69,7 +69,7 @@ def _skew_of(matrix: list[list[float]]) -> float:
 
 
 def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
-    """Raise ValueError where the intrinsics are not those of a camera without skew."""
+    """Raise ValueError where the intrinsics are non-finite, or have a skew, a focal length of 0, or a wrong last row."""
     _check_finite(matrix, where)
     (fx, skew, _), (below, fy, _), (left, middle, last) = matrix
     if not (fx and fy):

@@ -1,4 +1,4 @@
-"""Chunked rendering: an image is rendered in windows, each with at most a given number of (Gaussian, tile) instances."""
+"""Chunked rendering: windows of an image, each with at most a given number of (Gaussian, tile) pairs, called instances."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class ChunkedFrame:
     settings: RenderSettings
     """Settings of the whole render; its window is divided."""
     max_instances: int
-    """Largest number of instances of a chunk. A single tile is never divided, so it may have an instance for each
-    projected Gaussian."""
+    """Largest number of (Gaussian, tile) instances of a chunk. A single tile is never divided, so it may have more, up to one
+    for each projected Gaussian."""
     deterministic: bool = True
     """True to sum gradients in a fixed order."""
 
 
 def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
-    """Split a window between rows of tiles into two halves, or a single row into left and right; return None for one tile."""
+    """Split a window into upper and lower rows of tiles, or a single row into left and right; return None for one tile."""
     x, y, width, height = window
     if height > tile_size:
         first = -(-height // (2 * tile_size)) * tile_size
@@ -40,7 +40,7 @@ def halves(window: Window, tile_size: int) -> tuple[Window, Window] | None:
 
 
 def chunks(frame: ChunkedFrame, inputs: ProjectInputs) -> Iterator[tuple[RenderSettings, torch.Tensor]]:
-    """Yield the settings of windows of at most ``frame.max_instances`` instances, with the tile counts [C, N] in each window.
+    """Yield settings and tile counts [C, N] of windows that have at most ``frame.max_instances`` instances each.
 
     Windows come from top to bottom. A window with more instances is halved, unless it is a single tile.
 
@@ -117,7 +117,7 @@ class _BlendChunked(torch.autograd.Function):
 def contributions_chunked(
     projected: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute sum and maximum of each projected Gaussian's weights, as `contributions` does, chunk by chunk.
+    """Compute sum and maximum of each projected Gaussian's blending weights, as `contributions` does, chunk by chunk.
 
     Args:
         projected: Result of `project` for the frame's window, shape [C, N, 12].
@@ -159,7 +159,7 @@ def median_depth_chunked(projected: torch.Tensor, frame: ChunkedFrame, inputs: P
 def heaviest_chunked(
     projected: torch.Tensor, frame: ChunkedFrame, inputs: ProjectInputs, k: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Find the k heaviest Gaussians of each pixel chunk by chunk: the same bits as `heaviest` gives.
+    """Find the k Gaussians of largest blending weight in each pixel, chunk by chunk: the same bits as `heaviest` gives.
 
     Args:
         projected: Result of `project` for the frame's window, shape [C, N, 12].

@@ -1,7 +1,7 @@
 """Project, bin, blend: the steps from Gaussians to images.
 
-`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own memory. The camera
-model, the degree, the cut-offs and the window of a render are in `RenderSettings`, and nowhere else.
+`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to allocate
+memory. Only `RenderSettings` holds the camera model, the spherical-harmonics degree, the cut-offs and the window of a render.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Composed:
     tile_counts: torch.Tensor
     """Number of tiles that each Gaussian touches, int32, shape [C, N]."""
     tiles: Tiles
-    """Instances of each tile."""
+    """(Gaussian, tile) instances: the Gaussians that touch each tile."""
 
 
 def as_batch(array: Any, like: torch.Tensor, axes: int = 2) -> torch.Tensor:
@@ -75,8 +75,8 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
 
     Raises:
         TypeError: The covariances or the factors have another scalar type than the means.
-        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's
-            number of intrinsics or lenses is neither 1 nor that of its poses.
+        ValueError: The covariances or the factors have another shape, or are on another device; or the camera's number of
+            intrinsics or lenses is neither 1 nor the number of its poses.
     """
     means = gaussians.means
     viewmats = as_batch(camera.viewmat, means)
@@ -117,7 +117,7 @@ def bin_projected(
         projected: Projected Gaussians, shape [C, N, 12].
         tile_counts: Number of tiles of the window that each Gaussian touches, int32, shape [C, N].
         settings: Settings of the render.
-        memory: Memory of the instances.
+        memory: Memory that the (Gaussian, tile) instances may take.
         slotted: True if gradients or `weights_of` follow; False is faster (`bin_tiles`).
         listed: True for the tiles that get instances, bool, shape [C * tiles]; None for all tiles.
 
@@ -132,18 +132,18 @@ def compose(
     inputs: ProjectInputs, backgrounds: torch.Tensor, settings: RenderSettings, memory: InstanceMemory = AS_NEEDED,
     deterministic: bool = True,
 ) -> Composed:  # fmt: skip
-    """Render the window of a batch of cameras. Differentiable as `project` and `blend` are.
+    """Render a window of the images of C cameras. Differentiable as `project` and `blend` are.
 
     Args:
         inputs: Tensors of Gaussians and cameras.
         backgrounds: Colour behind everything, shape [C, 3].
         settings: Settings of the render.
-        memory: Memory of the instances.
+        memory: Memory that the (Gaussian, tile) instances may take.
         deterministic: True to sum gradients in a fixed order.
 
     Raises:
         ResourceError: There are more instances than memory allows.
-        TypeError: A scalar type is neither float32 nor float64, or they differ.
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         UsageError: The camera model is unknown.
         ValueError: A shape or a device disagrees.
     """
@@ -174,7 +174,7 @@ def images_of(
 
     Args:
         projected: Projected Gaussians, shape [C, N, 12].
-        tiles: Their instances.
+        tiles: Their (Gaussian, tile) instances.
         backgrounds: Colour behind everything, shape [C, 3], or [C, D] with ``colors``.
         settings: Settings of the render.
         deterministic: True to sum gradients in a fixed order.
@@ -220,7 +220,7 @@ def composite_into(
         tile_counts: Number of tiles that each Gaussian touches, int32, shape [C, N].
         backgrounds: Colour behind everything, contiguous, shape [C, 3].
         settings: Settings of the render.
-        memory: Memory of the instances; its allocator provides all other tensors.
+        memory: Memory that the (Gaussian, tile) instances may take; its allocator provides all other tensors.
         save: True if gradients will be taken.
 
     Returns:

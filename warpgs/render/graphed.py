@@ -1,9 +1,10 @@
 """Rasterizer calls that repeat: on CUDA their kernels are captured as graphs, and replayed.
 
-At training sizes, launching twenty kernels takes the host longer than running them takes the GPU. A training loop calls the
-rasterizer with the same tensors, new values and another camera. The loop's memory requests repeat as well, so torch allocates
-at the same addresses. A captured graph is replayed if a call has the addresses of the capture; otherwise the kernels are
-launched one by one. The bits are the same, and so is the memory, except for the spare capacity for instances.
+At training sizes, launching twenty kernels takes the host longer than running them takes the GPU. Each step of a training loop
+calls the rasterizer with the same tensors, which hold new values, and with another camera. The memory requests of the steps
+repeat as well, so torch allocates at the same addresses. A captured graph is replayed if a call has the addresses of the
+capture; otherwise the kernels are launched one by one. Both give the same bits. Replays need more memory only for the spare
+capacity for instances.
 """
 
 from __future__ import annotations
@@ -34,12 +35,13 @@ from warpgs.runtime.derivatives import first_order, keep, kept
 from warpgs.runtime.device_memory import available_bytes
 
 MIN_CALLS = 3
-"""Number of equal calls in a row before kernels are captured. After a capture without a gain, the number doubles."""
+"""Number of calls in a row with equal keys (`call_key`) before kernels are captured. It doubles after a capture that is
+replayed fewer than `MIN_REPLAYS` times."""
 CAPACITY_FACTOR = 1.05
-"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an equal call exceeded its capacity
-before, the larger number of both calls is used."""
+"""Capacity for visible Gaussians and for instances, as a multiple of the number needed. If an earlier call with the same key
+exceeded its capacity, the larger number that either call needed is used."""
 SPARE = 1024
-"""Number that is added to both capacities."""
+"""Number that is added to the capacities for visible Gaussians and for instances."""
 MAX_PROJECTED = 2**23
 """Largest number of projected Gaussians of a captured call. Larger calls take the GPU so long that a graph has no gain."""
 MAX_MEMORY_FRACTION = 0.05
@@ -47,7 +49,7 @@ MAX_MEMORY_FRACTION = 0.05
 
 
 class Capacity(NamedTuple):
-    """Numbers of a render that memory is allocated for."""
+    """Numbers of Gaussians and instances for which a render allocates memory."""
 
     visible: int
     """Number of Gaussians that touch a tile."""
@@ -64,7 +66,7 @@ class Capacity(NamedTuple):
 
 
 class GraphedRasterizer:
-    """Render and gradients of one set of tensors for any camera, as four graphed functions."""
+    """Render and gradients of one set of tensors for any camera, as four functions with graphs (`GraphedFunction`)."""
 
     def __init__(
         self, settings: RenderSettings, cameras: int, capacity: Capacity, graphs: GraphPool, gradients: bool = True
@@ -74,7 +76,7 @@ class GraphedRasterizer:
         Args:
             settings: Settings of the render.
             cameras: Number of images at a time.
-            capacity: Numbers to allocate memory for.
+            capacity: Numbers of Gaussians and instances to allocate memory for.
             graphs: Pool to capture graphs in.
             gradients: True to keep what the backward pass needs.
         """
@@ -184,7 +186,7 @@ class GraphedRasterizer:
         return ()
 
     def blend_gradients(self, saved: tuple[torch.Tensor, ...], v_images, wants_backgrounds: bool):
-        """Return gradients of projected Gaussians [C, N, 12], and of backgrounds [C, 3], or None if these are not wanted."""
+        """Return gradients of projected Gaussians [C, N, 12] and of backgrounds [C, 3], with None for unwanted backgrounds."""
         v_images = [None if v is None else v.contiguous() for v in v_images]
         (v_projected,), _ = self._backward_blend(*saved, *v_images)
         if not wants_backgrounds:
@@ -255,12 +257,12 @@ class Recorder:
     def __init__(self, graphs: GraphPool, gradients: bool = True):
         self.graphs, self.gradients = graphs, gradients
         self.rasterizer: GraphedRasterizer | None = None
-        """Rasterizer of the current calls; None before there were enough equal calls."""
+        """Rasterizer of the calls with the current key; None before there were enough of them."""
         self.min_calls = MIN_CALLS
         """Number of equal calls in a row before kernels are captured."""
         self._key, self._calls, self._too_large = None, 0, False
         self._exceeded: tuple[tuple | None, Capacity] = (None, Capacity(0, 0))
-        """Key of the last call that exceeded its capacity, and what it needed."""
+        """Key of the last call that exceeded its capacity, and the capacity that this call needed."""
 
     def render(self, inputs: ProjectInputs, backgrounds: torch.Tensor | None, settings: RenderSettings):
         """Return the result of `GraphedRasterizer.render`; None if the call must run without graphs.
@@ -359,8 +361,8 @@ def _can_capture(device: torch.device) -> bool:
     """Return whether calls can be captured now, on this device.
 
     Calls are not captured during another capture, on a device that is not current, or with hooks on saved tensors.
-    Checkpointing has such hooks, and needs the same number of saved tensors each time. Nor are they captured where torch
-    allocates each tensor from the driver, or Warp checks for errors after each kernel.
+    Activation checkpointing sets such hooks, and needs the same number of saved tensors each time. Nor are they captured where
+    torch allocates each tensor from the driver, or Warp checks for errors after each kernel.
     """
     if _UNCACHED or wp.config.verify_cuda:
         return False

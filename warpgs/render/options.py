@@ -35,10 +35,10 @@ class RasterizeOptions:
     rule: str | Rule = "exact"
     """Cut-offs: exact, balanced, fast (docs/trade.md), gsplat-1.6, gsplat-1.5, inria, or a `Rule` of your own."""
     near: float | None = None
-    """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the rule's, 0.01 under `exact`. Whole
+    """Nearest depth rendered, in the units of the Gaussians, at least 0; None for the value of the rule, 0.01 in `exact`. Whole
     Gaussians are culled by the depth of their mean: z in camera axes or, for a fisheye, the distance."""
     far: float | None = None
-    """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the rule's, 1e10."""
+    """Farthest depth rendered, beyond ``near`` and at most 1e10; None for the value of the rule, 1e10."""
     sh_degree: int | None = None
     """Spherical-harmonics degree to use; None for the stored degree."""
     background: torch.Tensor | None = None
@@ -53,9 +53,10 @@ class RasterizeOptions:
     feature_background: torch.Tensor | None = None
     """Background of the features, shape [D] or [C, D]; None for zeros. Differentiable."""
     tile_size: int = 16
-    """Side of a tile [px]: 8 or 16. The image depends on it only under rules with ``square_sigma``, such as inria."""
+    """Side of a tile [px]: 8 or 16. The image depends on the tile size only under rules with ``square_sigma``, such as
+    inria."""
     contributions: bool = False
-    """True to also return sum and maximum of each Gaussian's blending weight."""
+    """True to also return sum and maximum of each Gaussian's blending weights over the pixels."""
     median_depth: bool = False
     """True to also render the depth at which transmittance falls to one half."""
     heaviest: int = 0
@@ -63,15 +64,15 @@ class RasterizeOptions:
     and ``blend_counts``. 0 for none."""
     error_bound: bool = False
     """True to also bound the error of ``rgb`` against rule `exact`. The bound of a pixel is its difference from a float64
-    render under `exact`, plus the rounding of float64. So it covers both cut-offs and float32 rounding. The float64 render
-    takes several times as long as one in float32 (docs/trade.md). Not with ``capacity``."""
+    render under `exact`, plus the rounding of float64. So the bound covers both cut-offs and float32 rounding. The float64
+    render takes several times as long as one in float32 (docs/trade.md). Not with ``capacity``."""
     memory_budget: int | None = None
     """Bytes that the (Gaussian, tile) instances may take; None for four fifths of the free memory."""
     deterministic: bool = True
     """True to sum gradients in a fixed order, so that the same inputs give the same bits. False takes less memory on CUDA."""
     absgrad: bool = False
-    """True to also sum the magnitudes of the gradients of projected means over pixels: ``Render.means2d.absgrad``. It supports
-    at most 11 channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
+    """True to also sum the magnitudes of each projected mean's gradient over the pixels: ``Render.means2d.absgrad``. It
+    supports at most 11 channels of ``colors``, and no ``features``. Such calls are not captured as CUDA graphs."""
     antialiased: bool = False
     """True to multiply each opacity by sqrt(det(cov2d) / det(cov2d + low_pass I)), the 2D filter of Mip-Splatting. It removes
     the brightness that widening by ``Rule.low_pass`` adds to Gaussians smaller than a pixel. Use it for models trained with
@@ -79,8 +80,9 @@ class RasterizeOptions:
     opacity_factors: torch.Tensor | None = None
     """Factors of the opacities, at least 0, shape [N]; 0 hides a Gaussian. None for 1. Not differentiable."""
     capacity: int | None = None
-    """Number of (Gaussian, tile) instances to allocate memory for; None for the actual number. With a capacity nothing is read
-    back from the device, so the call can be captured in a CUDA graph. Check `Render.overflow` before you use the result."""
+    """Number of (Gaussian, tile) instances to allocate memory for; None for as many as there are. With a capacity nothing is
+    read back from the device, so the call can be captured in a CUDA graph. Check `Render.overflow` before you use the
+    result."""
     window: tuple[int, int, int, int] | None = None
     """Left, top, width and height [px] of the part to render. The result equals the crop of the whole image bit for bit. Edges
     must be multiples of ``tile_size`` or edges of the image. None for the whole image."""

@@ -1,4 +1,4 @@
-"""Pixels instead of an image: their window, their tiles and their values."""
+"""Rendering of single pixels instead of an image: their window, their tiles and their values."""
 
 from __future__ import annotations
 

@@ -224,16 +224,16 @@ def rasterize(
     supported, and torch.compile breaks its graph here.
 
     Args:
-        gaussians: N Gaussians: by log scales and logits (`Gaussians`), by scales and opacities (`ActivatedGaussians`), or by
-            covariances and opacities (`CovarianceGaussians`).
+        gaussians: N Gaussians, given by log scales and logits of opacities (`Gaussians`), by scales and opacities
+            (`ActivatedGaussians`), or by covariances and opacities (`CovarianceGaussians`).
         camera: One camera ([4, 4], [3, 3]), or a batch of C cameras with one image size ([C, 4, 4], [C, 3, 3]). Or a list of
             cameras and batches, of any image sizes; then ``gaussians`` and ``options`` are lists of the same length, or single
             values for all cameras.
         options: Options.
 
     Returns:
-        The images, without a leading axis for a single camera; a list of renders for a list of cameras. Read
-        ``render.means2d`` before the backward pass; after the pass, it holds the gradients of the projected means.
+        The images, without a leading axis for a single camera; a list of renders for a list of cameras. Read ``render.means2d``
+        before the backward pass. Its ``grad`` then holds the gradients of the projected means.
 
     Raises:
         ResourceError: The images, or the tiles that the Gaussians touch, need more memory than is available.
@@ -274,7 +274,7 @@ def _render(gaussians: RasterizedGaussians, camera: Camera, options: RasterizeOp
     features = _checked_channels("features", options.features, inputs)
     if options.absgrad and (features is not None or (colors is not None and colors.shape[-1] > WIDTHS[-1])):
         raise UsageError(
-            f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render the others in a second call"
+            f"absgrad supports at most {WIDTHS[-1]} channels of colors, and no features: render more in a second call"
         )
     if inputs.means.is_cuda and options.repeatable():
         backgrounds = None if options.background is None else _layer("background", options.background, None, inputs).backgrounds
@@ -361,7 +361,7 @@ def _rasterize(
 
 
 def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **maps: torch.Tensor | None) -> Render:
-    """Return the result; without a leading axis for a single camera."""
+    """Return the render, with tensors that have no leading axis for a single camera."""
     single = len(camera.viewmat.shape) == 2
 
     def own(image: torch.Tensor) -> torch.Tensor:

@@ -23,7 +23,7 @@ class _Ellipses:
     pixels: torch.Tensor
     """Projected means [px], shape [N, 2]."""
     half: torch.Tensor
-    """Half sides [px] of the box that holds every pixel with alpha at or above the cut, shape [N, 2]."""
+    """Half sides [px] of the box that holds every pixel with alpha at or above the cut-off, shape [N, 2]."""
     power: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
     """Factors of dx^2, dx dy and dy^2 in the exponent, each of shape [N, 1]."""
     opacities: torch.Tensor
@@ -113,7 +113,7 @@ def reference_image(
     """Return the colours in a window of one camera's image under rule ``exact``, in float64.
 
     Gaussians are evaluated at all pixels of a block, with matrices (Kerbl et al. 2023, section 4 and eq. 3). Use it for
-    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: many Gaussians are slow.
+    windows of a few thousand pixels. Leave out Gaussians that do not reach the window: the time grows with their number.
 
     Args:
         gaussians: N Gaussians of any scalar type, all finite.

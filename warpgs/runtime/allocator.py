@@ -48,7 +48,7 @@ class SizingAllocator(Allocator):
 
     def __init__(self):
         self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []
-        """An empty tensor of the same type and device, and the shape, of each output tensor."""
+        """For each output tensor, an empty tensor of its type and device, and its shape."""
         self.saved_bytes = self.workspace_bytes = 0
         """Sizes of all saved tensors, and of all workspace, with alignment."""
 

@@ -22,11 +22,11 @@ MAX_GRAPHS = 8
 """Largest number of graphs of a function, one for each set of addresses; a loop that keeps its last result alternates between
 two sets."""
 MIN_REPLAYS = 30
-"""Replays that pay for one capture."""
+"""Number of replays that save as much time as one capture takes."""
 FREE_CAPTURES = 16
-"""Captures of a function that are allowed without a gain: at the start of a loop, addresses do not repeat yet."""
+"""Number of captures that a function may make without a gain: at the start of a loop, addresses do not repeat yet."""
 SMALL_BYTES = 2**16
-"""Size of a workspace up to which it is kept, because allocating it at each call takes longer."""
+"""Largest workspace that is kept between calls [bytes]: allocating one at each call would be slower."""
 
 _CAPTURING = threading.Lock()
 """Lock held during a capture."""
@@ -56,7 +56,7 @@ class CapturedGraph:
             work: A function that neither reads from the device nor loads kernels: call it once before, to load them.
             stream: Stream to capture on, not the default one.
             pool: `pool` of a graph to share memory with. That graph must never be replayed at the same time, nor leave results
-                in the memory. None for own memory.
+                in the shared memory. None for own memory.
 
         Raises:
             RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
@@ -100,7 +100,7 @@ class GraphMemory:
     def give_back(self, limit: int) -> None:
         """Return unused memory to the device once torch holds ``limit`` bytes more than when memory was last given back.
 
-        That takes milliseconds, in which the device waits.
+        Returning memory takes milliseconds, in which the device waits.
         """
         if torch.cuda.memory_reserved(self.device) - self.reserved > limit:
             torch.cuda.empty_cache()
@@ -211,7 +211,7 @@ class GraphedFunction:
         self._places = [arena.place(t) for t in found]
 
     def _capture(self, key: tuple[int, ...], arena: Arena, inputs: tuple[torch.Tensor | None, ...]) -> CapturedGraph | None:
-        """Return a new graph; None where it would not pay or is not possible."""
+        """Return a new graph; None if a capture would not pay or is not possible."""
         if self.graphs.failed or self.captures - FREE_CAPTURES > self.replays // MIN_REPLAYS:
             return None  # too many captures: addresses change too often
         self.captures += 1

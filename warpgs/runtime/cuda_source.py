@@ -14,7 +14,7 @@ def source(name: str, **numbers: object) -> str:
 
     Args:
         name: Name of the file in the folder; an absolute path names a file elsewhere.
-        numbers: Number, or any other text, for each name.
+        numbers: Number, or any other text, that replaces each name.
     """
     text = re.sub(r'^#include "([\w.]+)"\n', lambda found: source(found[1]), (FOLDER / name).read_text("utf-8"), flags=re.M)
     for word, number in numbers.items():

@@ -48,11 +48,11 @@ def kept(ctx: Any) -> tuple[Any, ...]:
 def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap the backward method of an autograd function that has no derivative itself.
 
-    Unlike torch's `once_differentiable`, a second derivative with respect to any saved tensor raises: torch would report
-    that the tensor was not used. Nothing is added where gradients are taken without ``create_graph``.
+    A second derivative with respect to any saved tensor raises an error. torch's `once_differentiable` would report instead
+    that the tensor was not used. Without ``create_graph``, the wrapper adds nothing to the gradients.
 
     Raises:
-        UsageError: On the gradient of a gradient.
+        UsageError: A gradient of a gradient is requested.
     """
 
     @functools.wraps(backward)
@@ -83,7 +83,7 @@ class _WithoutGradient(torch.autograd.Function):
 
 
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
-    """Return values of any shape [...], through which a gradient is an error where ``source`` [...] requires gradients.
+    """Return values of any shape [...]; a gradient through them is an error where ``source`` [...] requires gradients.
 
     Args:
         name: Name of the values in the error.

@@ -1,4 +1,4 @@
-"""Memory that a device has, and has free now: on any system, and within the limits of a container."""
+"""Installed and free memory of a device, on any system and within the limits of a container."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
-    """Return the message for a lack of memory, with remedies: the flags of a fit, where one was running.
+    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True.
 
     ``purpose`` may state the use of the memory, such as " for step 3".
     """
@@ -72,7 +72,7 @@ def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool 
 
 @functools.cache
 def installed_bytes(device: torch.device) -> int:
-    """Return the memory of a device [bytes], on a CPU no more than its container may use; queried once."""
+    """Return the memory of a device [bytes], on a CPU at most the limit of the container; queried once."""
     if device.type == "cuda":
         import torch
 
@@ -91,9 +91,10 @@ def machine_memory() -> Memory | None:
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
     """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit.
 
-    Only Linux has control groups; on other systems, and without a limit, this is None. Both versions are read, from the
-    process's own group up to the root, since every group above counts too (kernel documentation, cgroup-v2 "Memory" and
-    cgroup-v1 "Memory Resource Controller"). Cached files that were not used lately count as free: the kernel drops them first.
+    Only Linux has control groups; on other systems, and without a limit, this is None. Both versions of control groups are
+    read, from the process's own group up to the root, since the limits of all of them apply (kernel documentation, cgroup-v2
+    "Memory" and cgroup-v1 "Memory Resource Controller"). Cached files that were not used lately count as free: the kernel drops
+    them first.
 
     Args:
         own: File that lists the process's groups; None for /proc/self/cgroup.
@@ -110,7 +111,7 @@ def container_memory(own: Path | None = None, mount: Path | None = None) -> Memo
 
 
 def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
-    """Yield folders of memory groups with the names of their files: limit, use, and file pages in ``memory.stat``."""
+    """Yield each memory group's folder, with the names of its limit file, its use file and a row of its ``memory.stat``."""
     rows = [row.split(":", 2) for row in _text(own).splitlines()]
     paths = {"": "/", "memory": "/"} | {c: p for _, names, p in (r for r in rows if len(r) == 3) for c in names.split(",")}
     versions = {
@@ -125,7 +126,7 @@ def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
 
 
 def _system_memory() -> Memory | None:
-    """Return what psutil finds; None where psutil is missing or the system denies access."""
+    """Return the memory that psutil reports; None where psutil is missing or the system denies access."""
     try:
         import psutil
 

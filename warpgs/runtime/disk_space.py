@@ -12,7 +12,7 @@ from warpgs.files import FULL
 WORDS = (*map(os.strerror, FULL), "disk is full", f"[Errno {errno.ENOSPC}]", f"[Errno {errno.EDQUOT}]")
 """Parts of the messages that systems, SQLite and Python give for a full disk."""
 MIN_FREE = 2**16
-"""Free space below which a disk counts as full [bytes]: some libraries fail without such a message."""
+"""Free space below which a disk counts as full [bytes]: some libraries fail without naming the full disk."""
 
 
 def disk_is_full(folder: Path, said: str) -> bool:

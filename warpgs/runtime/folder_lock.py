@@ -32,19 +32,19 @@ MOST_LETTERS = 200
 
 @contextlib.contextmanager
 def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
-    """Hold a folder, and make it if it is missing, so that no other process writes into it meanwhile.
+    """Lock a folder, and make it if it is missing, so that no other process writes into it during the block.
 
-    The system releases the lock when its holder ends, killed or not. The lock also excludes processes in other containers. The
-    lock file names the holder. Leftovers of killed writers are removed from the folder and from the system's temporary files.
-    In the block nothing below the folder is written through a link (`output_folder`). If an error ends the block, a folder that
-    was made here is removed if it is still empty; other folders are never removed.
+    The system releases the lock when the process that holds it ends, even if it is killed. The lock also excludes processes in
+    other containers. The lock file names the holder. Leftovers of killed writers are removed from the folder and from the
+    system's temporary files. In the block nothing below the folder is written through a link (`output_folder`). If an error
+    ends the block, a folder that was made here is removed if it is still empty; other folders are never removed.
 
     Args:
         folder: The folder.
         parts: Folders in it that are written under the same lock; none may be a link.
 
     Returns:
-        A note for the user where the file system has no locks; else nothing.
+        A list with a note for the user if the file system has no locks, otherwise an empty list.
 
     Raises:
         FolderHeldError: Another process holds the folder.
@@ -96,7 +96,7 @@ def check_file_path(path: Path) -> None:
 
 
 def check_free(folder: Path) -> None:
-    """Check that no process holds a folder, without writing; a folder that cannot be read counts as free.
+    """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free.
 
     Raises:
         FolderHeldError: Another process holds it.
@@ -168,7 +168,7 @@ def _lock(file: BinaryIO, folder: Path) -> bool:
 
 
 def _sign(file: BinaryIO) -> None:
-    """Write the owner into a lock file; Windows locks its first byte, and no other process may read that."""
+    """Write the owner into a lock file; Windows locks its first byte, which no other process may then read."""
     program = Path(sys.argv[0])
     name = program.parent.name if program.name == "__main__.py" else program.name  # of `python -m warpgs`
     command = shlex.join([name, *sys.argv[1:]])
@@ -180,7 +180,7 @@ def _sign(file: BinaryIO) -> None:
 
 
 def _holder(file: BinaryIO) -> str:
-    """Return a text on the holder of a lock file; wait briefly for the signature, since the lock may be new."""
+    """Return a text that names the holder of a lock file; wait briefly for the signature, since the lock may be new."""
     for _ in range(SIGNED_WITHIN):
         words = _signed(file)
         if words is not None:

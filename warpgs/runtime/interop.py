@@ -72,7 +72,7 @@ def real_of(tensor: torch.Tensor) -> type:
 
 
 def set_threads(count: int) -> None:
-    """Set the number of threads of CPU launches, at least 1. It sets torch's own number, so both agree."""
+    """Set the number of threads of CPU launches, at least 1. This sets torch's own number of threads, so both agree."""
     torch.set_num_threads(count)
 
 
@@ -91,7 +91,7 @@ class View(NamedTuple):
     tensor."""
 
     def shape(self) -> tuple[int, ...]:
-        """Return the sizes of the axes that a kernel sees, and of the axes of a vector type."""
+        """Return the sizes of the axes that a kernel sees, followed by the shape of an element."""
         if self.axes is None:
             return tuple(self.tensor.shape)
         if self.axes == 0:
@@ -101,7 +101,7 @@ class View(NamedTuple):
         return (count,) if self.axes == 1 else (count // max(width, 1), width)
 
     def array(self) -> wp.array:
-        """Return the same memory as a Warp array of the shape [...], without a copy and without gradient."""
+        """Return the tensor's memory as a Warp array of the shape [...], without a copy and without gradient."""
         tensor = self.tensor.detach()
         if self.axes is not None:
             tensor = tensor.view(self.shape()) if self.axes else tensor.as_strided(self.shape(), (1,))
@@ -129,14 +129,14 @@ def flat(tensor: torch.Tensor, dtype) -> View:
 
 
 def rows(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] as an argument of two axes. Rows are contiguous, and one stride leads from each to the next."""
+    """Return a tensor [..., K] as an argument of two axes. Each row must be contiguous, and all rows the same stride apart."""
     return View(tensor, dtype, 2)
 
 
 def span(tensor: torch.Tensor, dtype) -> View:
     """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, gaps between rows included.
 
-    Rows are contiguous, and `View.row_stride` leads from each to the next.
+    Each row must be contiguous; `View.row_stride` is the distance from one row to the next.
     """
     return View(tensor, dtype, 0)
 
@@ -156,7 +156,7 @@ def _several_devices() -> bool:
 def _current(device: torch.device):
     """Return a context in which a CUDA device is current; afterwards the caller's device is current again.
 
-    Warp makes a device current when it works there, and does not restore the device before it; torch then uses Warp's device.
+    Warp makes a device current when it works there, and does not restore the previous device; torch then uses Warp's device.
     """
     return torch.cuda.device(device) if _several_devices() else contextlib.nullcontext()
 
@@ -290,7 +290,7 @@ _OF_THREAD = _OfThread()
 
 
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
-    """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item.
+    """Launch ``kernel`` over ``count`` independent items; the kernel's first argument is the number of the first item.
 
     On a CPU, as many threads as torch uses share the items; results are repeatable, since each item has its own output memory.
 

@@ -24,7 +24,7 @@ class KernelCache(NamedTuple):
     """Folder of compiled kernels."""
 
     folder: Path
-    """Folder, without the part that names Warp's version."""
+    """Folder, without the subfolder that names Warp's version."""
     refused: str
     """Reason why the usual folder is not used; empty if it is used."""
 
@@ -78,7 +78,7 @@ def _usual(configured: str | None) -> tuple[Path | None, str]:
     if asked:
         folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
         if asked.startswith("~") and not folder.is_absolute():
-            return None, f"the home folder of the kernel cache {asked} is unknown"
+            return None, f"the kernel cache {asked} is in an unknown home folder"
         return folder.resolve(), ""
     home = cache_home()
     if home is None:

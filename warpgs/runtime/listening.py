@@ -1,4 +1,4 @@
-"""Guards of all servers: sockets of this machine only, and checks of the clients of a served page.
+"""Guards of all servers: sockets that only this machine reaches, and checks of requests for a served page.
 
 Any web page can send requests to every port of the machine that shows the page, and so can every program of every user of the
 machine. So a server of warpgs binds the loopback address, answers below a random path that is new at every start, and checks
@@ -54,7 +54,7 @@ def loopback_socket(port: int, fix: str, host: str = HOST) -> socket.socket:
 
 
 def loopback_of(name: str) -> str | None:
-    """Return the loopback address of a host name or address, 127.0.0.1 before ::1; None for other hosts."""
+    """Return the loopback address of a host name or address, 127.0.0.1 rather than ::1; None for other hosts."""
     try:
         found = [str(info[4][0]) for info in socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)]
     except (OSError, UnicodeError):  # the name cannot be resolved; connecting raises the error
@@ -94,7 +94,7 @@ def listening_at(process: int | None = None) -> list[tuple[str, int]]:
 
 
 def listeners() -> list[tuple[str, str, int]]:
-    """Return name, address and port of everything that this process and its children listen at."""
+    """Return program name, address and port of every listening socket of this process and its children."""
     import psutil
 
     found = [("this process", *at) for at in listening_at()]
@@ -105,10 +105,10 @@ def listeners() -> list[tuple[str, str, int]]:
 
 
 def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
-    """Print in one line what other machines can reach, if anything.
+    """Print in one line which of the found sockets other machines can reach, if any.
 
     Args:
-        found: Name, address and port of what listens.
+        found: Program name, address and port of each listening socket.
     """
     reached = [f"{who} at {ip}, port {port}" for who, ip, port in found if not is_loopback(ip)]
     if reached:

@@ -15,10 +15,10 @@ from warpgs.files import make_folder
 from warpgs.runtime.kernel_cache import REMEDY
 
 _LOADED: set[tuple[wp.Module, object, int]] = set()
-"""Modules that this process has loaded, with the context of the device and the threads of a block."""
+"""Modules that this process has loaded, each with the context of its device and its number of threads per block."""
 
 _LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
-"""Functions to call for each module that has to be compiled, with the seconds that modules took."""
+"""Functions to call for each module that has to be compiled, each with a list of compile times [s]."""
 
 
 @contextlib.contextmanager
@@ -61,10 +61,10 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
 
 @contextlib.contextmanager
 def exclusive(path: Path) -> Iterator[None]:
-    """Hold a file, which is made if it is missing, so that one thread of one process at a time runs the body.
+    """Lock a file, which is made if it is missing, so that one thread of one process at a time runs the body.
 
-    The system releases the file when its holder ends, killed or not. On a file system without locks the body runs
-    unlocked: Warp renames a compiled module into place, so two processes that compile it only lose time.
+    The system releases the lock when the process that holds it ends, even if it is killed. On a file system without locks the
+    body runs unlocked: Warp renames a compiled module into place, so two processes that compile it only lose time.
 
     Raises:
         ResourceError: The file cannot be opened.

@@ -52,7 +52,7 @@ def _message(data: memoryview) -> Message:
         else:
             length, at = _varint(data, at) if wire == 2 else ({1: 8, 5: 4}.get(wire, -1), at)
             if not 0 <= length <= len(data) - at:
-                raise ValueError(f"a field of wire type {wire} runs over the end")
+                raise ValueError(f"a field of wire type {wire} reaches beyond the data")
             value, at = data[at : at + length], at + length
         if not 0 < number <= MAX_FIELD:
             raise ValueError(f"invalid field number {number}")
@@ -65,13 +65,13 @@ def _parts(message: Message, *numbers: int) -> Iterator[Message]:
 
 
 def _text(message: Message, number: int) -> str:
-    """Return the text of a field, maybe empty; of duplicates the last, as in protobuf."""
+    """Return the text of a field, maybe empty; of duplicate fields the last one, as in protobuf."""
     texts = [v for n, v in message if n == number and isinstance(v, memoryview)]
     return bytes(texts[-1]).decode("utf-8", "replace") if texts else ""
 
 
 class _Walk:
-    """A walk through every node and tensor of a model that rejects what needs other files or foreign code."""
+    """A walk through every node and tensor of a model; it rejects models that need other files or foreign code."""
 
     def __init__(self, path: Path, own: set[tuple[str, str]]):
         self.path, self.own = path, own
@@ -129,8 +129,7 @@ def check_onnx(data: bytes, path: Path) -> None:
         path: Its name, for messages.
 
     Raises:
-        DataError: The bytes are not an ONNX model, keep weights elsewhere (even where that file exists), or use custom
-            operators.
+        DataError: The bytes are not an ONNX model, keep weights in another file (even if it exists), or use custom operators.
     """
     try:
         model = _message(memoryview(data))

@@ -167,5 +167,5 @@ def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
 
 
 def careful(stream: TextIO) -> TextIO:
-    """Return a stream unchanged if its writes do not fail, else wrapped; for displays that draw during a fit."""
+    """Return a stream whose writes do not raise, wrapped unless it already is; for displays that draw during a fit."""
     return stream if isinstance(stream, CarefulStream) else cast(TextIO, CarefulStream(stream, "stdout"))

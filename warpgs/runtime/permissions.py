@@ -47,7 +47,7 @@ def _writable_by_others(found: os.stat_result, trusted: set[int]) -> bool:
 
 
 def _is_own_group(gid: int) -> bool:
-    """Return whether a group belongs to this user alone: many systems make one per user, with the user's name or number."""
+    """Return whether a group belongs to this user alone: many systems make a group per user, with the user's name or number."""
     import grp
     import pwd
 

@@ -85,7 +85,7 @@ class RankWatch:
             time.sleep(0.05)
 
     def texts(self, own: str) -> list[str]:
-        """Return the text ``own`` of each process, once all called this; if a rank is lost, the thread ends this process."""
+        """Return each process's text ``own``, once all have called this; if a rank is lost, the thread ends this process."""
         names = [f"text/{r}" for r in range(self.count)]
         self.store.set(names[self.rank], own)
         while not self.store.check(names):
@@ -126,7 +126,7 @@ class RankWatch:
         return gone and not self._own.check([f"left/{rank}"])
 
     def fail(self, line: str) -> None:
-        """Print why all ranks end, unless another rank has printed it, or this rank follows the first to a normal end."""
+        """Print why all ranks end, unless another rank has, or this rank already ends normally and is not the first."""
         if self.leaving.is_set() and self.rank != 0:
             return
         self.leaving.set()
@@ -141,7 +141,7 @@ class RankWatch:
         self._keep_store()
 
     def _keep_store(self) -> None:
-        """Give the others time, as rank 0, to read that the fit ends: the store may end with this process."""
+        """On rank 0, give the other ranks time to read that the fit ends, since the store may end with this process."""
         if self.rank == 0:
             time.sleep(3 * BEAT_SECONDS)
 
@@ -155,7 +155,7 @@ class RankWatch:
         time.sleep(seconds + 2 * BEAT_SECONDS)
 
     def leave(self) -> None:
-        """Tell the others that this process ends normally; all but the first wait for the first to end."""
+        """Tell the other ranks that this process ends normally; all ranks but the first wait for the first to end."""
         try:
             self.store.set(f"left/{self.rank}", "")
             if self.rank != 0:

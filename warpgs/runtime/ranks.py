@@ -1,4 +1,4 @@
-"""Processes that fit one scene together: their identity, their exchange, and their end when one is lost.
+"""Processes that fit one scene together: their ranks, their exchange of data, and their end when one is lost.
 
 They are started by torchrun, or with the variables that it sets: RANK, WORLD_SIZE, LOCAL_RANK, MASTER_ADDR and MASTER_PORT.
 Data are exchanged by NCCL between GPUs and by gloo between CPUs. Neither reports a lost process in time (a kernel of NCCL waits
@@ -69,7 +69,7 @@ class Ranks:
         """End all exchange, once all processes have done the same steps."""
 
     def leave(self) -> None:
-        """End normally; all but the first wait for the first to end."""
+        """End normally; all ranks but the first wait for the first to end."""
 
 
 ALONE = Ranks()

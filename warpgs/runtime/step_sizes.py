@@ -26,7 +26,7 @@ class StepSizes:
     height: int
     """Height of the largest view [px]."""
     row: int
-    """Bytes of the parameters of a Gaussian."""
+    """Bytes of one Gaussian's parameters."""
     views: int = 1
     """Number of views."""
     masked: bool = False

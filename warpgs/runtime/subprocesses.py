@@ -49,7 +49,7 @@ def run_python(
         code: The code.
         arguments: Its ``sys.argv[1:]``; paths must be absolute.
         timeout: Seconds until the process is ended.
-        environment: Variables beside those of this process.
+        environment: Variables in addition to those of this process.
 
     Raises:
         subprocess.TimeoutExpired: The process took too long.
@@ -80,7 +80,7 @@ class ProcessFailed(Exception):
 
 
 def _environment(more: dict[str, str] | None) -> dict[str, str]:
-    """Return variables with which a process imports this package from its place, and nothing from the current folder."""
+    """Return variables with which a process imports this package as this process does, and nothing from the current folder."""
     home = str(Path(__file__).parents[2])
     search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
     own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
@@ -97,7 +97,7 @@ def python_lines(module: str, *arguments: str, folder: Path, environment: dict[s
         module: Full name of the module, run as ``__main__``.
         arguments: Its ``sys.argv[1:]``; paths must be absolute.
         folder: Folder to work in.
-        environment: Variables beside those of this process.
+        environment: Variables in addition to those of this process.
 
     Raises:
         ProcessFailed: The process ended with another exit code than 0.
@@ -162,7 +162,7 @@ class PythonWorker:
         Args:
             module: Full name of the module, run as ``__main__``.
             arguments: Its ``sys.argv[1:]``.
-            environment: Variables beside those of this process.
+            environment: Variables in addition to those of this process.
         """
         self._errors = tempfile.TemporaryFile()  # closed by `end`
         self._process = subprocess.Popen(

@@ -15,11 +15,11 @@ T = TypeVar("T")
 HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Categories of characters that move the cursor, change the direction of text, end a line, or are surrogates."""
 JOINERS = "\u200c\u200d"
-"""Exceptions that scripts and emoji need; they affect only adjacent letters."""
+"""Exceptions to `HIDDEN` that scripts and emoji need; they affect only adjacent letters."""
 
 
 class Detail(str):
-    """A note without need for action: for the files of a run and its report's last section, not the terminal."""
+    """A note that needs no action: it goes to the files of a run and the last section of its report, not to the terminal."""
 
     __slots__ = ()
 
@@ -66,7 +66,7 @@ def answer(line: object) -> None:
     """Print one line to the process that started this one.
 
     Raises:
-        OSError: That process has ended, so the answer is not needed.
+        OSError: The other process has ended, so the answer is not needed.
     """
     _print(line, False)
 
@@ -79,7 +79,7 @@ def _print(line: object, error: bool) -> None:
 
 
 def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
-    """Yield items, and print before each how many are done: ``scoring: 3 of 12 views``.
+    """Yield items; before each item, print how many are done: ``scoring: 3 of 12 views``.
 
     Args:
         items: The items.

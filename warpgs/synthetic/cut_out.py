@@ -115,7 +115,7 @@ def _grid(rng: np.random.Generator, surface: Surface) -> list[raycast.Shape]:
 
 
 def _plates(rng: np.random.Generator, surface: Surface, turn: float) -> list[raycast.Shape]:
-    """Return two or three thin radial plates at the side of the body that starts at angle ``turn`` [rad]."""
+    """Return two or three thin radial plates at the side of the body, the first at angle ``turn`` [rad]."""
     count, thin = int(rng.integers(2, 4)), rng.uniform(0.012, 0.02)
     long, high = rng.uniform(0.22, 0.3), rng.uniform(0.2, 0.32)
     shapes = []
@@ -158,7 +158,7 @@ def cut_out_object(seed: int = 0) -> list[raycast.Shape]:
 
 
 def ring_cameras(views: int, width: int, height: int) -> list[Camera]:
-    """Return cameras once around the origin, 17 to 53 degrees high: training views at the crests and troughs of the wave.
+    """Return cameras once around the origin, on a wave 17 to 53 degrees high; training views are its crests and troughs.
 
     Args:
         views: Number of cameras.
@@ -236,7 +236,7 @@ def write_object(
     Args:
         folder: Target folder, new or empty.
         form: ``transforms``: transforms.json with RGBA images. ``colmap``: a COLMAP model with a few exact points, RGB images,
-            grey where nothing is, and masks that hold the alpha, white for the object.
+            grey outside the object, and masks that hold the alpha, white for the object.
         views: Number of images, at least 9; eight of them are training views.
         width: Image width [px].
         height: Image height [px].

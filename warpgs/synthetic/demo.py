@@ -27,15 +27,15 @@ TAU = 2 * np.pi
 
 
 def checker_texture(rng: np.random.Generator, low: str, high: str, period: float, kind: str = "solid") -> raycast.Texture:
-    """Return a smoothed checker with five tinting waves, whose wavelengths are 0.6 to 2.2 times its period.
+    """Return a smoothed checker with five tinting waves of 0.6 to 2.2 times the checker's period.
 
     Args:
         rng: Generator of directions, tints and phases.
         low: One colour, as six hexadecimal digits.
         high: The other colour, likewise.
         period: Period of the checker [u].
-        kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box``
-            where the period is half the edge, so that the faces lie where the checker pattern is strongest.
+        kind: ``solid``; ``flat`` where the surface is the local plane z = 0 and only x and y make a pattern; ``box`` for a box
+            with edges of two periods, so that its faces lie where the checker pattern is strongest.
 
     Returns:
         The texture, matte.
@@ -98,8 +98,8 @@ def camera_path(views: int, width: int, height: int) -> list[Camera]:
         height: Image height [px].
 
     Returns:
-        The cameras in the order of the path. Held-out views lie between two training views in both directions, so that
-        they interpolate.
+        The cameras in the order of the path. Held-out views lie between two training views, both horizontally and vertically,
+        so that they interpolate.
     """
     focal = 0.95 * max(width, height * 4 / 3)
     K = np.array([[focal, 0, 0.515 * width], [0, focal, 0.485 * height], [0, 0, 1]])
@@ -147,7 +147,7 @@ def _sees(shapes: list[raycast.Shape], camera: Camera, x: np.ndarray, index: np.
         index: Index of the shape of each point, shape [N].
 
     Returns:
-        True where seen, shape [N].
+        True where the camera sees the point, shape [N].
     """
     xy, depth = _project(camera, x)
     size = np.array([camera.width, camera.height])
@@ -261,7 +261,7 @@ def _check(folder: Path, width: int, height: int) -> None:
 
 
 def _files(views: int, width: int, height: int, seed: int, tell: Callable[[str], object]) -> dict[str, bytes]:
-    """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no half a scene."""
+    """Return the contents of the demo folder by relative path, all at once, so that an interruption leaves no partial scene."""
     import cv2
 
     shapes, light = still_life(seed), raycast.Light()

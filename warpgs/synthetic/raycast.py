@@ -1,8 +1,8 @@
 """A small ray caster in numpy: shapes with smooth solid textures under one soft light, without OpenGL and without meshes.
 
-With it the demo scene needs no download and no graphics driver. Every shape computes the first hit of a ray in its own frame,
-the normal there and its radius. So an image, the exact depth of a pixel and the visibility of a point all come from the same
-intersection code. Shading is diffuse: a surface point has one colour from all directions.
+With it the demo scene needs no download and no graphics driver. Every shape computes, in its own frame, the first hit of a ray
+and the normal there, and has a bounding sphere. So an image, the exact depth of a pixel and the visibility of a point all come
+from the same intersection code. Shading is diffuse: a surface point has one colour from all directions.
 
 Axes as in an OpenCV camera: +x right, +y down, +z away from the viewer. Lengths in scene units [u].
 """
@@ -369,8 +369,8 @@ def render_rgba(
         samples: Number of rays along each side of a pixel.
 
     Returns:
-        Colours in [0, 1], times the fraction of a pixel's rays that hit a shape, and that fraction as fourth channel: float32,
-        shape [H, W, 4].
+        Colours in [0, 1], multiplied by alpha, and alpha as fourth channel: the fraction of a pixel's rays that hit a shape.
+        float32, shape [H, W, 4].
     """
     origin = -matmul(viewmat[:3, :3].T, viewmat[:3, 3])
     sub = (np.arange(width * samples, dtype=np.float32) + 0.5) / samples

@@ -27,7 +27,8 @@ class CameraModel:
 
         ``in_range(position, lens, near) -> bool``: True if the model can project this position. A NaN must give False.
 
-        ``depth_of(position) -> real``: The depth [u], above 0 in range. It orders the Gaussians and is rendered.
+        ``depth_of(position) -> real``: The depth [u], above 0 where ``in_range`` is True. It orders the Gaussians and is
+        rendered.
 
         ``pixel_of(position, K, lens) -> vec2``: The projected position [px].
 
@@ -42,8 +43,8 @@ class CameraModel:
 
         ``position_backward(position, K, lens, pixel, point, axes, v_first, v_second, v_pixel, v_depth) -> Gradients``: The
         gradients of position and intrinsics from those of the two rows, of the pixel and of the depth.
-        ``Gradients`` is a struct with ``v_position`` (vec3) and ``v_K`` (mat33). Where ``point`` equals ``pixel``, J
-        moves with the position; else it does not. The coefficients have no gradient.
+        ``Gradients`` is a struct with ``v_position`` (vec3) and ``v_K`` (mat33). Where ``point`` equals ``pixel``, J depends on
+        the position; otherwise J is constant. The coefficients have no gradient.
 
         Raises:
             TypeError: The class does not define this function.

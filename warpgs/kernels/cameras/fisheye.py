@@ -10,11 +10,11 @@ from warpgs.kernels.cameras.base import CameraModel, register
 from warpgs.kernels.cameras.linear import make_linear
 
 ANTIPODE = 1e-3
-"""Sine of the angle from the backward axis below which nothing is rendered: there the image of a point is a circle."""
+"""Smallest sine of the angle from the backward axis that is rendered: on that axis, the image of a point is a circle."""
 NEAR_AXIS = 0.04
-"""Squared tangent of the angle from the axis below which series replace quotients that would cancel."""
+"""Squared tangent of the angle from the axis; below this value, series replace quotients that would cancel."""
 TERMS = 12
-"""Terms of the series: the error is below 1e-13 of the sum."""
+"""Number of terms of the series: the error is below 1e-13 of the sum."""
 
 
 @register("fisheye")
