@@ -1,10 +1,12 @@
 """Rivals under one rule: their steps are chosen on training views left out, and all share start, background and degree."""
 
+import math
+
 import pytest
 
 from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
 from bench.lib.one_fit import config_of, is_peer, peer_settings
-from bench.lib.rivals_page import arms_table
+from bench.lib.rivals_page import arms_table, other_steps_table
 from tests.scenes import photos
 from tests.test_bench_presets import results
 from warpgs.errors import UsageError
@@ -38,19 +40,27 @@ def test_all_arms_share_start_background_and_degree(views):
 
 
 def test_the_page_pairs_each_method_with_its_base():
-    """Differences are paired by seed, to the first arm or to the one above; a single seed is named; cells may lack."""
+    """Differences are paired by seed, to the first arm or to the one above; few seeds have no interval; cells may lack."""
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)), Arm("c", "mcmc:steps=7"))
-    rows = results("fern:3", "default", [20.0, 20.2]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4])
-    rows += results("fern:3", "mcmc:steps=7", [19.0])
+    rows = results("fern:3", "default", [20.0, 20.2, 20.1]) + results("fern:3", "3dgs:steps=20", [21.0, 21.4, 21.2])
+    rows += results("fern:3", "mcmc:steps=7", [19.0, 19.2])
     rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
     table = arms_table(arms, rows, ["fern:3"], above=False).splitlines()
     assert table[0].startswith("| method | fern: steps | fern: PSNR / SSIM | difference to a")
-    assert "| a | 4,500 | 20.10 ± 0.14 / 0.500 |  |" in table
-    low, high = (1.1 + sign * 0.1 * 25.4517 for sign in (-1, 1))  # Student's t for 97.5 % of one degree of freedom, two rows
-    assert f"| b | 20 | 21.20 ± 0.28 / 0.500 | +1.10 [{low:+.2f}, {high:+.2f}] |" in table
-    assert "| c | 7 | 19.00 / 0.500 (1 seed) | -1.00 |" in table
+    assert "| a | 4,500 | 20.10 ± 0.10 / 0.500 |  |" in table
+    low, high = (1.1 + sign * 0.1 / math.sqrt(3) * 6.2053 for sign in (-1, 1))  # Student's t, 97.5 % of two rows, two degrees
+    assert f"| b | 20 | 21.20 ± 0.20 / 0.500 | +1.10 [{low:+.2f}, {high:+.2f}] |" in table
+    assert "| c | 7 | 19.10 ± 0.14 / 0.500 (2 seeds) | -1.00 |" in table
     again = arms_table((*arms, Arm("d", "quick")), rows, ["fern:3"], above=True).splitlines()
-    assert again[-2:] == ["| c | 7 | 19.00 / 0.500 (1 seed) | -2.00 |", "| d |  |  |  |"]
+    assert again[-2:] == ["| c | 7 | 19.10 ± 0.14 / 0.500 (2 seeds) | -2.10 |", "| d |  |  |  |"]
+
+
+def test_the_page_lists_scores_with_steps_that_were_not_chosen():
+    """Those on held-out views alone: the chosen number stands in the other table."""
+    arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)))
+    rows = results("fern:3", "3dgs:steps=10", [21.0, 21.4]) + results("fern:3", "3dgs:steps=20", [20.0])
+    rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
+    assert other_steps_table(arms, rows, ["fern:3"]).splitlines()[2:] == ["| fern | b | 10 | 21.20 ± 0.28 (2 seeds) |"]
 
 
 def test_every_arm_names_its_steps_once():
