@@ -68,7 +68,7 @@ def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: i
         cameras: Cameras of the views by name, at least one; pinholes.
         reaches: Distance along each optical axis to the point that the camera looks at [u]; 0 if unknown.
         seconds: Duration of the path [s].
-        most: Largest number of views passed through; from more views, evenly spaced ones are taken.
+        most: Largest number of views on the path; if there are more, evenly spaced views are taken.
     """
     distances = _distances(cameras)
     named, near = list(range(len(cameras))), _neighbour_tour(distances)

@@ -22,7 +22,8 @@ class Coverage:
     """Coverage of each Gaussian by all training views; tensors of shape [N] on the device of the Gaussians."""
 
     maxima: torch.Tensor
-    """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806; a sum is small for thin Gaussians)."""
+    """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806); a sum of weights would be small for
+    thin Gaussians."""
     views: torch.Tensor
     """Number of views with a weight of at least `SEEN`, int64."""
 

@@ -37,9 +37,9 @@ class InitConfig:
 
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
-    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep with given
-    depth or up to --init.sweep-up-to views; else points if the training views saw at least 100 of them; else random. If views
-    have an alpha channel, points in an empty area of a view are left out."""
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep if depth
+    is given, or for at most --init.sweep-up-to views; else points if the training views saw at least 100 points; else random.
+    If views have an alpha channel, points in an empty area of a view are left out."""
     sweep_up_to: int = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
     random_count: int = 20_000
@@ -158,7 +158,7 @@ def consistent_points(
 
 
 def _number_extrapolated(views: list[View], count: int) -> str:
-    """Return how many points are extrapolated, for the user, and why there are none."""
+    """Describe, for the user, how many points are extrapolated, or why there are none."""
     if count:
         return f"{count:,} extrapolated where no view looks"
     hidden = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of the views"
@@ -290,7 +290,7 @@ def initial_gaussians(
         sh_degree: Degree of the spherical harmonics, 0 to 4.
         extent: Size of the scene [u]; the distances are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
         device: Device of the tensors, float32.
-        extrapolated: Number of points, the last ones, that start with `EXTRAPOLATED_OPACITY`.
+        extrapolated: Number of extrapolated points, which are the last ones and start with `EXTRAPOLATED_OPACITY`.
 
     Returns:
         The Gaussians.

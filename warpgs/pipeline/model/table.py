@@ -76,7 +76,7 @@ class Table:
         self.add_columns(columns)
 
     def add_columns(self, columns: Mapping[str, Column]) -> None:
-        """Add columns by name, filled."""
+        """Add columns by name, with their initial values."""
         self.kinds |= columns
         self.columns |= {n: torch.full((self.count,), c.fill, dtype=c.dtype, device=self.device) for n, c in columns.items()}
 
@@ -99,7 +99,7 @@ class Table:
         return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
 
     def growth_bytes(self, before: int, after: int) -> int:
-        """Return the bytes needed to add rows: the new rows, one tensor before and after, and indices of rows and parents."""
+        """Return the bytes needed to add rows: the new rows, one tensor before and after the change, and indices."""
         added = min(2 * (after - before), after)  # a split replaces one row by two
         largest = max(t.element_size() * t[0].numel() for t in self.params.values())
         return self.row_bytes * added + largest * (before + after) + 8 * after
