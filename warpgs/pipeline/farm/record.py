@@ -135,7 +135,7 @@ def is_whole(folder: Path, record: JobRecord) -> bool:
 
 
 def finished(job: FarmJob) -> JobRecord | None:
-    """Return the record of a job that is finished and valid: same scene, settings and version, and whole files; else None."""
+    """Return the record of a job that is finished and valid: same scene, settings and version, and intact files; else None."""
     record = read_record(job.folder)
     if record is None or record.state != "done" or record.identity != job.identity() or record.version != __version__:
         return None

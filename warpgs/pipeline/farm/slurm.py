@@ -31,7 +31,7 @@ ASK_EVERY = 1.0
 QUEUE_EVERY = 15.0
 """Time between two calls of squeue, which lists all jobs [s]."""
 MISSED = 3
-"""A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show its answer
+"""A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show the job's answer
 late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
@@ -184,7 +184,7 @@ class SlurmEngine:
 
 
 def _call(program: str, *options: str, script: str = "") -> ProgramResult:
-    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply; those of squeue are removed: they could hide jobs."""
+    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply, but those of squeue do not: they could hide jobs."""
     return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
 
 

@@ -22,7 +22,7 @@ STEP_INTERVAL = 0.5
 
 
 def _answers() -> Callable[..., None]:
-    """Return a function that answers; all other output goes to stderr from now on."""
+    """Return a function that writes answers to stdout; from now on, all other output goes to stderr."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 

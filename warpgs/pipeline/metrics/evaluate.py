@@ -55,7 +55,7 @@ class ViewMetrics:
     lpips: dict[str, float] = field(default_factory=dict)
     """LPIPS by variant (`lpips_vgg_legacy`); empty without weights, NaN if the image is too small."""
     opacity: dict[str, float] = field(default_factory=dict)
-    """Scores by the names of `ALPHA_VARIANTS`, NaN without such pixels; empty if the view is opaque."""
+    """Scores by the names of `ALPHA_VARIANTS`, NaN if the view has no such pixels; empty if the view is opaque."""
 
     def row(self) -> dict[str, Any]:
         """Return all scores by name, flat, as in result files."""

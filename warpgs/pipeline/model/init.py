@@ -57,7 +57,8 @@ class InitConfig:
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind depth edges
     (docs/decisions/026-extrapolated-points.md). In a fit with such points, opacity decay spares Gaussians that a step does not
-    use. No points are added if a view has a mask, an alpha channel or a black background. None: by the number of views."""
+    use. No points are added if a view has a mask, an alpha channel or a black background. None: chosen by the number of
+    views."""
     flow: str = "dis"
     """flow: source of optical flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"

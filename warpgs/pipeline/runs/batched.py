@@ -37,7 +37,7 @@ def check_batched(
     path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
     if path is not None and not resume and needs_poses(path):
         raise UsageError(
-            f"{path}: has no cameras, and each of {ranks.count} ranks finds its own poses; run `warpgs poses {path} --out "
+            f"{path}: has no cameras, and each of {ranks.count} ranks would find its own poses; run `warpgs poses {path} --out "
             "SCENE` first, and fit SCENE"
         )
     if time_budget is not None:

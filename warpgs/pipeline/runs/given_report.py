@@ -23,7 +23,7 @@ DEPTH, NORMALS = "given_depth", "given_normals"
 def given_figures(
     train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
 ) -> dict[str, Any]:
-    """Return the comparison of the model with each kind of given map: a row for each view that has one, and a summary.
+    """Return the comparison of the model with each kind of given map: a row for each view with such a map, and a summary.
 
     Args:
         train: The views to fit.

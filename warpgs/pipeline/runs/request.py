@@ -61,14 +61,14 @@ class SceneRequest:
     """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
     Default: the maps named in transforms.json; give none to ignore them."""
     normals: str | None = None
-    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, as for --depths."""
+    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
     depth_kind: str = "metric"
     """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
     disparity (inverse lengths of unknown scale and shift, as networks give)."""
     depth_unit: float | None = None
     """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
     normal_axes: str = "opencv"
-    """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
+    """Camera axes of the normals: opencv (y down, z forward) or opengl (y up, z back)."""
     matcher: str | None = None
     """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
@@ -108,7 +108,7 @@ def check_overrides(overrides: Mapping[str, object]) -> None:
         UsageError: A keyword is an option of `load_scene`.
     """
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
-        raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to load_scene, and fit that scene")
+        raise UsageError(f"warpgs.fit: {name} is an option for reading a scene; give it to load_scene, and fit that scene")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:

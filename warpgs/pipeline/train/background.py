@@ -1,4 +1,4 @@
-"""Colour behind a scene: from its files, the mean of its photographs, or the user's choice; and random colours behind steps."""
+"""Colour behind a scene: from its files, the mean of its photographs, or the user's choice; and random colours in training."""
 
 from __future__ import annotations
 

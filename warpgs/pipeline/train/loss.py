@@ -63,7 +63,7 @@ class LossInputs:
     tensors. If poses are refined, this is the refined pose of the step, and it is differentiable."""
     step: torch.Tensor
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
-    for later steps; `LossTerm.active` has the number on the host."""
+    for later steps; `LossTerm.active` gets the number on the host."""
 
     def of(self, term: LossTerm) -> LossInputs:
         """Return the inputs of one term, with only the outputs that it needs."""

@@ -35,12 +35,12 @@ def setting_names(config: FitConfig) -> list[str]:
 
 
 def keyword(name: str) -> str:
-    """Return the keyword of a setting: ``init_opacity`` of ``init.opacity``."""
+    """Return the keyword of a setting: ``init_opacity`` for ``init.opacity``."""
     return name.replace(".", "_")
 
 
 def flag(name: str) -> str:
-    """Return the flag of a setting without its leading dashes: ``init.random-count`` of ``init.random_count``."""
+    """Return the flag of a setting without its leading dashes: ``init.random-count`` for ``init.random_count``."""
     return name.replace("_", "-")
 
 

@@ -26,8 +26,8 @@ ALIGNMENT = 16
 FLOAT_BYTES = 4
 """Size of a float [bytes]."""
 DIVIDED_BYTES = 2**26
-"""Least size of a tensor whose rows are divided among processes [bytes]: updating a smaller tensor takes less time than
-two more exchanges need to begin."""
+"""Least size of a tensor whose rows are divided among processes [bytes]: for a smaller tensor, the update takes less time than
+the start of two more exchanges."""
 MAX_RENDERS = 2**24
 """Upper bound of the number of renders of a fit: the random numbers of a render depend on its index, a float32."""
 
@@ -188,7 +188,8 @@ class SlotSums:
         Divided rows then hold the sum of this process's slots, until `sum_own_rows`.
 
         Args:
-            slot: Function of a slot, the tensors of a sum, and whether to add to them; else the function overwrites them.
+            slot: Function of a slot's number, the tensors of a sum, and a flag: True to add to the tensors, False to overwrite
+                them.
 
         Raises:
             ResourceError: Another process was lost.
@@ -210,7 +211,7 @@ class SlotSums:
         self.rows[0, own.start * self._width : own.stop * self._width] = sums
 
     def share(self, tensor: torch.Tensor) -> None:
-        """Send this process's rows of a tensor [N, ...], contiguous and of the shape of the large one, to all others."""
+        """Send this process's rows of a tensor [N, ...], contiguous and shaped like the large tensor, to all others."""
         divided = tensor[: self.divided].view(-1)
         self.tree.ranks.gather(tensor[self.own_rows].view(-1), divided)
 
@@ -238,6 +239,6 @@ class SlotSums:
         return own
 
     def _average(self, start: int, sums: torch.Tensor) -> None:
-        """Divide the means among sums [S] by the number of slots; these sums begin at ``start`` in a sum."""
+        """Divide the means among sums [S] by the number of slots; ``start`` is the place of ``sums`` in a whole sum."""
         for first, end in self.means:
             sums[max(0, first - start) : max(0, end - start)].mul_(1 / self.tree.batch)

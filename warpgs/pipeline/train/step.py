@@ -32,8 +32,8 @@ from warpgs.scene import Camera, Gaussians, Render
 MAX_STEPS = 100
 """Largest number of steps between two reads of results from the device."""
 MAX_VIEWS = 200
-"""Largest number of rendered views between two such reads, for steps of several views (a single step may have more): a request
-to stop waits for the next read."""
+"""Largest number of rendered views between two reads of results, for steps of several views; a single step may have more. A
+request to stop waits for the next read."""
 
 
 def steps_at_once(batch: int) -> int:
@@ -168,7 +168,7 @@ class Learned:
     dropout_seed: int | None
     """Seed of the opacity dropout; None without dropout."""
     cameras: TrainingCameras
-    """Training cameras, to which limits of sizes refer."""
+    """Training cameras, for limits of sizes."""
 
 
 @dataclass(frozen=True)

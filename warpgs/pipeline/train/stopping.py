@@ -29,8 +29,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""The gain is measured since the latest measurement at or before the present step divided by this factor, so over at least the
-last third of the steps."""
+"""A gain compares the present step with the latest measurement at or before this step divided by `LATELY`: it covers at least
+the last third of the steps."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +182,7 @@ class Stopping:
             yield from strategy.update(step)
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
-        """Measure the blocks if the set has changed since the previous mark, and at the last; return whether growth ends."""
+        """Measure the blocks at the last mark, or if the set changed since the previous one; return whether growth ends."""
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
             return False

@@ -72,7 +72,7 @@ class Strategy:
         """Set up the strategy; the table, the training views and the memory plan exist already."""
 
     def growth(self) -> Growth:
-        """Return the times at which Gaussians are added, for early stopping; up to phase 3 by default."""
+        """Return the times at which Gaussians are added, for early stopping; by default until phase 3 begins."""
         return Growth(self.context.phases.refine, self.context.phases.stable_start)
 
     def phase(self, step: int) -> Hashable:

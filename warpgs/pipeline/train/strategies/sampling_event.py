@@ -66,8 +66,8 @@ class MethodConfig:
     events: bool = False
     """Sampling events, which add fine Gaussians in phase 2."""
     hier: bool | None = False
-    """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: by the number
-    of views."""
+    """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: chosen by the
+    number of views."""
     s_render: bool = True
     """Use the rendering residual in the importance."""
     s_semantic: bool = True
@@ -76,8 +76,8 @@ class MethodConfig:
     """Use the geometric score in the importance. With gate_quantile above 0 (preset paper-literal), the reliability gate uses
     the score even if this is off."""
     ra: bool = True
-    """Reliability gate: sample only pixels above gate_quantile of the geometric score and, with sampler.depth consistent, only
-    pixels with consistent depth, in views that have some."""
+    """Reliability gate: sample only pixels above gate_quantile of the geometric score. With sampler.depth consistent, views
+    with consistent depth are also sampled only where it exists."""
     agp: bool = True
     """Adaptive Gaussian placement: sample pixels at random in proportion to importance. If off, take the pixels of highest
     importance."""
@@ -285,8 +285,9 @@ def sampling_event(
 ) -> Event:
     """Sample fine Gaussians by the importance of the pixels of the training views.
 
-    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer) or the set its capacity, the unprotected
-    fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond the limit are not added.
+    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer) or the set reaches its capacity, the
+    unprotected fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond the limit are not
+    added.
 
     Args:
         gaussians: The current set, N rows.

@@ -204,7 +204,7 @@ class RefinePoses(ViewModule):
     """Learn a small correction of each training camera except the first, for inexact poses (docs/your-photos.md)."""
 
     start: float = 0.2
-    """Fraction of the steps before poses are refined, in [0, 1), because the initial Gaussians are inaccurate."""
+    """Fraction of the steps after which refinement of poses starts, in [0, 1): at first the Gaussians are inaccurate."""
     rotation_lr: float = 2e-4
     """Learning rate of the rotations of the training cameras [rad], when refinement starts."""
     translation_lr: float = 2e-4
