@@ -15,8 +15,8 @@ from warpgs.scene import Camera
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
 """Default path for each kind of rig."""
 WIDE_ARC = math.radians(75)
-"""If cameras on one side cover more azimuths than this [rad], a film goes from photograph to photograph: a spiral would leave
-the captured area."""
+"""Largest range of azimuths [rad] of cameras on one side for a spiral; for wider ranges, a film goes from photograph to
+photograph, because a spiral would leave the captured area."""
 SWING = 0.9
 """Fraction of the cameras' range that a film swings through: coverage is lower at the ends of the range."""
 MAX_ELEVATION = math.radians(80)

@@ -32,7 +32,7 @@ MIN_UP = 0.5
 FLAT = 0.02
 """Largest variance of positions across the plane of cameras on a circle, as a fraction of the variance in the plane."""
 ROLLED = 0.05
-"""As `FLAT`, but for the horizontal axes of level photographs, which lean by at most 13 degrees (root mean square)."""
+"""The limit `FLAT`, but for the horizontal axes of level photographs, which lean by at most 13 degrees (root mean square)."""
 MIN_SAME = math.cos(math.radians(15))
 """Cosine of the largest angle between the normals of two planes that count as equal."""
 MIN_SWING = math.radians(6)

@@ -51,9 +51,9 @@ class InitConfig:
     near_views: int = 4
     """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps a point for every pixel."""
+    """sweep, flow: width of the cells in which points of confirmed depth are merged [px]; 0 keeps a point for every pixel."""
     fill_px: float = 16.0
-    """sweep, flow: cell width [px] for filling in points where depth is not consistent; 0 fills in none."""
+    """sweep, flow: cell width [px] for filling in points where other views do not confirm depth; 0 fills in none."""
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind depth edges
     (docs/decisions/026-extrapolated-points.md). In a fit with such points, opacity decay spares Gaussians that a step does not
@@ -116,7 +116,7 @@ def consistent_depths(
         views: Training views.
         known: Points that bound the planes.
         config: Source and its settings.
-        device: Returns the device to sweep on, once it may be used.
+        device: Function that waits until the device to sweep on may be used, and returns it.
         progress: Called with a line for the user about the current work.
     """
     if config.source == "flow":
@@ -226,7 +226,8 @@ def initial_points(
 ) -> Start:  # fmt: skip
     """Return the points to start from.
 
-    ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines about the current work.
+    ``device`` waits until the device to sweep on may be used, and returns it; ``progress`` is called with lines about the
+    current work.
 
     Raises:
         DataError: The training views saw no points, and ``config`` needs them; or masks leave no pixel for a random start.

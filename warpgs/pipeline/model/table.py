@@ -42,7 +42,8 @@ class DensityUpdate:
     parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
     """Parent of each new row, by its index before the change, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
-    """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
+    """Initial values by column, by default the column's ``fill``. New rows take them if they have no parent, or if the column
+    is not inherited."""
     overwritten: torch.Tensor | None = None
     """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
     [R]; None to overwrite no row."""
@@ -142,7 +143,7 @@ class Table:
             skip: 0, or the reason for skipping the step, int32, shape [1].
             factors: Factor of the step of each mean, shape [N]; None for 1. Steps are scaled, not gradients, because Adam's
                 step does not depend on the scale of the gradient.
-            rows: Rows to update; all rows if factors are given.
+            rows: Rows to update; with ``factors``, it must be all rows.
         """
         assert factors is None or rows == slice(None)
         before = None if factors is None else self.params["means"].detach().clone()

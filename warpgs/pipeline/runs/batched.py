@@ -85,7 +85,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     if ranks.count > 1:
         counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
         notes.append(
-            f"ranks: {ranks.count} processes ({ranks.backend}), each renders {' or '.join(map(str, counts))} views of a step; "
+            f"ranks: {ranks.count} processes ({ranks.backend}); each renders {' or '.join(map(str, counts))} views of a step; "
             "the model has the same bits for any number of ranks"
         )
     return notes

@@ -44,8 +44,8 @@ class FitConfig:
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """On a CPU, if --steps is None, take at most as many steps as two cores finish in 1 to 20 minutes, depending on the number
-    of views."""
+    """Limit the steps on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending on the
+    number of views."""
     seed: int = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"

@@ -114,7 +114,7 @@ class MemoryPlan:
     gaussians: int
     """Number of Gaussians at the start."""
     instances: int
-    """Most (Gaussian, tile) instances of a view at the start."""
+    """Largest number of (Gaussian, tile) instances of a view at the start."""
     planned: int
     """Bytes of the first steps."""
     cap: int
@@ -138,7 +138,7 @@ class MemoryPlan:
         """Return one line for the user."""
         text = f"memory: a step takes {format_bytes(self.planned)} now"
         if self.chunked:
-            text += ", the image in chunks"
+            text += ", with the image in chunks"
         if self.cap > self.gaussians:
             about = "" if self.limit is not None else "about "
             text += f", {about}{format_bytes(self.planned_at_cap)} at {self.cap:,} Gaussians"
@@ -200,7 +200,7 @@ def plan(
     Args:
         layout: Layout of the steps; with graphs if possible.
         count: Gaussians at the start.
-        instances: Most (Gaussian, tile) instances of a view at the start.
+        instances: Largest number of (Gaussian, tile) instances of a view at the start.
         most: Number of Gaussians that densification may reach.
         limit: Bytes that the fit may take; None for no limit.
         available: Bytes that the device has free.

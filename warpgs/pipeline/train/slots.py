@@ -144,7 +144,7 @@ class SlotSums:
     def __init__(
         self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device, *, means: int = 0, large: int | None = None
     ):
-        """Allocate.
+        """Allocate memory for the sums.
 
         Args:
             tree: The tree.

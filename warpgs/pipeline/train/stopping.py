@@ -38,12 +38,12 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float | None = 0.0
-    """Growth ends when the gain of the left-out blocks over at least the last third of the steps, plus ``noise`` standard
-    errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor
-    while views have half size. 0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if --cpu-limit
-    shortens the fit."""
+    """Growth, the phase that adds Gaussians, ends when the gain of the left-out blocks over at least the last third of the
+    steps, plus ``noise`` standard errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does
+    not end in its first third, nor while views have half size. 0: no blocks are left out, and the fit takes the planned steps.
+    None: 0.1, or 0 if --cpu-limit shortens the fit."""
     fraction: float = 0.03
-    """Fraction of the pixels in blocks that are left out until growth ends."""
+    """Fraction of the pixels that are left out, in blocks, until growth ends."""
     measurements: int = 12
     """Number of equal intervals of the growth phase; the blocks are measured after each interval."""
     noise: float = 1.0

@@ -17,7 +17,7 @@ class LossConfig:
     """Weights of the loss."""
 
     ssim_weight: float = 0.2
-    """Fraction lambda of the structural term, in [0, 1]."""
+    """Fraction lambda of the SSIM term, in [0, 1]."""
     random_background: bool = True
     """Put views with an alpha channel, and their renders, on a random background at each step. Without this, Gaussians of the
     background colour could cover empty areas. No effect on opaque views."""

@@ -31,7 +31,7 @@ from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 COARSE = 0
 """Layer of the Gaussians that were not sampled; sampled Gaussians have `FINE`."""
 NOT_SAMPLED = -(2**30)
-"""``created_step`` of the coarse layer, whose Gaussians were not sampled."""
+"""Value of ``created_step`` in the coarse layer, whose Gaussians were not sampled."""
 _COUNT = schema.whole(0)
 EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
 """Schema of a stored event."""

@@ -84,7 +84,7 @@ class MethodConfig:
     pm: bool = True
     """Protection mechanism: new fine Gaussians keep a minimum opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
-    """Factor on the learning rate of coarse means from phase 2 on, with two layers, in [0, 1]."""
+    """Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers, in [0, 1]."""
     keep: float = 1.0
     """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
     over at most 32 training views."""
