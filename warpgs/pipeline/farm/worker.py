@@ -34,7 +34,7 @@ def _answers() -> Callable[..., None]:
 
 
 def _read(lines: queue.SimpleQueue[str | None], working: threading.Event) -> None:
-    """Pass on the lines of stdin; at its end interrupt the current job."""
+    """Pass on the lines of stdin; at the end of stdin, interrupt the current job."""
     for line in sys.stdin:
         lines.put(line)
     lines.put(None)

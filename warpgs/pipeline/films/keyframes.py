@@ -24,7 +24,7 @@ MAX_BYTES = 16 * 2**20
 MAX_SKEW = 1e-3
 """Largest entry of R R^T - I for the upper left 3 x 3 matrix R of a pose in a file."""
 MIN_SECONDS, MAX_SECONDS = 1e-3, 86400.0
-"""Least and largest time from one keyframe to the next [s]: slopes of the curve between them stay finite."""
+"""Least and largest time from one keyframe to the next [s]: slopes of the path stay finite."""
 MAX_REACH = 1e12
 """Largest coordinate of a camera centre in a file."""
 

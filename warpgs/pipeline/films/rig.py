@@ -28,7 +28,7 @@ MAX_GAP = math.radians(150)
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
-"""Length of the mean of the cameras' upward unit directions above which they agree."""
+"""Length of the mean of the cameras' upward unit directions above which the directions agree."""
 FLAT = 0.02
 """Largest variance of positions across the plane of cameras on a circle, as a fraction of the variance in the plane."""
 ROLLED = 0.05

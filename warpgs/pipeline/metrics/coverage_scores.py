@@ -32,7 +32,7 @@ PROBED = 6
 
 @torch.no_grad()
 def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
-    """Measure how much two training photographs of the same point differ in colour, as a function of their depth difference.
+    """Measure how much two training photographs of the same point differ in colour, as a function of the difference in depth.
 
     Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
     result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that

@@ -118,7 +118,7 @@ class ViewSet:
     cameras: list[Camera]
     """Cameras with tensors on the device of the model."""
     options: RasterizeOptions
-    """Options for rendering them."""
+    """Options for rendering the views."""
     seed: int
     """Seed of the random signs of `fisher`."""
 

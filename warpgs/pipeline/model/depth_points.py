@@ -197,7 +197,7 @@ def coarse_points(
 def _elsewhere(
     points: np.ndarray, widths: np.ndarray, more: np.ndarray, colors: np.ndarray, more_widths: np.ndarray, cell: float
 ) -> tuple[PointCloud, np.ndarray]:
-    """Merge points ``more`` [M, 3] in cells without any of ``points`` [N, 3]; return them and a mask of those used, bool [M].
+    """Merge points ``more`` [M, 3] in cells without ``points`` [N, 3]; return the merged points and a mask of used ones [M].
 
     ``widths`` [N] and ``more_widths`` [M] are widths of a pixel at each point [u]; ``cell`` is the width of a cell [px].
     """

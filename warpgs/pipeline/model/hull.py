@@ -53,7 +53,7 @@ class Silhouette:
         """True if the object reaches the border of the image, so that it may extend beyond it."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
-        """Return three masks [N] for balls around points [N, 3]: all pixels are empty; all are opaque; the view may see them.
+        """Return three masks [N] for balls around points [N, 3]: all pixels empty; all pixels opaque; the ball in view.
 
         Args:
             points: Centres of the balls [u].

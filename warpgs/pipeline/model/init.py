@@ -103,7 +103,7 @@ class Start(NamedTuple):
     depths: list[ViewDepth] | None = None
     """Geometrically consistent depth of each view; None if not computed."""
     extrapolated: int = 0
-    """Number of extrapolated points, where no view looks; they are the last ones."""
+    """Number of extrapolated points, where no view looks; they are the last points of the cloud."""
 
 
 def consistent_depths(
@@ -292,7 +292,7 @@ def initial_gaussians(
         sh_degree: Degree of the spherical harmonics, 0 to 4.
         extent: Size of the scene [u]; the distances are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
         device: Device of the tensors, float32.
-        extrapolated: Number of extrapolated points, which are the last ones and start with `EXTRAPOLATED_OPACITY`.
+        extrapolated: Number of extrapolated points, which are the last of the cloud and start with `EXTRAPOLATED_OPACITY`.
 
     Returns:
         The Gaussians.

@@ -40,7 +40,7 @@ class DensityUpdate:
     added: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """New rows of each parameter, shape [A, ...]; their moments start at zero. Empty if no row is added."""
     parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
-    """Parent of each new row, by its index before the change, -1 without a parent, int64, shape [A]."""
+    """Index, before the change, of the parent of each new row, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
     """Initial values by column, by default the column's ``fill``. New rows take them if they have no parent, or if the column
     is not inherited."""

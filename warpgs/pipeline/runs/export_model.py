@@ -1,4 +1,4 @@
-"""Export of a model, from a run or a file, filtered, in any format, and of its cameras."""
+"""Export of a model or of its cameras, from a run or a file, filtered, in any format."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def given_figures(
         train: The views to fit.
         views: The same views, with the maps of the loss terms.
         gaussians: The fitted model.
-        options: Options for rendering it.
+        options: Options for rendering the model.
 
     Returns:
         For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a

@@ -1,4 +1,4 @@
-"""Steps of several views: each view has a slot for its gradients, and one update uses their mean, added in a fixed order.
+"""Steps of several views: each view has a slot for its gradients; one update uses the mean over slots, in a fixed order.
 
 Slots are distributed over the processes of a fit. Every process does the rest of a step itself, with the same bits. On CUDA
 several steps are taken before their results are read, so that Python prepares a step while the device works on the previous
@@ -200,7 +200,7 @@ class BatchSteps:
     def _works(
         self, kinds: list[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, captured: bool
     ) -> list[Callable[[], ViewGradients]]:
-        """Return each slot's function for its gradients; ``kinds`` has the kind of view of each slot of this process."""
+        """Return each slot's function for its gradients; ``kinds`` lists the kinds of view for this process's slots."""
         if captured and self._graphs is not None:
             return [_replayed(graph) for graph in self._graphs.capture_all(kinds, stacks, plan, max_instances)]
         render = eager_renderer(self.options, max_instances)

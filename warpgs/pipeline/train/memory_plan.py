@@ -58,7 +58,7 @@ class Layout:
         return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
-        """Return the bytes in addition to `held` at each moment of a step that may be its heaviest.
+        """Return the bytes in addition to `held` at each moment of a step that may be the heaviest.
 
         ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
         """

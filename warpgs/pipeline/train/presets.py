@@ -188,7 +188,7 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def _config_of_file(path: Path, name: str, above: int = 0) -> tuple[FitConfig, str]:
-    """Return the settings of a file, and a note on their source; ``above`` is the number of files that start from it."""
+    """Return the settings of a file, and a note on their source; ``above`` is the number of files that build on it."""
     import dataclasses
 
     values, digest = _read(path)

@@ -26,7 +26,7 @@ MAX_DECAY = 0.1
 
 
 def check_lrs(of: str, **rates: float | None) -> None:
-    """Check learning rates, and factors of them, by name; None is allowed; ``of`` names the group of settings.
+    """Check learning rates, or factors of learning rates, by name; None is allowed; ``of`` names the group of settings.
 
     Raises:
         UsageError: A value is not positive, or above `MAX_LR`.

@@ -1,4 +1,4 @@
-"""Sums over the views of a step, its slots, in one order for any number of processes.
+"""Sums over the views of a step (slots), in one order for any number of processes.
 
 float32 values are added in a fixed binary tree over the slots 0 to B - 1. The sum of n slots is the sum of the first p slots
 plus the sum of the others, with p the largest power of two below n. Each process sums the largest subtrees of its own slots.
@@ -178,7 +178,7 @@ class SlotSums:
         return slice(self.tree.ranks.rank * each, (self.tree.ranks.rank + 1) * each)
 
     def parts(self, row: int = 0) -> list[torch.Tensor]:
-        """Return the tensors of a sum, parts of its memory, in their shapes [...]."""
+        """Return the tensors of a sum, as parts of the sum's memory, in their shapes [...]."""
         sized = zip(self.starts, self.shapes, strict=True)
         return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
 

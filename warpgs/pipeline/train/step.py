@@ -93,7 +93,7 @@ class StepBuffers:
         self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
-        """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next."""
+        """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next one."""
         done, stop = int(self.counter), int(self.stop)
         return done, stop, self.history[: done + 1].tolist()
 

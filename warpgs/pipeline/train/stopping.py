@@ -151,7 +151,7 @@ class Stopping:
         return sum(len(b) * b.side**2 for b in self.blocks)
 
     def hidden(self) -> list[TrainingView]:
-        """Return the views without their blocks."""
+        """Return the views with their held-out blocks masked."""
         return [hide(v, b) for v, b in zip(self.whole, self.blocks)]
 
     def sh_every(self, every: int, highest: int) -> int:
@@ -170,7 +170,7 @@ class Stopping:
         Args:
             step: Steps done.
             strategy: Density strategy.
-            context: Parts of the fit; when growth ends, its third phase begins.
+            context: Parts of the fit; when growth ends, the fit's third phase begins.
             degree: Degree of the harmonics in use.
         """
         if self.due(step) and self._measured(step, strategy, context, degree):

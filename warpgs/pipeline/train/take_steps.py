@@ -81,7 +81,7 @@ class StepTaker:
     def agreed(self, stopped: bool) -> bool:
         """Return whether to end after the last step; all processes get the same answer.
 
-        A request to one process reaches the others with its next steps.
+        A request to stop reaches one process first, and the others with the next steps.
         """
         if self.batched is None or self.ranks.count == 1:
             return stopped

@@ -21,7 +21,7 @@ class Strategy:
 
     To write a strategy, derive a class and override the methods that it needs. For each step the trainer calls `phase` on the
     host. As part of the step it then calls `statistics` for each view, `lr_factors` and `after_step`. After the step it calls
-    `due` on the host and, if that returns True, `update`.
+    `due` on the host and, if the result is True, `update`.
 
     The methods that are part of a step are captured once as a CUDA graph and replayed. So they must not read back from the
     device, must write their results into existing tensors, and may depend on the host only through `phase`.
@@ -61,7 +61,7 @@ class Strategy:
         return own
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes that the strategy needs at the moments of a step, or in an event, without its columns."""
+        """Return the bytes that the strategy needs at the moments of a step, or in an event; columns are not included."""
         return {}
 
     def columns(self) -> Mapping[str, Column]:
@@ -126,7 +126,7 @@ class Strategy:
         return iter(())
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Yield changes for the pixels that early stopping held out, when it ends growth.
+        """Yield changes, when early stopping ends growth, for the pixels that early stopping held out.
 
         Args:
             step: Steps done.

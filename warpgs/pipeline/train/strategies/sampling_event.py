@@ -169,7 +169,7 @@ class Rendered(NamedTuple):
     """A render of a view before an event, and the pixels that can be sampled."""
 
     rgb: torch.Tensor
-    """Colours as the view shows them, shape [H, W, 3]."""
+    """Rendered colours after the view modules of the fit, shape [H, W, 3]."""
     surface: torch.Tensor
     """Rendered z-depth [u], shape [H, W]."""
     depth: torch.Tensor
@@ -193,7 +193,7 @@ def sample_view(
     view: TrainingView, number: int, rendered: Rendered, residuals: Sequence[Residual], config: MethodConfig,
     coefficients: int, generator: torch.Generator,
 ) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
-    """Score one view, sample its pixels, and return them with the rows [S, ...] of the fine Gaussians behind them.
+    """Score one view and sample its pixels; return maps and samples, and rows [S, ...] of fine Gaussians behind the pixels.
 
     Args:
         view: The view.

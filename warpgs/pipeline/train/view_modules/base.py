@@ -40,7 +40,7 @@ class FittedViews:
     gaussians: Gaussians
     """The fitted model."""
     options: RasterizeOptions
-    """Options for rendering it."""
+    """Options for rendering the model."""
 
 
 @dataclass(frozen=True)

@@ -110,8 +110,8 @@ def similar_cameras(
 
     Args:
         cameras: Cameras by name, in the world of the given ones.
-        given: Cameras before.
-        refined: The same cameras after, in the same order.
+        given: Cameras before refinement.
+        refined: The same cameras after refinement, in the same order.
         names: Names of the cameras to return.
     """
     R, scale, t = similarity(given, refined)
@@ -161,8 +161,8 @@ def pose_figures(
     """Return the changes by refinement, for metrics.json.
 
     Args:
-        given: Cameras before, in scene units.
-        refined: Cameras after.
+        given: Cameras before refinement, in scene units.
+        refined: Cameras after refinement.
         train: Names of the training views.
         held_out: Whether there are held-out views.
         scale: Scene units per unit of the scene's files.
