@@ -61,8 +61,8 @@ class Tour:
 def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> Tour:
     """Return a path through training views at an even pace.
 
-    The order of their names is used if it is probably the order in which they were taken, that is, if this path is not much
-    longer than one from neighbour to neighbour. The path is closed if its ends are neighbours.
+    The views are passed in the order of their names if this path is not much longer than one from neighbour to neighbour: then
+    the names probably follow the order of capture. The path is closed if its ends are neighbours.
 
     Args:
         cameras: Cameras of the views by name, at least one; pinholes.

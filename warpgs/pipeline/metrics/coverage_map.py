@@ -16,7 +16,7 @@ from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02
 """Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
-difference, the squared colour difference of two photographs is twice (3 dB) its value at the best agreement of depths (decision
+difference, the squared colour difference of two photographs is twice (3 dB) the value at the best agreement of depths (decision
 019)."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface; other pixels have no depth."""

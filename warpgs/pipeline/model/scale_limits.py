@@ -188,8 +188,8 @@ def shape_figures(
         ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], and its ratios to the radius and to the extent;
         the largest ratio of a standard deviation to the distance of the nearest camera, among the cameras that `camera_centers`
         chooses; ``needles``, the fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one;
-        ``needles_by_opacity``, the same weighted by opacity; ``thin``, the fraction whose longest axis is more than `NEEDLE`
-        times the shortest; and the number of Gaussians ``beyond`` the limits.
+        ``needles_by_opacity``, this fraction weighted by opacity; ``thin``, the fraction whose longest axis is more than
+        `NEEDLE` times the shortest; and the number of Gaussians ``beyond`` the limits.
     """
     scales = gaussians.log_scales.detach().cpu().double()
     longest, middle = long_axes(scales)

@@ -141,7 +141,7 @@ class Stopping:
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
         return [
             Detail(
-                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} or before"
+                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} at the latest"
             )
         ]
 

@@ -132,7 +132,7 @@ class Exposure(ViewModule):
         """Return the learned exposures and their effect.
 
         Returns:
-            ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of a middle gray
+            ``views``, for each training view [A | b] as 3 rows of 4, and ``gain``, the mean over channels of a middle gray
             after exposure, divided by that gray; ``matched_psnr``, the mean PSNR of held-out views after colour matching [dB],
             None without held-out views; ``summary``.
         """
