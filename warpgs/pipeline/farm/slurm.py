@@ -117,7 +117,7 @@ class SlurmEngine:
         self._running[job.name] = _Queued(slurm_id, number)
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return the jobs that have ended; answers are looked for once a second, and Slurm is asked four times a minute."""
+        """Return the jobs that have ended; answer files are checked once a second, and squeue is called four times a minute."""
         last = time.monotonic() + seconds
         while True:
             ended = self._ended()

@@ -105,7 +105,7 @@ def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
 
 
 def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
-    """Return the same Gaussians without degrees that none uses; in a file all Gaussians have equally many coefficients."""
+    """Return the Gaussians without degrees that none of them uses; a file stores equally many coefficients for all."""
     degrees = stored_degrees(gaussians.sh)
     highest = int(degrees.max()) if len(degrees) else 0
     return Gaussians(**(gaussians.tensors() | {"sh": gaussians.sh[:, : (highest + 1) ** 2].contiguous()}))

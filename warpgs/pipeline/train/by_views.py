@@ -76,7 +76,7 @@ def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
 
 
 def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
-    """Return the steps that fit into the time of a CPU, and a sentence for the user, which is empty if all steps fit.
+    """Return how many steps fit into the time limit on a CPU, and a sentence for the user; it is empty if all steps fit.
 
     Args:
         wanted: Steps of the fit without a limit.

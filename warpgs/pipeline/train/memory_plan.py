@@ -173,7 +173,7 @@ def layout_of(
         modules: View modules.
         kept: Other views that are kept on the device.
         captured: True to capture steps as CUDA graphs where the device can.
-        sums: Sums of gradients that a step of several views keeps.
+        sums: Number of sums of gradients that a step of several views keeps.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"

@@ -15,7 +15,7 @@ def log_linear(start: float, end: float, progress: float) -> float:
 
 
 def sh_degree(step: int, every: int, highest: int) -> int:
-    """Return the degree in use at a step counted from 1: one more after every ``every`` steps, up to ``highest``."""
+    """Return the degree in use at a step (from 1): it rises by one after each ``every`` steps, up to ``highest``."""
     return min(highest, (step - 1) // every)
 
 

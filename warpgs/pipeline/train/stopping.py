@@ -141,7 +141,7 @@ class Stopping:
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
         return [
             Detail(
-                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} at the latest"
+                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} or earlier"
             )
         ]
 
@@ -182,7 +182,7 @@ class Stopping:
             yield from strategy.update(step)
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
-        """Measure the blocks at the last mark, or if the set changed since the previous one; return whether growth ends."""
+        """Measure the blocks if the set changed since the previous mark, and at the last mark; return whether growth ends."""
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
             return False

@@ -106,8 +106,8 @@ class Strategy:
     ) -> Mapping[str, torch.Tensor]:
         """Return the values that a view of a step adds to columns, by name of the column, shape [N] each.
 
-        They must depend on this view only, because other views of the step may be in other processes. They must be 0 where
-        ``visible`` is False, because gradients of a skipped step may be NaN.
+        The values must depend on this view only, because other views of the step may be in other processes. They must be 0
+        where ``visible`` is False, because gradients of a skipped step may be NaN.
 
         Args:
             phase: Value of `phase` for the step.

@@ -254,7 +254,7 @@ def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView
 def _sampled(
     gaussians: Gaussians, views: list[TrainingView], config: MethodConfig, options: RasterizeOptions, generator: torch.Generator
 ) -> tuple[dict[str, torch.Tensor], tuple[SampledView, ...]]:
-    """Return the Gaussians that are sampled in the views, by name of the tensor, and the maps used."""
+    """Return the Gaussians sampled in the views, as tensors by name, and the maps used."""
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
         numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
