@@ -47,7 +47,7 @@ def check_batched(
 
 
 def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
-    """Check that all processes fit the same scene with the same settings: each takes its own part of the same steps.
+    """Check that all processes fit the same scene with the same settings, because each takes a part of the same steps.
 
     Args:
         record: Record of the run, as this process has it.

@@ -114,7 +114,7 @@ def block_errors(
 
 
 def decibels(errors: torch.Tensor) -> float:
-    """Return the PSNR of the mean of block errors [B], with the floor [dB]; NaN without blocks."""
+    """Return the PSNR [dB] of the mean of block errors [B], including the error floor; NaN without blocks."""
     return psnr_of(float(errors.mean()) + FLOOR) if len(errors) else math.nan
 
 

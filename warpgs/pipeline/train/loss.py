@@ -134,7 +134,7 @@ def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
 def total(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of values [H, ...], shape [], with the same bits for any number of CPU threads.
 
-    On a CPU torch's sum of a whole tensor depends on that number, so rows are summed first.
+    On a CPU, torch's sum of a whole tensor depends on the number of threads, so rows are summed first.
     """
     return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
 

@@ -129,7 +129,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
 def chosen_settings(
     preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: Mapping[str, object]
 ) -> tuple[FitConfig, list[str]]:
-    """Return the settings of a preset with some replaced, both as in `warpgs.fit`, and a note on their source.
+    """Return the settings of a preset, some of them replaced, and a note on their source; arguments are as in `warpgs.fit`.
 
     Raises:
         DataError: The file of a preset cannot be read or is not TOML.

@@ -136,7 +136,7 @@ def _check_models(train: list[View], config: FitConfig) -> None:
 
 
 def samples(config: FitConfig) -> bool:
-    """Return whether the strategy places Gaussians behind pixels, for which depths of views are compared."""
+    """Return whether the strategy places Gaussians behind pixels, which needs depths that views confirm."""
     return find_strategy(config.strategy).samples(config.groups())
 
 

@@ -135,7 +135,7 @@ class Tree:
 
 
 class SlotSums:
-    """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum.
+    """Sums of several tensors over slots; the tensors of a sum have fixed shapes and lie side by side in memory.
 
     The rows of a large tensor may be divided among processes. Each process gets the sums of its own rows, updates these rows,
     and sends the updated rows instead of sums.
@@ -185,7 +185,7 @@ class SlotSums:
     def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
 
-        Divided rows then hold the sum of this process's slots, until `sum_own_rows`.
+        Divided rows then hold the sum of this process's slots only, until `sum_own_rows` is called.
 
         Args:
             slot: Function of a slot's number, the tensors of a sum, and a flag: True to add to the tensors, False to overwrite
@@ -229,7 +229,7 @@ class SlotSums:
             self.rows[row].add_(self.rows[row + 1])
 
     def _own_sums(self, place: slice) -> torch.Tensor:
-        """Finish the tree for this process's slice of a part of the numbers; processes have slices of equal size, [S]."""
+        """Finish the sums of this process's part of the numbers in ``place``; all parts have equal size, [S]."""
         tree, ranks = self.tree, self.tree.ranks
         sent = self.rows[: tree.width, place].view(tree.width, ranks.count, -1).transpose(0, 1).contiguous()
         received = ranks.to_each(sent)

@@ -139,11 +139,7 @@ class Stopping:
             return [Detail(f"early stopping is off, because {few}; the fit takes all its steps")]
         self.whole = context.views
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
-        return [
-            Detail(
-                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} or earlier"
-            )
-        ]
+        return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, by step {ends}")]
 
     @property
     def held_pixels(self) -> int:

@@ -35,7 +35,7 @@ class StepTaker:
 
     @property
     def sums(self) -> int:
-        """Sums of gradients that a step of several views keeps."""
+        """Number of sums of gradients that a step of several views keeps."""
         return 0 if self.batched is None else self.batched.tree.buffers
 
     @property

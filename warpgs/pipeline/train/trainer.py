@@ -183,8 +183,8 @@ class Trainer:
     def advance(self, limit: int = 1) -> list[StepReport]:
         """Take up to ``limit`` steps, and let the strategy change the set of Gaussians after the last step if a change is due.
 
-        On CUDA steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU, or
-        if a memory limit does not allow graphs, one step is taken.
+        On CUDA, steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU,
+        or if a memory limit does not allow graphs, one step is taken.
 
         Raises:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.

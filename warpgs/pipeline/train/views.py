@@ -279,7 +279,7 @@ def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
 def show_learned(
     views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
 ) -> None:
-    """Write the current learned values into views of `with_learned`, from which density strategies render.
+    """Write the current learned values into the views of `with_learned`; density strategies render these views.
 
     Args:
         views: Training views.

@@ -34,8 +34,7 @@ MAPS = 12
 def depth_roughness(
     depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`), divided by the pixel count, shape
-    [].
+    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) divided by pixel count, shape [].
 
     z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum is over
     pixels that, like both neighbours, are unmasked and more opaque than `MIN_ALPHA`.

@@ -148,7 +148,7 @@ def refine(
 
 
 class GradientGrowth:
-    """Gradients of the projected means, gathered in columns of the table, and growth and pruning by them."""
+    """Growth and pruning by the gradients of projected means, which are gathered in columns of the table."""
 
     STATE: ClassVar = {"was_reset": schema.flag}
     """Schema of the plain values of `state`, by name."""
@@ -161,7 +161,7 @@ class GradientGrowth:
 
     @staticmethod
     def columns() -> dict[str, Column]:
-        """Return the columns for the sum of a projected mean's gradient norms, and for the number of renders that show it."""
+        """Return the columns for each projected mean: the sum of its gradient norms, and the number of renders that show it."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
     @property

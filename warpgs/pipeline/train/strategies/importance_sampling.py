@@ -63,7 +63,7 @@ class ImportanceSampling(Strategy):
         return {SAMPLING: 7 * FLOAT * sizes.pixels * min(sizes.views, MAX_VIEWS)} if self.method.events else {}
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the columns of gradients, of the layer of each Gaussian, and of the step at which it was sampled."""
+        """Return the columns for gradients, each Gaussian's layer, and the step at which the Gaussian was sampled."""
         own = {"level": Column(COARSE, torch.int32), "created_step": Column(NOT_SAMPLED, torch.int32)}
         return {**self.gradients.columns(), **own}
 

@@ -71,7 +71,7 @@ def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | 
 
 
 def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, wanted: int) -> tuple[torch.Tensor, float]:
-    """Return M_reliable: the valid pixels whose geometric score is above a quantile of the valid pixels; and the quantile used.
+    """Return M_reliable, the valid pixels with a geometric score above a quantile over valid pixels, and the quantile used.
 
     Args:
         geometry: S_geometry, shape [H, W].

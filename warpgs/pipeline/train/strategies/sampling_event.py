@@ -286,8 +286,8 @@ def sampling_event(
     """Sample fine Gaussians by the importance of the pixels of the training views.
 
     If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer) or the set reaches its capacity, the
-    unprotected fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond the limit are not
-    added.
+    unprotected fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond these limits are
+    not added.
 
     Args:
         gaussians: The current set, N rows.
@@ -296,7 +296,7 @@ def sampling_event(
         views: Training views with their scores.
         config: Switches and settings.
         step: Steps done.
-        capacity: Gaussians that may be added.
+        capacity: Number of Gaussians that may be added.
         options: Settings of the rasterizer.
         generator: CPU generator, the same numbers on every device.
 
