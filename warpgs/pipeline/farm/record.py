@@ -60,9 +60,9 @@ class JobRecord:
     seconds: float = 0.0
     """Wall time of the job, reading and scores included [s]."""
     psnr: float | None = None
-    """Mean over held-out views [dB]; None without held-out views."""
+    """Mean PSNR over held-out views [dB]; None without held-out views."""
     ssim: float | None = None
-    """Mean over held-out views."""
+    """Mean SSIM over held-out views."""
     gaussians: int = 0
     steps: int = 0
     ply_bytes: int = 0

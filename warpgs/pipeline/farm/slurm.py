@@ -36,9 +36,9 @@ late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
 SECONDS_TO_SAVE = 120
-"""Time before its limit at which Slurm interrupts a job, so that the fit saves its state [s]."""
+"""Time before the end of a job's time limit at which Slurm interrupts the job, so that the fit saves its state [s]."""
 LAST_BYTES = 2000
-"""Length of the end of a job's output in which its last line is searched [bytes]."""
+"""Number of bytes at the end of a job's output that are searched for its last line."""
 PATIENCE = 60.0
 """Time limit of a command of Slurm [s]."""
 

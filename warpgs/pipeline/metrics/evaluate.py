@@ -29,7 +29,7 @@ ALPHA_VARIANTS = {
     "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
     "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
 }
-"""Definition of each score of views with an alpha channel. A mean is over the views that have such pixels."""
+"""Definition of each score of views with an alpha channel. A mean covers only the views with pixels for the score."""
 EMPTY, OPAQUE, OBJECT = 0.02, 0.5, 0.98
 """Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"

@@ -59,7 +59,7 @@ class SceneRequest:
     lens). Fisheyes need native."""
     depths: str | None = None
     """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
-    Default: the maps named in transforms.json; give none to ignore them."""
+    Default: the maps that transforms.json names; with the value none, these maps are ignored."""
     normals: str | None = None
     """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
     depth_kind: str = "metric"

@@ -15,7 +15,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views: with an alpha channel, and of opaque views."""
+"""Steps of a fit of up to `FEW` views: first for views with an alpha channel, then for opaque views."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Number of views above which steps exceed `MIN_STEPS`; exponent of this growth; and largest number of steps."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6

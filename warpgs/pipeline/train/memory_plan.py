@@ -32,7 +32,7 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
 RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views.step_bytes)
-"""Functions that return the bytes of a part of every step, by moment."""
+"""Functions that return the bytes of a part of every step, at each moment of the step."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Layout:
     sizes: StepSizes
     """Sizes of every step, without the numbers of Gaussians and instances."""
     parts: tuple[Callable[[StepSizes], Needs], ...]
-    """Functions that return the bytes of a part of a step, by moment."""
+    """Functions that return the bytes of a part of a step, at each moment of the step."""
     table: Table
     """The Gaussians with their columns."""
     view_bytes: int

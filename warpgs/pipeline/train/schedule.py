@@ -48,8 +48,8 @@ class OptimizerConfig:
     quats_lr: float = 1e-3
     """Learning rate of the rotations."""
     scales_lr: float | None = 0.01
-    """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md). None: chosen by the number of
-    views."""
+    """Learning rate of the log scales; 0.005 in the reference implementation (docs/decisions/004-scale-rate.md). None: chosen
+    by the number of views."""
     scales_decay: float = 1.0
     """Learning rate of the log scales at the last step, as a fraction of the first. It falls log-linearly during phase 3;
     without phases, during the whole fit. 1: constant."""

@@ -29,7 +29,7 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 
 COARSE = 0
-"""Layer of the Gaussians that were not sampled; sampled Gaussians have `FINE`."""
+"""Number of the layer of Gaussians that were not sampled; sampled Gaussians have `FINE`."""
 NOT_SAMPLED = -(2**30)
 """Value of ``created_step`` in the coarse layer, whose Gaussians were not sampled."""
 _COUNT = schema.whole(0)

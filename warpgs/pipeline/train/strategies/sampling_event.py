@@ -32,7 +32,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Prior, ViewDepth
 
 FINE = 1
-"""Layer of sampled Gaussians."""
+"""Number of the layer of sampled Gaussians."""
 MAX_VIEWS = 8
 """Largest number of views in which one event samples; of more views, a random subset is taken."""
 MAX_WEIGHED = 32
