@@ -49,7 +49,7 @@ def test_lines_are_flags_of_fit(tmp_path):
         ('{"scene": "a", "--steps": 1}', "cannot be set"),
         ('{"scene": "a\\u0000"}', "without a zero byte"),
         ('{"scene": "a", "name": ".b"}', "is not a valid name"),
-        ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, but a job's name may have 200"),
+        ('{"scene": "a", "name": "%s"}' % (100 * "写"), "has 300 bytes, but a job's name may have at most 200"),
         ('{"scene": "a", "name": "%s"}' % (101 * "x"), "is not a valid name"),
         ("[" * 60 + "]" * 60, "nested deeper"),
     ],

@@ -224,7 +224,7 @@ def test_a_fit_takes_keywords_and_records_where_settings_come_from(tmp_path):
         ({"init_opacity": float("nan")}, "init_opacity must be a finite number"),
         ({"opacity": 0.3}, "did you mean init_opacity"),
         ({"sh_degree": 5}, r"sh-degree must be in \[0, 4\], not 5"),
-        ({"downscale": 2}, "downscale is an option of reading a scene"),
+        ({"downscale": 2}, "downscale is an option for reading a scene"),
     ):
         with pytest.raises(UsageError, match=said):
             warpgs.fit(scene, "quick", out=tmp_path / "x", **wrong, **options)

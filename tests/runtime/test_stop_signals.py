@@ -13,7 +13,7 @@ from warpgs.synthetic.demo import split_spec, write_demo
 SIGNALS = [pytest.param(s, id=n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))]
 CONTEXTS = [interrupting_signals, noted_signals, ignored_signals]
 SENTENCE = "warpgs: interrupted; --resume continues from the last checkpoint\n"
-UNSAVED = "warpgs: interrupted; no step was saved: the same command begins again\n"
+UNSAVED = "warpgs: interrupted; no step was saved: run the same command again\n"
 
 
 @pytest.fixture(autouse=True)

@@ -138,7 +138,7 @@ def _outcome(
         # the report is what a fit writes last
         metrics = _scores(folder / "metrics.json") if (folder / "report.html").is_file() else None
         if gap:
-            note = f"the old run differs in {gap}; moved to {_set_aside(folder).name} and fitted again"
+            note = f"the old run differs in {gap}; moved to {_set_aside(folder).name}, and the scene was fitted again"
             state = "redone"
         elif metrics is not None:
             if (folder / LOCK).exists():  # left by a fit that was killed after its last file, like other leftovers
@@ -152,7 +152,7 @@ def _outcome(
         else:
             resume, state, note = True, "continued", "was interrupted; continued from the last checkpoint"
     elif os.path.exists(folder) and not is_empty(folder):
-        note = f"old results: {why}; moved to {_set_aside(folder).name} and fitted again"
+        note = f"old results: {why}; moved to {_set_aside(folder).name}, and the scene was fitted again"
         state = "redone"
 
     def fit(go_on: bool) -> dict[str, Any]:
@@ -164,7 +164,7 @@ def _outcome(
         except (DataError, UsageError) as e:
             if not resume:
                 raise
-            note = f"could not be continued ({e}); moved to {_set_aside(folder).name} and fitted again"
+            note = f"could not be continued ({e}); moved to {_set_aside(folder).name}, and the scene was fitted again"
             return Outcome("redone", fit(False), note)
     except WarpgsError as e:
         return Outcome("failed", None, f"{note + '; then ' if note else ''}{e}", e)

@@ -59,7 +59,7 @@ def run_farm(
 
     Args:
         jobs: The jobs.
-        engine: Where they run; it is not closed.
+        engine: Engine that runs the jobs; it is not closed.
         show: Called with the status of all jobs whenever one changed, and every ``poll`` seconds.
         poll: Time between checks of a job that another farm works on [s].
 

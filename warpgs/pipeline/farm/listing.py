@@ -66,8 +66,8 @@ def list_jobs(jobs: str) -> list[ListedJob]:
             )
         if (size := len(os.fsencode(job.name))) > MOST_BYTES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} has {size} bytes, but a job's name may have {MOST_BYTES}; give another name "
-                "in a .jsonl file"
+                f"{jobs}: {job.name[:100]!r} has {size} bytes, but a job's name may have at most {MOST_BYTES}; give another "
+                "name in a .jsonl file"
             )
         if job.name.casefold() in taken:
             raise UsageError(f"{jobs}: two jobs have the name {job.name!r}; give each line of a .jsonl file its own name")

@@ -34,7 +34,7 @@ def private_shared_folder(base: Path | None) -> Iterator[Path]:
     """
     home = cache_home()
     if base is None and home is None:
-        raise UsageError("--engine slurm needs a home folder for its job files; name one with --slurm-folder")
+        raise UsageError("--engine slurm needs a home folder for its job files; name another folder with --slurm-folder")
     base = (base or home / "warpgs" / "slurm").absolute()
     try:
         base.mkdir(mode=0o700, parents=True, exist_ok=True)

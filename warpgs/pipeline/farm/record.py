@@ -60,9 +60,9 @@ class JobRecord:
     seconds: float = 0.0
     """Wall time of the job, reading and scores included [s]."""
     psnr: float | None = None
-    """Mean over held-out views [dB]; None without held-out views."""
+    """Mean PSNR over held-out views [dB]; None without held-out views."""
     ssim: float | None = None
-    """Mean over held-out views."""
+    """Mean SSIM over held-out views."""
     gaussians: int = 0
     steps: int = 0
     ply_bytes: int = 0
@@ -135,7 +135,7 @@ def is_whole(folder: Path, record: JobRecord) -> bool:
 
 
 def finished(job: FarmJob) -> JobRecord | None:
-    """Return the record of a job that is finished and valid: same scene, settings and version, and whole files; else None."""
+    """Return the record of a job that is finished and valid: same scene, settings and version, and intact files; else None."""
     record = read_record(job.folder)
     if record is None or record.state != "done" or record.identity != job.identity() or record.version != __version__:
         return None

@@ -75,7 +75,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
 
     Args:
         jobs: The jobs, with folders below ``results``.
-        engine: The engine; it is closed.
+        engine: Engine that runs the jobs; it is closed at the end.
         results: Folder of the results.
         live: As in `FarmTable`.
 

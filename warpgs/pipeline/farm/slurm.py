@@ -31,14 +31,14 @@ ASK_EVERY = 1.0
 QUEUE_EVERY = 15.0
 """Time between two calls of squeue, which lists all jobs [s]."""
 MISSED = 3
-"""A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show its answer
+"""A job is taken as ended if this many calls of squeue in a row do not list it: a network file system may show the job's answer
 late."""
 NAME = "warpgs"
 STATES = ("done", "failed", "held")
 SECONDS_TO_SAVE = 120
-"""Time before its limit at which Slurm interrupts a job, so that the fit saves its state [s]."""
+"""Time before the end of a job's time limit at which Slurm interrupts the job, so that the fit saves its state [s]."""
 LAST_BYTES = 2000
-"""Length of the end of a job's output in which its last line is searched [bytes]."""
+"""Number of bytes at the end of a job's output that are searched for its last line."""
 PATIENCE = 60.0
 """Time limit of a command of Slurm [s]."""
 
@@ -117,7 +117,7 @@ class SlurmEngine:
         self._running[job.name] = _Queued(slurm_id, number)
 
     def wait(self, seconds: float) -> list[Event]:
-        """Return the jobs that have ended; answers are looked for once a second, and Slurm is asked four times a minute."""
+        """Return the jobs that have ended; answer files are checked once a second, and squeue is called four times a minute."""
         last = time.monotonic() + seconds
         while True:
             ended = self._ended()
@@ -184,7 +184,7 @@ class SlurmEngine:
 
 
 def _call(program: str, *options: str, script: str = "") -> ProgramResult:
-    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply; those of squeue are removed: they could hide jobs."""
+    """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply, but those of squeue do not: they could hide jobs."""
     return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
 
 

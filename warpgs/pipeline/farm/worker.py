@@ -22,7 +22,7 @@ STEP_INTERVAL = 0.5
 
 
 def _answers() -> Callable[..., None]:
-    """Return a function that answers; all other output goes to stderr from now on."""
+    """Return a function that writes answers to stdout; from now on, all other output goes to stderr."""
     out = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)
 
@@ -34,7 +34,7 @@ def _answers() -> Callable[..., None]:
 
 
 def _read(lines: queue.SimpleQueue[str | None], working: threading.Event) -> None:
-    """Pass on the lines of stdin; at its end interrupt the current job."""
+    """Pass on the lines of stdin; at the end of stdin, interrupt the current job."""
     for line in sys.stdin:
         lines.put(line)
     lines.put(None)

@@ -15,12 +15,12 @@ from warpgs.scene import Camera
 BY_KIND = {"forward": "spiral", "ring": "turntable", "room": "turntable", "free": "interpolate"}
 """Default path for each kind of rig."""
 WIDE_ARC = math.radians(75)
-"""Range of azimuths [rad] of cameras on one side above which a film goes from photograph to photograph: a spiral would leave
-the captured area."""
+"""Largest range of azimuths [rad] of cameras on one side for a spiral; for wider ranges, a film goes from photograph to
+photograph, because a spiral would leave the captured area."""
 SWING = 0.9
 """Fraction of the cameras' range that a film swings through: coverage is lower at the ends of the range."""
 MAX_ELEVATION = math.radians(80)
-"""Largest elevation of a film: above it, the upward direction is lost."""
+"""Largest elevation of a film's cameras: near the zenith, the upward direction is ambiguous."""
 LIMITS = {"width": (16, 8192), "fov": (1.0, 170.0)}
 """Smallest and largest value of a film's sides [px], and of its vertical field of view [deg]."""
 
@@ -70,7 +70,7 @@ def upright(rig: Rig, camera: Camera) -> Camera:
 
 
 def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np.ndarray]:
-    """Return poses of two turns that open and close again among the cameras, all looking at the rig's centre."""
+    """Return poses along two turns that widen and narrow again among the cameras, all looking at the rig's centre."""
     center = np.mean([c.center for c in cameras], axis=0)
     forward = rig.center - center
     depth = math.sqrt((forward * forward).sum())
@@ -90,7 +90,9 @@ def _spiral_to_one_side(rig: Rig, cameras: list[Camera], frames: int) -> list[np
 
 
 def _turn(rig: Rig, frames: int, turns: int, rise: float) -> list[np.ndarray]:
-    """Return poses on a circle about the rig's centre, or looking around from it; without full coverage a swing there and back.
+    """Return poses on a circle about the rig's centre, or looking around from it.
+
+    If the cameras do not cover all sides, the path swings there and back.
 
     Args:
         rig: The rig.
@@ -119,7 +121,7 @@ def camera_path(kind: str, rig: Rig, cameras: list[Camera], frames: int) -> list
     Args:
         kind: ``turntable``: a level circle at the cameras' distance and elevation; for cameras on one side, a swing through
             their range and back; in a room, a turn on the spot. ``spiral``: two turns that rise and fall; for cameras that look
-            to one side, two turns that open and close again.
+            to one side, two turns that widen and narrow again.
         rig: Arrangement of the training cameras.
         cameras: Training cameras, at least one.
         frames: Number of cameras.

@@ -44,7 +44,7 @@ def _training_depths(model: FittedModel, views: bool | Sequence[View], options: 
 
 
 def _covered(image: np.ndarray, depth: torch.Tensor, camera: Camera, training: list[DepthView], cut_out: bool) -> bytes:
-    """Return the PNG of an image [H, W, 3] that marks regions seen by no training view, and by one."""
+    """Return the PNG of an image [H, W, 3] that marks regions that no training view saw, and regions that one view saw."""
     seen = coverage_map(depth, camera, training)
     classes = classes_of(seen, cut_out)
     return png(coverage_image(image, classes["0"], classes["1"]))
@@ -206,8 +206,8 @@ def render_path(
 
     Args:
         model: Result of `fit` or `open_run`.
-        path: views (every view of the scene); turntable, spiral or interpolate (through the training views); auto for the
-            choice by the positions of the training cameras; the name of a JSON file of keyframes; or your own cameras.
+        path: views (every view of the scene); turntable, spiral or interpolate (through the training views); auto (chosen by
+            the positions of the training cameras); the name of a JSON file of keyframes; or your own cameras.
         out: Folder to write, which may exist; or a film file (.mp4, .webm, .webp or .gif), to write only the film.
         units: Units of your own cameras: scene or file.
         frames: Number of frames; None for ``seconds`` times ``fps``. Ignored with your own cameras.

@@ -24,7 +24,7 @@ MAX_BYTES = 16 * 2**20
 MAX_SKEW = 1e-3
 """Largest entry of R R^T - I for the upper left 3 x 3 matrix R of a pose in a file."""
 MIN_SECONDS, MAX_SECONDS = 1e-3, 86400.0
-"""Least and largest time from one keyframe to the next [s]: slopes of the curve between them stay finite."""
+"""Least and largest time from one keyframe to the next [s]: slopes of the path stay finite."""
 MAX_REACH = 1e12
 """Largest coordinate of a camera centre in a file."""
 
@@ -46,7 +46,7 @@ def _fov_y(camera: Camera) -> float:
 
 
 def _row(keyframe: Keyframe) -> np.ndarray:
-    """Return the point looked at [u], unit quaternion wxyz of world_from_camera, vertical field of view [rad], reach: [9]."""
+    """Return a row [9]: point looked at [u], quaternion wxyz of world_from_camera, vertical field of view [rad], reach [u]."""
     camera = keyframe.camera
     rotation = torch.from_numpy(np.ascontiguousarray(camera.viewmat[:3, :3].T, dtype=np.float64))
     point = camera.center + keyframe.reach * camera.viewmat[2, :3]
@@ -56,8 +56,8 @@ def _row(keyframe: Keyframe) -> np.ndarray:
 def _spline(rows: np.ndarray, times: np.ndarray, at: np.ndarray, closed: bool) -> np.ndarray:
     """Return the values [F, 9] at times [F] of a smooth curve through rows [N, 9] at rising times [N].
 
-    Cubic Hermite pieces whose slopes are those of the parabola through each row and its two neighbours (Catmull and Rom 1974,
-    for uneven times). A closed curve's last row is its first one.
+    The pieces are cubic Hermite. The slope at each row is that of the parabola through this row and its two neighbours (Catmull
+    and Rom 1974, for uneven times). In a closed curve, the last row repeats the first.
     """
     steps = np.diff(times)
     slopes = np.diff(rows, axis=0) / steps[:, None]
@@ -89,8 +89,8 @@ def through(keyframes: list[Keyframe], frames: int, *, closed: bool = False) -> 
 
     Args:
         keyframes: At least one, at rising times; in a closed path the last keyframe repeats the first.
-        frames: Number of cameras; with two or more the first and the last are keyframes, but a closed path ends one frame
-            before it returns.
+        frames: Number of cameras. If there are two or more, the path starts at the first keyframe and ends at the last; a
+            closed path ends one frame before the last.
         closed: Whether the path goes through its end without a corner.
 
     Raises:
@@ -125,7 +125,7 @@ KEYFRAMES = schema.items(schema.fields({
 def read_keyframes(path: Path, template: Camera, normalization: Normalization) -> list[Keyframe]:
     """Read keyframes of a JSON file: a list of ``{"c2w": 4x4, "fov_y": radians, "seconds": time}``.
 
-    ``c2w`` is camera-to-world in OpenCV axes and in the units of the scene's files; ``seconds`` rise from one to the next.
+    ``c2w`` is camera-to-world in OpenCV axes and in the units of the scene's files; ``seconds`` rise from keyframe to keyframe.
 
     Args:
         path: The file.

@@ -29,7 +29,7 @@ SECONDS = 3.0
 VIEW_SECONDS, MAX_SECONDS = 0.5, 20.0
 """Duration of a film through training views [s]: per view, and at most in all."""
 MIN_FRAMES_PER_VIEW = 4
-"""Fewest frames from one training view to the next; a film with too few frames passes through some of the views only."""
+"""Fewest frames from one training view to the next; a film with too few frames skips some of the views."""
 MAX_FRAMES = 1_000_000
 WIDER = 1.02
 """A film counts as wider than the photographs if its field of view exceeds theirs by this factor."""
@@ -86,7 +86,7 @@ class FilmPlan:
     """The frames of a film before they are rendered."""
 
     cameras: list[tuple[str, Camera]]
-    """Stem of the file and camera of each frame, in scene units [u]."""
+    """File name without suffix, and camera, of each frame, in scene units [u]."""
     coverage: float
     """Fraction of a training view's pixels that the model covers; 0 if unknown."""
     remedy: str
@@ -170,7 +170,7 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
         return FilmPlan(_numbered(cameras), coverage, remedy, [words], nearer)
     notes = [f"{len(train)} {'training ' if model.test else ''}cameras {rig.describe()}"]
     if rig.turned:
-        notes.append("the photographs are rotated; the film is upright, by the common plane of the cameras")
+        notes.append("the photographs are rotated; the film takes its upward direction from the common plane of the cameras")
     kind = path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)

@@ -19,7 +19,8 @@ NAMES = {
 MIN_AGREEMENT = 0.8
 """Fraction of the cameras that must look at one point, or away from it."""
 MIN_COSINE = 0.8
-"""Cosine of the largest angle between a camera's axis and its subject, 37 degrees: about a corner of a photograph."""
+"""Cosine of the largest angle between a camera's axis and the direction to its subject: 37 degrees, about the corner of a
+photograph."""
 MIN_RING = math.radians(100)
 """Range of azimuths about a point below which cameras photographed it from one side."""
 MAX_GAP = math.radians(150)
@@ -27,13 +28,13 @@ MAX_GAP = math.radians(150)
 MIN_FORWARD = 0.5
 """Length of the mean viewing direction above which cameras without a common point look to one side."""
 MIN_UP = 0.5
-"""Length of the mean of the cameras' upward unit directions above which they agree."""
+"""Length of the mean of the cameras' upward unit directions above which the directions agree."""
 FLAT = 0.02
 """Largest variance of positions across the plane of cameras on a circle, as a fraction of the variance in the plane."""
 ROLLED = 0.05
-"""The limit `FLAT` for horizontal axes of level photographs: they lean by at most 13 degrees (root mean square)."""
+"""The limit `FLAT`, but for the horizontal axes of level photographs, which lean by at most 13 degrees (root mean square)."""
 MIN_SAME = math.cos(math.radians(15))
-"""Cosine of the largest angle between the normals of both planes for which they count as equal."""
+"""Cosine of the largest angle between the normals of two planes that count as equal."""
 MIN_SWING = math.radians(6)
 """Smallest range of azimuths of a film, for cameras above each other."""
 
@@ -80,7 +81,7 @@ class Rig:
         return self.kind in ("ring", "forward") and min(cosines) > MIN_COSINE
 
     def reach(self, camera: Camera) -> float:
-        """Return the distance along a camera's axis to its subject [u]; 0 if the rig has no such point."""
+        """Return the distance along a camera's axis to the rig's subject [u]; 0 if the cameras have no common subject."""
         if self.kind not in ("ring", "forward"):
             return 0.0
         return max(0.0, float(((self.center - camera.center) * camera.viewmat[2, :3]).sum()))

@@ -61,14 +61,14 @@ class Tour:
 def tour_of(cameras: list[Camera], reaches: list[float], seconds: float, most: int) -> Tour:
     """Return a path through training views at an even pace.
 
-    The order of their names is used if it is probably the order in which they were taken, that is, if this path is not much
-    longer than one from neighbour to neighbour. The path is closed if its ends are neighbours.
+    The views are passed in the order of their names if this path is not much longer than one from neighbour to neighbour: then
+    the names probably follow the order of capture. The path is closed if its ends are neighbours.
 
     Args:
         cameras: Cameras of the views by name, at least one; pinholes.
         reaches: Distance along each optical axis to the point that the camera looks at [u]; 0 if unknown.
         seconds: Duration of the path [s].
-        most: Largest number of views passed through; from more views, evenly spaced ones are taken.
+        most: Largest number of views on the path; if there are more, evenly spaced views are taken.
     """
     distances = _distances(cameras)
     named, near = list(range(len(cameras))), _neighbour_tour(distances)

@@ -16,7 +16,7 @@ from warpgs.scene import Camera, Gaussians
 
 TOLERANCE = 0.02
 """Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
-difference, the squared colour difference of two photographs is twice (3 dB) its value at the best agreement of depths (decision
+difference, the squared colour difference of two photographs is twice (3 dB) the value at the best agreement of depths (decision
 019)."""
 MIN_ALPHA = 0.5
 """Least opacity of a pixel that shows a surface; other pixels have no depth."""
@@ -47,9 +47,9 @@ class Match:
     v: torch.Tensor
     """Row in the other view [px]."""
     difference: torch.Tensor
-    """Difference between the point's depth in the other view and the nearest of the depths that the other view sees at the four
-    pixels around it, as a fraction of the depth. The four pixels are compared because depth varies within a pixel on a slanted
-    surface. Infinite outside of the other image, where that view sees no surface, and where the pixel itself shows none."""
+    """Smallest difference between the point's depth in the other view and the depths seen at the four pixels around the point,
+    as a fraction of the depth. Four pixels are compared because depth varies within a pixel on a slanted surface. Infinite
+    outside the other image, where the other view sees no surface, and where the pixel itself shows none."""
 
 
 @torch.no_grad()
@@ -164,7 +164,7 @@ class Coverage:
 
 
 def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView], tolerance: float = TOLERANCE) -> Coverage:
-    """Count at each pixel of a render the training views that saw the point it shows.
+    """Count, for each pixel of a render, the training views that saw the point at this pixel.
 
     A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind the surface (occluded)
     nor in front of it (the view looks through). Counts use the model's depth, so they are as accurate as the model's geometry.

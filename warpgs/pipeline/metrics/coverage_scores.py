@@ -32,10 +32,10 @@ PROBED = 6
 
 @torch.no_grad()
 def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
-    """Measure how much two training photographs of the same point differ in colour, as a function of their depth difference.
+    """Measure how much two training photographs of the same point differ in colour, as a function of the difference in depth.
 
     Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
-    result estimates the error of a pixel whose nearest training view has this depth difference. The estimate uses the data that
+    result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that
     the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
 
     Args:
@@ -141,7 +141,7 @@ def score_by_coverage(
 ) -> dict[str, Any]:
     """Split the scores of held-out views by the number of training views that see the point at each pixel.
 
-    Views of lenses are scored as a pinhole would show them.
+    Views with a lens model are scored as a pinhole would show them.
 
     Args:
         gaussians: N Gaussians in the units of the views' cameras.
@@ -184,7 +184,7 @@ def score_by_coverage(
 
 
 def _summary(rows: dict[str, dict[str, Any]]) -> str:
-    """Return the fraction of the pixels and of the error that no training view saw, as a sentence for the user."""
+    """Return a sentence for the user: the fraction of pixels that no training view saw, and the fraction of the error there."""
     unseen = rows.get("0")
     if unseen is None:
         return "every held-out pixel was seen by a training view"

@@ -29,7 +29,7 @@ ALPHA_VARIANTS = {
     "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
     "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
 }
-"""Definition of each score of views with an alpha channel. A mean is over the views that have such pixels."""
+"""Definition of each score of views with an alpha channel. A mean covers only the views with pixels for the score."""
 EMPTY, OPAQUE, OBJECT = 0.02, 0.5, 0.98
 """Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
 MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
@@ -55,7 +55,7 @@ class ViewMetrics:
     lpips: dict[str, float] = field(default_factory=dict)
     """LPIPS by variant (`lpips_vgg_legacy`); empty without weights, NaN if the image is too small."""
     opacity: dict[str, float] = field(default_factory=dict)
-    """Scores by the names of `ALPHA_VARIANTS`, NaN without such pixels; empty if the view is opaque."""
+    """Scores by the names of `ALPHA_VARIANTS`, NaN if the view has no such pixels; empty if the view is opaque."""
 
     def row(self) -> dict[str, Any]:
         """Return all scores by name, flat, as in result files."""

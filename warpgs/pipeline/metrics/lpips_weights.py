@@ -120,7 +120,7 @@ def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
 
 
 def _mapped(file: BinaryIO) -> str | BinaryIO:
-    """Return the path of an open archive under which torch can map it: then tensors use no memory before they are read.
+    """Return a path that lets torch map an open archive: then tensors use no memory before they are read.
 
     Return the file itself if the system has no such paths, or if torch would have to unpickle the tensors.
     """

@@ -20,7 +20,7 @@ MIN_RESIDUAL = 0.05
 MIN_FACTOR = 3.0
 """Least ratio of a differing pixel's residual to the residual of other views at the same point."""
 FLOOR = 0.005
-"""Lower bound, in [0, 1], of the residual of other views in that ratio."""
+"""Lower bound, in [0, 1], of the residual of other views in the ratio for `MIN_FACTOR`."""
 MIN_VIEWS = 2
 """Fewest other views that must show a point."""
 MIN_TRAINING = 6
@@ -105,7 +105,7 @@ def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[i
 
 
 def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
-    """Return for each training view the fraction of its pixels, in [0, 1], in regions that it shows differently from others.
+    """Return for each training view the fraction of its pixels, in [0, 1], in regions that other views show differently.
 
     A pixel is included if the view's residual is much larger than the residuals of other views at the same point, and at least
     two other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.

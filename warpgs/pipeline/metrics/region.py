@@ -24,8 +24,8 @@ def scored_region(view: View) -> tuple[np.ndarray | None, str]:
 def counted_region(view: View) -> tuple[np.ndarray | None, str]:
     """Return the pixels of a view that a fit compares with the render, bool [H, W], and their name; None for all.
 
-    These are the pixels of the view's mask, if any; else the bright pixels, if the view shows an object on black, because a
-    black frame around a small object would otherwise dominate the score.
+    These are the pixels of the view's mask, if any. Without a mask, they are the bright pixels of a view of an object on black,
+    because a black frame around a small object would dominate the score.
     """
     if view.mask is not None and not view.mask.all():
         return view.mask, "mask"

@@ -19,8 +19,8 @@ ROUNDS = 5
 PASSES = 8
 """Largest number of rounds of merging: up to 2^8 neighbours become one."""
 DEGREES_FRACTION, MERGE_FRACTION = 1 / 3, 2 / 3
-"""Fractions of the allowed loss that may be used up after degrees are lowered, and after neighbours are merged; removal may use
-up the rest."""
+"""Fractions of the allowed loss: the loss may reach the first after degrees are lowered, and the second after neighbours are
+merged. Removal may use up the rest."""
 RAMP = 3
 """Number of rounds over which the loss allowed for merging grows to its full value."""
 WORTHWHILE = 0.02
@@ -92,8 +92,8 @@ def with_degrees(gaussians: Gaussians, degrees: torch.Tensor) -> Gaussians:
 def degree_order(gaussians: Gaussians, seen: Coverage) -> torch.Tensor:
     """Return the rows of the Gaussians by ascending need for harmonics, int64 [N].
 
-    The need is the energy above degree 0 times the largest contribution: in an orthonormal basis the sum of squares is, up to a
-    constant, the variance of the colour over directions.
+    The need is the norm of the coefficients above degree 0, times the largest blending weight. In an orthonormal basis, this
+    norm is proportional to the standard deviation of the colour over directions.
     """
     return torch.argsort(gaussians.sh[:, 1:].square().sum((1, 2)).sqrt() * seen.maxima, stable=True)
 
@@ -105,7 +105,7 @@ def stored_degrees(sh: torch.Tensor) -> torch.Tensor:
 
 
 def drop_unused_sh(gaussians: Gaussians) -> Gaussians:
-    """Return the same Gaussians without degrees that no Gaussian uses; in a file all have the same number of coefficients."""
+    """Return the Gaussians without degrees that none of them uses; a file stores equally many coefficients for all."""
     degrees = stored_degrees(gaussians.sh)
     highest = int(degrees.max()) if len(degrees) else 0
     return Gaussians(**(gaussians.tensors() | {"sh": gaussians.sh[:, : (highest + 1) ** 2].contiguous()}))
@@ -118,7 +118,7 @@ class ViewSet:
     cameras: list[Camera]
     """Cameras with tensors on the device of the model."""
     options: RasterizeOptions
-    """Options for rendering them."""
+    """Options for rendering the views."""
     seed: int
     """Seed of the random signs of `fisher`."""
 
@@ -197,9 +197,9 @@ class Pruned:
     """A smaller model."""
 
     gaussians: Gaussians
-    """Sorted by degree, ascending."""
+    """Gaussians of the smaller model, by ascending degree."""
     degrees: torch.Tensor
-    """Degree of each, int32, shape [N], ascending."""
+    """Degree of each Gaussian, int32, shape [N], ascending."""
 
 
 def prune_model(

@@ -22,7 +22,8 @@ class Coverage:
     """Coverage of each Gaussian by all training views; tensors of shape [N] on the device of the Gaussians."""
 
     maxima: torch.Tensor
-    """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806; a sum is small for thin Gaussians)."""
+    """Largest blending weight over all pixels of all views (RadSplat, arXiv 2403.13806); a sum of weights would be small for
+    thin Gaussians."""
     views: torch.Tensor
     """Number of views with a weight of at least `SEEN`, int64."""
 
@@ -49,10 +50,10 @@ def coverage(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOpti
 def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions, seed: int) -> torch.Tensor:
     """Estimate the change of the images when a Gaussian moves by its own width or its axes grow.
 
-    The result is the trace of PUP-3DGS' sensitivity (arXiv 2406.10219, eq. 6: the sum over pixels of the outer product of the
-    colour's gradient with respect to mean and scale), in units of the Gaussian's width; PUP uses the log-determinant instead.
-    With random signs e as the gradient of an image, the backward pass gives J^T e; the mean of its square is the diagonal of
-    J^T J.
+    The result is the trace of PUP-3DGS' sensitivity, in units of the Gaussian's width (arXiv 2406.10219, eq. 6: the sum over
+    pixels of the outer product of the colour's gradient with respect to mean and scale). PUP uses the log-determinant instead.
+    With random signs e as the gradient of an image, the backward pass gives J^T e; the mean of the squares of J^T e is the
+    diagonal of J^T J.
 
     Args:
         gaussians: N Gaussians.

@@ -20,12 +20,13 @@ from warpgs.scene import Camera, PointCloud, View, ViewDepth
 NOTHING = PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
 """No points."""
 FREE_SPACE = 0.95
-"""A filled point occludes the surface of another view if its depth there is below this fraction of the view's depth."""
+"""A point that fills a gap occludes the surface of another view if the point's depth there is below this fraction of that
+view's depth."""
 NEAR_FRACTION, FAR_FRACTION = 1 / 1.3, 3.0
-"""Factors of the 2nd and of the 98th percentile of the depths of known points; the planes lie between the two products. Few
+"""Factors of the 2nd and the 98th percentile of known depths: the planes of a sweep lie between the two products. Few of the
 planes are at distant surfaces, many at near ones."""
 MIN_KNOWN = 10
-"""Fewest known points in a view that can bound its depths."""
+"""Fewest known points of a view from which its range of depths is taken."""
 
 
 def joined(clouds: Sequence[PointCloud]) -> PointCloud:
@@ -145,11 +146,11 @@ def coarse_points(
 
     Args:
         views: Training views.
-        depths: Geometrically consistent depth of each, confirmed by other views.
+        depths: Geometrically consistent depth of each view, confirmed by other views.
         merge_px: Width of the cells in which consistent points are merged into one [px]; 0 keeps every pixel.
-        fill_px: Width of the cells of filled points, where no depth is consistent [px]; 0 fills in none. Their depths come from
-            `complete`. No filled point is in space that another view sees through, or in the cell of a consistent point. Views
-            without estimated depth get none, so that the work for each view is bounded.
+        fill_px: Width of the cells of filled points, where no depth is consistent [px]; 0 for no filled points. `complete`
+            gives the depths of filled points. No filled point is in space that another view sees through, or in the cell of a
+            consistent point. Views without estimated depth get no filled points, to bound the work for each view.
         source: Name of the source in the notes, such as sweep or flow.
         known: Points of a reconstruction. A point is used if at least two of the views see it and no depth is consistent there;
             depth around such points is interpolated from them.
@@ -196,7 +197,7 @@ def coarse_points(
 def _elsewhere(
     points: np.ndarray, widths: np.ndarray, more: np.ndarray, colors: np.ndarray, more_widths: np.ndarray, cell: float
 ) -> tuple[PointCloud, np.ndarray]:
-    """Merge points ``more`` [M, 3] in cells without any of ``points`` [N, 3]; return them and a mask of those used, bool [M].
+    """Merge points ``more`` [M, 3] in cells without ``points`` [N, 3]; return the merged points and a mask of used ones [M].
 
     ``widths`` [N] and ``more_widths`` [M] are widths of a pixel at each point [u]; ``cell`` is the width of a cell [px].
     """

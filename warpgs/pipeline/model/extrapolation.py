@@ -29,8 +29,8 @@ REACH, BEHIND_PX, BEHIND_COLOR_PX = 24, 8, 3
 """Distance by which a far surface is continued behind a near one; width of its cells, one point each; and radius within which
 its colour is averaged [px]."""
 STEP, EDGE = 1.02, 1.15
-"""Ratios of depth: a surface ends between neighbouring pixels above the first; points are added if the ratio of the far to the
-near depth is above the second."""
+"""Ratios of the far to the near depth of two neighbouring pixels. Above the first ratio, a surface ends between them; above the
+second, points are added behind the near one."""
 SIDES = ((0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and direction of the four neighbours of a pixel."""
 
@@ -61,7 +61,7 @@ def all_count(views: Sequence[View]) -> bool:
 
 
 def _beyond(views: Sequence[View], i: int, depth: np.ndarray) -> PointCloud:
-    """Return points around view ``i`` that no image shows; its z-depth ``depth`` [u], shape [H, W], is known everywhere."""
+    """Return points around view ``i`` that no image shows; ``depth`` [H, W] is the view's z-depth [u], known everywhere."""
     view = views[i]
     height, width = depth.shape
     pad = int(BEYOND * width)

@@ -26,11 +26,11 @@ NEEDLE_LENGTH = 0.2
 hairs and edges of a good model. With a tenth instead, removal costs up to 0.08 dB on held-out views
 (docs/decisions/014-formats.md)."""
 MAX_BOX_BYTES = 65536
-"""Size of the largest file of a box that is read [bytes]."""
+"""Largest size of a file that describes a box [bytes]."""
 _NODES = ((0.0, 0.5688888888888889), (0.5384693101056831, 0.47862867049936647), (0.906179845938664, 0.23692688505618908))
 """Nodes and weights of the Gauss-Legendre rule with five points, the last two also mirrored: exact to degree 9."""
 _AZIMUTHS = 10
-"""Points of the rule around the axis, exact to order 9; products of harmonics of degree 4 have degree 8."""
+"""Number of azimuths of the quadrature rule, exact to order 9; products of harmonics of degree 4 have degree 8."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Box:
     size: tuple[float, float, float]
     """Full lengths of the sides [file units]."""
     rotation: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    """Columns: the directions of the sides in the world, shape [3, 3]."""
+    """Rotation matrix, shape [3, 3]; its columns are the directions of the sides in the world."""
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
@@ -64,7 +64,7 @@ def box_of(text: str) -> Box:
             by commas: the least x, y, z and the largest x, y, z.
 
     Raises:
-        DataError: The file cannot be read, or holds something else.
+        DataError: The file cannot be read, or does not describe a box.
         UsageError: The text is invalid, or a side is not longer than 0.
     """
     if text.lower().endswith(".json"):
@@ -72,7 +72,7 @@ def box_of(text: str) -> Box:
     try:
         value = json.loads(text if text.lstrip().startswith("{") else f"[{text}]")
     except (ValueError, RecursionError) as e:
-        forms = "six numbers with commas between, JSON with center and size, or a .json file"
+        forms = "six numbers separated by commas, JSON with center and size, or a .json file"
         raise UsageError(f"--crop {text[:60]}: give {forms}") from e
     if isinstance(value, list):
         low, high = _numbers(value, (6,), "a box").reshape(2, 3)

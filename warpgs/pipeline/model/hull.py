@@ -53,11 +53,11 @@ class Silhouette:
         """True if the object reaches the border of the image, so that it may extend beyond it."""
 
     def look(self, points: np.ndarray, radius: np.ndarray | float, pixels: float = 0.0) -> tuple[np.ndarray, ...]:
-        """Return three masks [N] for balls around points [N, 3]: all pixels are empty; all are opaque; the view may see them.
+        """Return three masks [N] for balls around points [N, 3]: all pixels empty; all pixels opaque; the ball in view.
 
         Args:
             points: Centres of the balls [u].
-            radius: Radius of each [u], shape [N], or of all.
+            radius: Radius of each ball, shape [N], or one radius for all [u].
             pixels: Distance that is added to each radius in the image [px].
         """
         at, z = geometry.project_points(self.view.camera, points)
@@ -130,7 +130,7 @@ def _surface(cells: np.ndarray, half: float, shapes: Sequence[Silhouette]) -> np
 
 
 def _seen_colors(shapes: Sequence[Silhouette], cells: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean colours [N, 3] of cells of that width [u] where they are seen, and the cells that are kept, bool [N].
+    """Return the mean colours [N, 3] in which views see cells of a ``width`` [u], and the cells that are kept, bool [N].
 
     A cell is kept if at least `LEAST_VIEWS` views see it at an opaque pixel, unoccluded by other cells, and in similar colours;
     other cells may be empty parts of the hull.

@@ -37,9 +37,9 @@ class InitConfig:
 
     source: str = "auto"
     """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
-    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep with given
-    depth or up to --init.sweep-up-to views; else points if the training views saw at least 100 of them; else random. If views
-    have an alpha channel, points in an empty area of a view are left out."""
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep if depth
+    is given, or for at most --init.sweep-up-to views; else points if the training views saw at least 100 points; else random.
+    If views have an alpha channel, points in an empty area of a view are left out."""
     sweep_up_to: int = 0
     """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
     random_count: int = 20_000
@@ -51,13 +51,14 @@ class InitConfig:
     near_views: int = 4
     """sweep, flow: number of other views with which each view is matched."""
     merge_px: float = 4.0
-    """sweep, flow: width of the cells in which consistent points are merged [px]; 0 keeps a point for every pixel."""
+    """sweep, flow: width of the cells in which points of confirmed depth are merged [px]; 0 keeps a point for every pixel."""
     fill_px: float = 16.0
-    """sweep, flow: cell width [px] for filling in points where depth is not consistent; 0 fills in none."""
+    """sweep, flow: cell width [px] for filling in points where other views do not confirm depth; 0 fills in none."""
     extrapolate: bool | None = False
     """sweep, flow: add extrapolated points where no view looks, beyond the images and behind depth edges
     (docs/decisions/026-extrapolated-points.md). In a fit with such points, opacity decay spares Gaussians that a step does not
-    use. No points are added if a view has a mask, an alpha channel or a black background. None: by the number of views."""
+    use. No points are added if a view has a mask, an alpha channel or a black background. None: chosen by the number of
+    views."""
     flow: str = "dis"
     """flow: source of optical flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
     flow_range: str = "255"
@@ -102,7 +103,7 @@ class Start(NamedTuple):
     depths: list[ViewDepth] | None = None
     """Geometrically consistent depth of each view; None if not computed."""
     extrapolated: int = 0
-    """Number of extrapolated points, where no view looks; they are the last ones."""
+    """Number of extrapolated points, where no view looks; they are the last points of the cloud."""
 
 
 def consistent_depths(
@@ -115,7 +116,7 @@ def consistent_depths(
         views: Training views.
         known: Points that bound the planes.
         config: Source and its settings.
-        device: Returns the device to sweep on, once it may be used.
+        device: Function that waits until the device to sweep on may be used, and returns it.
         progress: Called with a line for the user about the current work.
     """
     if config.source == "flow":
@@ -158,7 +159,7 @@ def consistent_points(
 
 
 def _number_extrapolated(views: list[View], count: int) -> str:
-    """Return how many points are extrapolated, for the user, and why there are none."""
+    """Describe, for the user, how many points are extrapolated, or why there are none."""
     if count:
         return f"{count:,} extrapolated where no view looks"
     hidden = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of the views"
@@ -225,7 +226,8 @@ def initial_points(
 ) -> Start:  # fmt: skip
     """Return the points to start from.
 
-    ``device`` returns the device to sweep on, once it may be used; ``progress`` is called with lines about the current work.
+    ``device`` waits until the device to sweep on may be used, and returns it; ``progress`` is called with lines about the
+    current work.
 
     Raises:
         DataError: The training views saw no points, and ``config`` needs them; or masks leave no pixel for a random start.
@@ -290,7 +292,7 @@ def initial_gaussians(
         sh_degree: Degree of the spherical harmonics, 0 to 4.
         extent: Size of the scene [u]; the distances are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
         device: Device of the tensors, float32.
-        extrapolated: Number of points, the last ones, that start with `EXTRAPOLATED_OPACITY`.
+        extrapolated: Number of extrapolated points, which are the last of the cloud and start with `EXTRAPOLATED_OPACITY`.
 
     Returns:
         The Gaussians.

@@ -74,11 +74,12 @@ def _curve(means: torch.Tensor, shift: float) -> torch.Tensor:
 def merges(gaussians: Gaussians, maxima: torch.Tensor, kinds: torch.Tensor, odd: bool, shift: float = 0.0) -> Merges:
     """Pair neighbours along the Morton curve, and compute the merged Gaussian of each pair.
 
-    Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. The new opacity times area is
-    the area that the pair covers face on, with the overlap counted once. If this needs an opacity above `OPAQUE`, the two
-    longer axes grow instead: otherwise a surface of opaque Gaussians would get holes. The cost of a pair is its largest
-    blending weight times the sum of three terms: the difference of the colours; the logarithm of new over old covered area,
-    since distant pairs or pairs of different planes bulge; and the logarithm of the area by which the axes had to grow.
+    Mean, covariance and colours are those of the mixture, weighted by opacity times face-on area. The product of the new
+    opacity and the new area is the area that the pair covers face on; the overlap counts once. If this needs an opacity above
+    `OPAQUE`, the two longer axes grow instead: otherwise a surface of opaque Gaussians would get holes. The cost of a pair is
+    its largest blending weight times the sum of three terms. They are the difference of the colours; the logarithm of new over
+    old covered area, since distant pairs or pairs of different planes bulge; and the logarithm of the factor by which the area
+    had to grow.
 
     Args:
         gaussians: N Gaussians.

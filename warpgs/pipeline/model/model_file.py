@@ -48,7 +48,7 @@ class FittedModel(Model):
     test: tuple[str, ...]
     """Names of the views held out."""
     rule: str
-    """Cut-offs of the rasterizer that the fit used."""
+    """Name of the rasterizer's cut-offs in the fit, such as exact."""
     background: tuple[float, float, float]
     """Colour behind the scene."""
     step: int

@@ -14,7 +14,7 @@ from warpgs.scene import PointCloud, View
 OBJECTS = ("foreground", "object")
 """Names of the regions of an object (`fitted_region`): object on black, and object that an alpha channel cuts out."""
 MIN_MATCHES = 10
-"""Fewest matched points of a view for its random points to take their depths from them."""
+"""Fewest matched points of a view that give depths to its random points."""
 NEIGHBORS = 5
 """Number of nearest matched points from which a random pixel takes its depth."""
 PAIRS = 2**20

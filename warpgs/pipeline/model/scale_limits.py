@@ -115,7 +115,7 @@ class LimitConfig:
 
 
 class TrainingCameras(NamedTuple):
-    """Training cameras, as limits of sizes refer to them."""
+    """Tensors of the training cameras, for limits of sizes."""
 
     centers: torch.Tensor
     """Result of `camera_centers`, shape [K, 3]."""
@@ -132,8 +132,8 @@ class TrainingCameras(NamedTuple):
 def _camera_row(camera: Camera) -> np.ndarray:
     """Return a camera as `pixel_size` takes it, shape [9]; its cone holds eight points of the border of the image.
 
-    If a lens does not reach one of these points, the cone is all that the model can see. For a model without centre, pixels
-    have size 0 and limit nothing.
+    If the lens does not reach one of these points, the cone is the whole field of view of the lens. For a camera model without
+    a centre, pixels have size 0 and limit nothing.
     """
     f, center = np.array([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
     ends = np.array([(x, y) for x in (0, 0.5, 1) for y in (0, 0.5, 1) if (x, y) != (0.5, 0.5)])
@@ -179,17 +179,17 @@ def shape_figures(
 
     Args:
         gaussians: N Gaussians.
-        config: Limits; no Gaussian counts as beyond a limit that is 0.
+        config: Limits; a limit of 0 is never exceeded.
         radius: Result of `scene_radius` [u].
         extent: Result of `scene_extent` [u].
         cameras: Training cameras, at least one.
 
     Returns:
-        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], absolute, over the radius and over the extent,
-        and the largest ratio to the distance of the nearest camera, of those that `camera_centers` chooses; ``needles``, the
-        fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one; ``needles_by_opacity``, the same
-        weighted by opacity; ``thin``, the fraction whose longest axis is more than `NEEDLE` times the shortest; and the number
-        of Gaussians ``beyond`` the limits.
+        ``radius`` and ``extent`` [u]; the ``largest`` standard deviation [u], and its ratios to the radius and to the extent;
+        the largest ratio of a standard deviation to the distance of the nearest camera, among the cameras that `camera_centers`
+        chooses; ``needles``, the fraction of Gaussians whose longest axis is more than `NEEDLE` times the middle one;
+        ``needles_by_opacity``, this fraction weighted by opacity; ``thin``, the fraction whose longest axis is more than
+        `NEEDLE` times the shortest; and the number of Gaussians ``beyond`` the limits.
     """
     scales = gaussians.log_scales.detach().cpu().double()
     longest, middle = long_axes(scales)

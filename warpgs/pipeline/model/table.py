@@ -40,9 +40,10 @@ class DensityUpdate:
     added: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """New rows of each parameter, shape [A, ...]; their moments start at zero. Empty if no row is added."""
     parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
-    """Parent of each new row, by its index before the change, -1 without a parent, int64, shape [A]."""
+    """Index, before the change, of the parent of each new row, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
-    """Value by column, for new rows without a parent and for columns that are not inherited; default: the column's ``fill``."""
+    """Initial values by column, by default the column's ``fill``. New rows take them if they have no parent, or if the column
+    is not inherited."""
     overwritten: torch.Tensor | None = None
     """Indices, before the change, of the rows to overwrite: parameters are replaced, and moments restart at zero. Int64, shape
     [R]; None to overwrite no row."""
@@ -76,7 +77,7 @@ class Table:
         self.add_columns(columns)
 
     def add_columns(self, columns: Mapping[str, Column]) -> None:
-        """Add columns by name, filled."""
+        """Add columns by name, with their initial values."""
         self.kinds |= columns
         self.columns |= {n: torch.full((self.count,), c.fill, dtype=c.dtype, device=self.device) for n, c in columns.items()}
 
@@ -99,7 +100,7 @@ class Table:
         return 3 * self.row_bytes + sum(c.element_size() for c in self.columns.values())
 
     def growth_bytes(self, before: int, after: int) -> int:
-        """Return the bytes needed to add rows: the new rows, one tensor before and after, and indices of rows and parents."""
+        """Return the bytes needed to add rows: the new rows, one tensor before and after the change, and indices."""
         added = min(2 * (after - before), after)  # a split replaces one row by two
         largest = max(t.element_size() * t[0].numel() for t in self.params.values())
         return self.row_bytes * added + largest * (before + after) + 8 * after
@@ -142,7 +143,7 @@ class Table:
             skip: 0, or the reason for skipping the step, int32, shape [1].
             factors: Factor of the step of each mean, shape [N]; None for 1. Steps are scaled, not gradients, because Adam's
                 step does not depend on the scale of the gradient.
-            rows: Rows to update; all rows if factors are given.
+            rows: Rows to update; with ``factors``, it must be all rows.
         """
         assert factors is None or rows == slice(None)
         before = None if factors is None else self.params["means"].detach().clone()

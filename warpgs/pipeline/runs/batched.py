@@ -37,7 +37,7 @@ def check_batched(
     path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
     if path is not None and not resume and needs_poses(path):
         raise UsageError(
-            f"{path}: has no cameras, and each of {ranks.count} ranks finds its own poses; run `warpgs poses {path} --out "
+            f"{path}: has no cameras, and each of {ranks.count} ranks would find its own poses; run `warpgs poses {path} --out "
             "SCENE` first, and fit SCENE"
         )
     if time_budget is not None:
@@ -47,7 +47,7 @@ def check_batched(
 
 
 def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
-    """Check that all processes fit the same scene with the same settings: each takes its own part of the same steps.
+    """Check that all processes fit the same scene with the same settings, because each takes a part of the same steps.
 
     Args:
         record: Record of the run, as this process has it.
@@ -85,7 +85,7 @@ def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
     if ranks.count > 1:
         counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
         notes.append(
-            f"ranks: {ranks.count} processes ({ranks.backend}), each renders {' or '.join(map(str, counts))} views of a step; "
+            f"ranks: {ranks.count} processes ({ranks.backend}); each renders {' or '.join(map(str, counts))} views of a step; "
             "the model has the same bits for any number of ranks"
         )
     return notes

@@ -137,7 +137,7 @@ def render(
         coverage: True to also write images of the coverage by training views.
         sheet: Whether to write six frames in one image, too.
         file_of: Cameras and rule of a file of Gaussians, as `open_file` takes them; None for a run.
-        antialiased: Whether that file was trained with antialiasing.
+        antialiased: Whether the Gaussians of that file were trained with antialiasing.
 
     Raises:
         DataError: The folder is not a run, or the file, its cameras or the keyframes cannot be read.

@@ -20,8 +20,8 @@ from warpgs.scene import Gaussians, View
 FOLDER = "coverage"
 """Folder in a run folder with an image of each held-out view."""
 EXPECTED = (
-    "The expected PSNR is the PSNR between training photographs at points with the same depth difference: an estimate from "
-    "training data, not a bound."
+    "The expected PSNR is an estimate from training data, not a bound. It is the PSNR between training photographs where the "
+    "depths of two views differ as much as at the scored pixels."
 )
 """Meaning of the expected PSNR, as text for the user."""
 

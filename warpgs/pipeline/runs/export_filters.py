@@ -59,7 +59,7 @@ def filtered(
     keep, lines = torch.ones(len(gaussians), dtype=torch.bool), []
     if filters.crop is not None:
         keep = inside(gaussians, box_of(filters.crop))
-        lines.append(f"{int((~keep).sum()):,} Gaussians are outside the box")
+        lines.append(f"{int((~keep).sum()):,} Gaussians outside the box are left out")
     if cleaned if filters.clean is None else filters.clean:
         removed = disturbing(gaussians, None if stored is None else _maxima(stored))
         counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}

@@ -1,4 +1,4 @@
-"""Export of a model, from a run or a file, filtered, in any format, and of its cameras."""
+"""Export of a model or of its cameras, from a run or a file, filtered, in any format."""
 
 from __future__ import annotations
 
@@ -156,4 +156,4 @@ def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, f
         lines += write_cameras(target, cameras)
     sizes = sorted({(c.width, c.height) for c in cameras})
     some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
-    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}, named by numbers"]
+    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}; their names are numbers"]

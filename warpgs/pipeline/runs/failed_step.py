@@ -26,7 +26,7 @@ FILE = "not_finite.safetensors"
 """Name of the file in a run folder."""
 
 Bundle = tuple[dict[str, torch.Tensor], dict[str, Any]]
-"""Tensors and plain values of such a step."""
+"""Tensors and plain values of a step with a non-finite loss."""
 
 
 def failed_step(trainer: Trainer, view: int, name: str, slot: int = 0) -> Bundle:

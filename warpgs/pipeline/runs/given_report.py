@@ -23,13 +23,13 @@ DEPTH, NORMALS = "given_depth", "given_normals"
 def given_figures(
     train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
 ) -> dict[str, Any]:
-    """Return the comparison of the model with each kind of given map: a row for each view that has one, and a summary.
+    """Return the comparison of the model with each kind of given map: a row for each view with such a map, and a summary.
 
     Args:
         train: The views to fit.
         views: The same views, with the maps of the loss terms.
         gaussians: The fitted model.
-        options: Options for rendering it.
+        options: Options for rendering the model.
 
     Returns:
         For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a

@@ -97,7 +97,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
 
 @dataclass(frozen=True)
 class Precompiled:
-    """One module on one device."""
+    """One module of kernels, loaded on one device."""
 
     device: str
     """cpu, or the name of the CUDA device."""

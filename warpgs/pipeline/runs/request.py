@@ -18,8 +18,8 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.scene import Scene
 
 CPU_MAX_SIDE = 800
-"""Default of the longest side of an image [px] for a fit on a CPU: four times as many steps fit into the time limit, and
-held-out PSNR at full size rises (decision 018)."""
+"""Default of the longest side of an image [px] for a fit on a CPU. Compared with 1600 px, four times as many steps fit into the
+time limit, and held-out PSNR at full size rises (decision 018)."""
 NO_SCORES = "no photograph is held out, so new views get no score; hold some out with --split every:8"
 """Note on a fit without held-out views."""
 
@@ -59,16 +59,16 @@ class SceneRequest:
     lens). Fisheyes need native."""
     depths: str | None = None
     """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
-    Default: the maps named in transforms.json; give none to ignore them."""
+    Default: the maps that transforms.json names; with the value none, these maps are ignored."""
     normals: str | None = None
-    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, as for --depths."""
+    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
     depth_kind: str = "metric"
     """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
     disparity (inverse lengths of unknown scale and shift, as networks give)."""
     depth_unit: float | None = None
     """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
     normal_axes: str = "opencv"
-    """Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera."""
+    """Camera axes of the normals: opencv (y down, z forward) or opengl (y up, z back)."""
     matcher: str | None = None
     """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
@@ -108,7 +108,7 @@ def check_overrides(overrides: Mapping[str, object]) -> None:
         UsageError: A keyword is an option of `load_scene`.
     """
     for name in overrides.keys() & {f.name for f in fields(SceneRequest)}:
-        raise UsageError(f"warpgs.fit: {name} is an option of reading a scene; give it to load_scene, and fit that scene")
+        raise UsageError(f"warpgs.fit: {name} is an option for reading a scene; pass it to load_scene, and fit the result")
 
 
 def choose_device(name: str | torch.device) -> tuple[torch.device, str]:

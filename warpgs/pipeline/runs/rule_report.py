@@ -77,8 +77,8 @@ def rule_report_of(
 
     Returns:
         ``max``, ``mean`` and ``psnr`` [dB] (None if infinite) of the error of colours in [0, 1] over all parts; ``views`` by
-        name with their windows; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``; and
-        ``summary``, the same figures as a sentence.
+        name with their compared parts; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``;
+        and ``summary``, the same figures as a sentence.
     """
     generator = np.random.default_rng(seed)
     chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
@@ -108,7 +108,7 @@ def rule_report_of(
 
 
 def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], exact: RasterizeOptions) -> torch.Tensor:
-    """Return the image of a window under `exact` in float64; by the kernels for camera models that the reference lacks."""
+    """Return a part of an image under `exact` in float64; by the kernels for camera models that the reference lacks."""
     if camera.model in MODELS:
         with _one_thread():
             return reference_image(part, camera, window, exact.background, part.sh_degree, exact.antialiased)

@@ -110,9 +110,9 @@ def _on_host(sampled: SampledView) -> SampledView:
 def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
     """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
 
-    A separate thread writes the images. The end of the block waits for them, and so does the yielded function. Call it before a
-    checkpoint, since a fit that continues from a checkpoint does not write earlier images. If an image cannot be written, the
-    fit continues, with one message in ``fit.messages``.
+    A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call this
+    function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an image
+    cannot be written, the fit continues, with one message in ``fit.messages``.
 
     Args:
         fit: The fit, before its first step.
@@ -166,8 +166,8 @@ def event_figures(fit: Trainer) -> dict[str, Any]:
     """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
 
     Returns:
-        ``events``: number of events, of Gaussians added and evicted, of samplings (views over all events), and of samplings
-        with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
+        ``events``: numbers of events, of Gaussians added and evicted, of samplings (one for each view of an event), and of
+        samplings with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
     """
     asked = fit.config.method.asked_quantile
     layered = isinstance(fit.strategy, ImportanceSampling)

@@ -118,7 +118,7 @@ def check_record(record: Any) -> None:
 
 
 MODEL_STATE = fields({"step": whole(0)}, {"cameras": mapping(_CAMERA, _view_name)})
-"""Schema of the plain values in a checkpoint that a model is read from."""
+"""Schema of a checkpoint's plain values from which a model is read."""
 _SHAPE = fields(
     {n: number(0) for n in ("largest", "largest_over_radius", "largest_over_extent", "largest_over_distance")}
     | {n: number(0) for n in ("needles", "needles_by_opacity", "thin")}

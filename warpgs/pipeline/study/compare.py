@@ -38,9 +38,9 @@ ABLATION_ROWS: dict[str, dict[str, bool] | None] = {
     **{f"with {name}": {name: True} for name in SWITCHES},
     PAPER: None,
 }
-"""Switches that each row of the ablation changes in the preset. The rows: no change; pixels sampled uniformly; by the residual;
-by the residual and one more score at a time; each enabled part switched off alone; each disabled part switched on alone.
-`PAPER` is a preset of its own. A row that equals an earlier one is left out."""
+"""Switches that each row of the ablation changes in the preset. The rows: no change; pixels sampled uniformly; pixels sampled
+by the residual; by the residual and one more score at a time; each enabled part switched off alone; each disabled part switched
+on alone. `PAPER` is a preset of its own. A row that equals an earlier one is left out."""
 
 
 def preset_variants(names: list[str], steps: int | None) -> dict[str, FitConfig]:

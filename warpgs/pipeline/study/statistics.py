@@ -29,7 +29,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean of paired differences, and an interval for its true value, for normally distributed differences."""
+    """Mean of paired differences, and an interval for its true value; the differences are taken as normally distributed."""
 
     mean: float
     """Mean difference; NaN without pairs."""

@@ -71,7 +71,7 @@ class StudyRequest:
             raise UsageError("name at least one scene folder")
         if len(set(names)) < len(names):
             raise UsageError(
-                f"two scene folders have the same name ({', '.join(names)}), which names their results; rename one"
+                f"two scene folders have the same name ({', '.join(names)}), but it names their results; rename one"
             )
 
 
@@ -141,7 +141,7 @@ def _same_files(request: StudyRequest, runs: Runs, scenes: list[str], variant: s
 
 
 def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[Metric, ...], caption: str) -> Table:
-    """Return the means of all variants over scenes and seeds, and their differences to the first."""
+    """Return the means of all variants over scenes and seeds, and their differences to the first variant."""
     base = next(iter(request.variants))
     confidence, rows = family_confidence(len(request.variants) - 1), []
     for name in request.variants:
@@ -174,7 +174,7 @@ def _plot(request: StudyRequest, runs: Runs, scenes: list[str], table: Table) ->
 
 
 def _figure(request: StudyRequest, runs: Runs, places: list[Place], device: torch.device) -> tuple[bytes | None, str]:
-    """Return the figure (PNG) of the first seed with every run, or None, and a note."""
+    """Return the figure (PNG) of the first seed for which all runs succeeded, or None, and a note."""
     whole = [s for s in range(request.seeds) if all(runs[p.name, v, s].metrics for p in places for v in request.variants)]
     if not whole:
         return None, "no figure: no seed succeeded in every row"

@@ -1,4 +1,4 @@
-"""Colour behind a scene: from its files, the mean of its photographs, or the user's choice; and random colours behind steps."""
+"""Colour behind a scene: from its files, the mean of its photographs, or the user's choice; and random colours in training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHOSEN = ("auto", "mean", "scene")
 BEHIND = 0x62616B67
 """Seed component that makes random backgrounds independent of other random numbers of a fit."""
 LEVELS = 2**16 - 1
-"""Levels that colours are rounded to before they are added: sums of integers are exact in any order."""
+"""Number of levels to which colours are rounded before they are added: sums of integers are exact in any order."""
 
 
 def color_of(text: str) -> Color | None:

@@ -1,6 +1,6 @@
-"""Steps of several views: each view has a slot for its gradients, and one update uses their mean, added in a fixed order.
+"""Steps of several views: each view has a slot for its gradients; one update uses the mean over slots, in a fixed order.
 
-Slots are distributed over the processes of a fit. Every process does the remaining work of a step, with the same bits. On CUDA
+Slots are distributed over the processes of a fit. Every process does the rest of a step itself, with the same bits. On CUDA
 several steps are taken before their results are read, so that Python prepares a step while the device works on the previous
 one.
 """
@@ -31,8 +31,8 @@ from warpgs.render.options import RasterizeOptions
 from warpgs.runtime.cuda_graph import CapturedGraph
 
 STOP, FLAGS = 2, 3
-"""Indices in the last summed tensor, after loss and squared error: the number of processes that were asked to stop, and the
-first slot's reason to stop the step."""
+"""Indices in the last summed tensor, which begins with loss and squared error: the number of processes that were asked to stop,
+and the first slot's reason to stop the step."""
 
 
 class SumUpdate:
@@ -51,8 +51,8 @@ class SumUpdate:
             sums: Means of gradients, and sums of statistics and of the slots' losses and flags.
             names: Names of the statistics.
             large: Parameter whose rows the sums may divide among processes.
-            said: Sums of losses and flags in the last step, or in the step that a slot stopped, [`FLAGS` + B]; the update sets
-                it.
+            said: Sums of losses and flags in the last step, or in the step that a slot stopped, [`FLAGS` + B]; written by the
+                update.
         """
         self.learned, self.plan, self.buffers, self.sums, self.large, self.said = learned, plan, buffers, sums, large, said
         parts = sums.parts()
@@ -82,7 +82,7 @@ class SumUpdate:
 
     @torch.no_grad()
     def _common(self, names: list[str]) -> None:
-        """Update the rows that every process updates: all rows of these parameters, and undivided rows of the large one."""
+        """Update what every process updates: all rows of these parameters, and undivided rows of the large parameter."""
         self._begin()
         self._descend(names)
         self._descend([self.large], slice(self.sums.divided, None))
@@ -157,11 +157,11 @@ class BatchSteps:
         """Take the steps of `buffers`, with their learning rates and settings.
 
         Args:
-            places: Kind and row of the view of each slot, of all processes, step by step.
+            places: Kind and row of each slot's view, for the slots of all processes, step by step.
             settings: Settings of each slot, as `StepBuffers` takes them.
             stacks: Views by kind.
             plan: Fixed choices of the steps.
-            max_instances: Instances that a view may have at a time; None for no limit.
+            max_instances: Largest number of (Gaussian, tile) instances of a view at a time; None for no limit.
             captured: Whether CUDA graphs are used.
 
         Raises:
@@ -200,7 +200,7 @@ class BatchSteps:
     def _works(
         self, kinds: list[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None, captured: bool
     ) -> list[Callable[[], ViewGradients]]:
-        """Return each slot's function for its gradients; ``kinds`` are the kinds of the views of this process's slots."""
+        """Return each slot's function for its gradients; ``kinds`` lists the kinds of view for this process's slots."""
         if captured and self._graphs is not None:
             return [_replayed(graph) for graph in self._graphs.capture_all(kinds, stacks, plan, max_instances)]
         render = eager_renderer(self.options, max_instances)
@@ -208,7 +208,7 @@ class BatchSteps:
 
     @torch.no_grad()
     def _add(self, slot: int, place: int, found: ViewGradients, parts: list[torch.Tensor], adds: bool) -> None:
-        """Add the contribution of a slot to the parts of a sum, or overwrite them with it; ``place`` is as in `_found`."""
+        """Add the contribution of a slot to the parts of a sum, or overwrite the parts; ``place`` is as in `_found`."""
         said = parts[-1]
         if not adds:
             said.zero_()

@@ -15,13 +15,14 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
 MIN_STEPS, OPAQUE_STEPS = 3000, 4500
-"""Steps of a fit of up to `FEW` views: with an alpha channel, and of opaque views."""
+"""Steps of a fit of up to `FEW` views: first for views with an alpha channel, then for opaque views."""
 FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
 """Number of views above which steps exceed `MIN_STEPS`; exponent of this growth; and largest number of steps."""
 SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
 """Learning rate of the log scales for up to `SCALES_VIEWS` views, and exponent with which it falls for more views."""
 OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
-"""Learning rate of the opacities for 3 views, which rises with the square root of their number, and its largest value."""
+"""Learning rate of the opacities for 3 views, which rises with the square root of the number of views; and its largest
+value."""
 HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
 """Fraction of the steps at half size for up to `HALF_VIEWS` views; for more views it is inversely proportional to their
 number."""
@@ -32,22 +33,23 @@ OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
 """Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
 were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
 SMOOTH_WEIGHT, ALPHA_SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 0.5, 4, 3000
-"""Weight of the roughness of rendered depth for opaque views and for views with alpha; and the largest number of views and the
-least number of steps with this term. The term lowers PSNR with 9 views, and does not help in 480 steps
+"""Weights of the roughness of rendered depth, for opaque views and for views with alpha; and the largest number of views and
+the least number of steps with this term. The term lowers PSNR with 9 views, and does not help in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
-of opacities with such points. Neither was measured in other fits (docs/decisions/026-extrapolated-points.md)."""
+of opacities with such points. Fits with more views or fewer steps were not measured
+(docs/decisions/026-extrapolated-points.md)."""
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
 CPU_PIXELS = 1.55e6
-"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians up to three
-times as many."""
+"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians, up to three
+times as many pixels."""
 CPU_SECONDS = 45.0, 4.0, 1200.0
 """Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
 ONE_LAYER = 1.1
-"""Time of a step on a CPU with one layer, relative to a step with two layers, which have fewer Gaussians."""
+"""Time of a step on a CPU with one layer of Gaussians, relative to a step with two layers, where there are fewer Gaussians."""
 MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
 """Learning rates of the means and of the constant colour; and the factor of both if the time limit on a CPU shortens the fit
 and there are more than `CPU_RATES_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
@@ -74,12 +76,12 @@ def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
 
 
 def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
-    """Return the steps that fit into the time of a CPU, and a sentence for the user, which is empty if all steps fit.
+    """Return how many steps fit into the time limit on a CPU, and a sentence for the user; it is empty if all steps fit.
 
     Args:
         wanted: Steps of the fit without a limit.
         views: Number of training views.
-        pixels: Pixels that those steps render, weighted by the time for a pixel.
+        pixels: Pixels that the wanted steps render, weighted by the time for a pixel.
     """
     seconds, most = pixels / CPU_PIXELS, cpu_seconds(views)
     if seconds <= most:
@@ -156,7 +158,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
 
 
 def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
-    """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` are the steps without a limit."""
+    """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` is the unlimited number of steps."""
     optimizer, half = made.optimizer, made.half_resolution
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {

@@ -37,15 +37,15 @@ class FitConfig:
     """Preset that the other settings start from: a name, a .toml file of settings, or your own FitConfig or mapping as
     module:NAME or path/to/file.py:NAME."""
     steps: int | None = 7000
-    """Number of optimisation steps; early stopping may end the fit sooner. None: by the number of views."""
+    """Number of optimisation steps; early stopping may end the fit sooner. None: chosen by the number of views."""
     max_steps: int = 30_000
     """Largest number of steps that is chosen by the number of views."""
     batch: int = 1
     """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
     this number (docs/many-gpus.md). Several GPUs share the views of a step."""
     cpu_limit: bool = True
-    """Limit the steps on a CPU, if --steps is None, to those that two cores finish in 1 to 20 minutes, depending on the number
-    of views."""
+    """Limit the steps on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending on the
+    number of views."""
     seed: int = 0
     """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
     rule: str = "exact"
@@ -55,10 +55,10 @@ class FitConfig:
     pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run
     are antialiased, too; other programs need their antialiased mode."""
     half_resolution: float | None = 0.0
-    """Fraction of the steps, from the first step on, that use views of half size (docs/trade.md). None: by the number of
+    """Fraction of the steps, from the first step on, that use views of half size (docs/trade.md). None: chosen by the number of
     views."""
     sh_degree: int | None = 3
-    """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: by the number of
+    """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: chosen by the number of
     views."""
     sh_every: int = 1000
     """Number of steps after which the spherical-harmonics degree rises by one."""

@@ -39,7 +39,7 @@ class Growth(NamedTuple):
     """Step after which no Gaussians are added."""
     events: tuple[int, ...] = ()
     """Steps, ascending, at which many Gaussians are added at once. Early stopping measures the model right before them. Empty
-    if it may measure at any step."""
+    if early stopping may measure at any step."""
 
 
 @dataclass

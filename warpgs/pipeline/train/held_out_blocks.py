@@ -1,6 +1,6 @@
-"""Held-out blocks of pixels, and the gain on them with its noise, which end a fit early (docs/decisions/020).
+"""Held-out blocks of pixels; the gain on these blocks, compared with its noise, ends a fit early (docs/decisions/020).
 
-VGNC (arXiv 2504.14548) chooses the size of a model by held-out views from a generative model; here pixels are held out instead.
+VGNC (arXiv 2504.14548) chooses the number of Gaussians by validation views from a generative network; here pixels are held out.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def block_errors(
 
 
 def decibels(errors: torch.Tensor) -> float:
-    """Return the PSNR of the mean of block errors [B], with the floor [dB]; NaN without blocks."""
+    """Return the PSNR [dB] of the mean of block errors [B], including the error floor; NaN without blocks."""
     return psnr_of(float(errors.mean()) + FLOOR) if len(errors) else math.nan
 
 

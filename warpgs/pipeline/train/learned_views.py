@@ -14,7 +14,7 @@ from warpgs.scene import Camera, View
 
 
 def seen(modules: Sequence[ViewModule], rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
-    """Apply view modules to rendered colours [H, W, 3]; ``values`` are their parameters for the view by name, shape [...]."""
+    """Apply view modules to rendered colours [H, W, 3]; ``values`` are the modules' values for the view, by name, [...]."""
     for module in modules:
         rgb = module.after_render(rgb, values)
     return rgb

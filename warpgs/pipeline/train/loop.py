@@ -1,4 +1,4 @@
-"""The loop around the training steps: reports, checkpoints, stops, and a second try after out of memory."""
+"""The loop around the training steps: reports, checkpoints, stops, and a second try of a step that runs out of memory."""
 
 from __future__ import annotations
 

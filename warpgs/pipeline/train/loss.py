@@ -63,7 +63,7 @@ class LossInputs:
     tensors. If poses are refined, this is the refined pose of the step, and it is differentiable."""
     step: torch.Tensor
     """Number of the step, from 1: an integer as float32, shape []. It is a tensor, because a captured step is replayed
-    for later steps; `LossTerm.active` has the number on the host."""
+    for later steps; `LossTerm.active` gets the number on the host."""
 
     def of(self, term: LossTerm) -> LossInputs:
         """Return the inputs of one term, with only the outputs that it needs."""
@@ -134,7 +134,7 @@ def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
 def total(values: torch.Tensor) -> torch.Tensor:
     """Return the sum of values [H, ...], shape [], with the same bits for any number of CPU threads.
 
-    On a CPU torch's sum of a whole tensor depends on that number, so rows are summed first.
+    On a CPU, torch's sum of a whole tensor depends on the number of threads, so rows are summed first.
     """
     return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
 

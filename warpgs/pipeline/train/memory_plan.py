@@ -1,9 +1,10 @@
 """Memory that a fit needs, as the sum of the needs that its parts declare, and the means to keep to a limit.
 
 A step needs the memory of the parameters and Adam's state, plus the memory of its heaviest moment, such as blending or the
-loss. Each part declares its bytes beside its allocations: kernels, loss terms, view modules and the strategy by moment of a
-step (`StepSizes`), the table by row. The CUDA driver, Python and the compiled kernels need additional memory. Small parts are
-not counted: parameters of single views, and the buffers of learning rates and losses (`StepBuffers`).
+loss. Each part declares its bytes in the code beside its allocations. Kernels, loss terms, view modules and the strategy
+declare bytes for each moment of a step (`StepSizes`); the table declares bytes for each row. The CUDA driver, Python and the
+compiled kernels need additional memory. Small parts are not counted: parameters of single views, and the buffers of learning
+rates and losses (`StepBuffers`).
 """
 
 from __future__ import annotations
@@ -31,17 +32,17 @@ from warpgs.runtime.terminal import Detail
 from warpgs.scene import Camera, Gaussians
 
 RENDER = (project.step_bytes, tiles.step_bytes, blend.step_bytes, training_views.step_bytes)
-"""Functions that return the bytes of a part of every step, by moment."""
+"""Functions that return the bytes of a part of every step, at each moment of the step."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Parts of a fit; with the numbers of Gaussians and instances they determine the memory of a step."""
+    """Parts of a fit that, together with the numbers of Gaussians and instances, determine the memory of a step."""
 
     sizes: StepSizes
-    """Sizes of every step, without Gaussians and instances."""
+    """Sizes of every step, without the numbers of Gaussians and instances."""
     parts: tuple[Callable[[StepSizes], Needs], ...]
-    """Functions that return the bytes of a part of a step, by moment."""
+    """Functions that return the bytes of a part of a step, at each moment of the step."""
     table: Table
     """The Gaussians with their columns."""
     view_bytes: int
@@ -57,7 +58,7 @@ class Layout:
         return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
-        """Return the bytes in addition to `held` at each moment of a step that may be its heaviest.
+        """Return the bytes in addition to `held` at each moment of a step that may be the heaviest.
 
         ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
         """
@@ -77,7 +78,7 @@ class Layout:
         return self.held(count) + heaviest
 
     def smallest(self, count: int) -> int:
-        """Return the bytes of the smallest step: a tile is not divided, and has at most as many instances as Gaussians."""
+        """Return the bytes of the smallest step: a chunk of one tile, with at most one instance for each Gaussian."""
         return max(self.step(count, count, chunked) for chunked in (False, True))
 
     def most_instances(self, count: int, limit: int) -> int:
@@ -113,7 +114,7 @@ class MemoryPlan:
     gaussians: int
     """Number of Gaussians at the start."""
     instances: int
-    """Most (Gaussian, tile) instances of a view at the start."""
+    """Largest number of (Gaussian, tile) instances of a view at the start."""
     planned: int
     """Bytes of the first steps."""
     cap: int
@@ -137,7 +138,7 @@ class MemoryPlan:
         """Return one line for the user."""
         text = f"memory: a step takes {format_bytes(self.planned)} now"
         if self.chunked:
-            text += ", the image in chunks"
+            text += ", with the image in chunks"
         if self.cap > self.gaussians:
             about = "" if self.limit is not None else "about "
             text += f", {about}{format_bytes(self.planned_at_cap)} at {self.cap:,} Gaussians"
@@ -170,9 +171,9 @@ def layout_of(
         terms: Loss terms.
         strategy: Density strategy.
         modules: View modules.
-        kept: Views that are kept beside them.
+        kept: Other views that are kept on the device.
         captured: True to capture steps as CUDA graphs where the device can.
-        sums: Sums of gradients that a step of several views keeps.
+        sums: Number of sums of gradients that a step of several views keeps.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
@@ -187,19 +188,19 @@ def layout_of(
 
 @torch.no_grad()
 def most_instances(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOptions) -> int:
-    """Return the (Gaussian, tile) instances of the camera that has most; cameras hold tensors."""
+    """Return the number of (Gaussian, tile) instances for the camera that has the most; cameras hold tensors."""
     return max(int(count_instances(inputs_of(gaussians, c), image_settings(c, 0, options))) for c in cameras)
 
 
 def plan(
     layout: Layout, *, count: int, instances: int, most: int, limit: int | None, available: int, capacity_factor: float = 1.0
 ) -> tuple[MemoryPlan, Layout]:
-    """Plan a fit that starts with ``count`` Gaussians, whose heaviest view has ``instances``, and may reach ``most``.
+    """Plan a fit that starts with ``count`` Gaussians and ``instances`` in the heaviest view, and may reach ``most`` Gaussians.
 
     Args:
         layout: Layout of the steps; with graphs if possible.
         count: Gaussians at the start.
-        instances: Most (Gaussian, tile) instances of a view at the start.
+        instances: Largest number of (Gaussian, tile) instances of a view at the start.
         most: Number of Gaussians that densification may reach.
         limit: Bytes that the fit may take; None for no limit.
         available: Bytes that the device has free.

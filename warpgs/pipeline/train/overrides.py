@@ -26,7 +26,7 @@ WITHOUT_PREFIX = "priors"
 PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
 """Fields that hold parts of a registry, each with settings of its own."""
 OTHERS = ("preset", "strategy", "strategy_config", *PARTS)
-"""Fields whose values are converted in their own way, such as a name to look up."""
+"""Fields whose values are converted in their own way, such as by looking up a name."""
 
 
 def setting_names(config: FitConfig) -> list[str]:
@@ -35,12 +35,12 @@ def setting_names(config: FitConfig) -> list[str]:
 
 
 def keyword(name: str) -> str:
-    """Return the keyword of a setting: ``init_opacity`` of ``init.opacity``."""
+    """Return the keyword of a setting: ``init_opacity`` for ``init.opacity``."""
     return name.replace(".", "_")
 
 
 def flag(name: str) -> str:
-    """Return the flag of a setting without its leading dashes: ``init.random-count`` of ``init.random_count``."""
+    """Return the flag of a setting without its leading dashes: ``init.random-count`` for ``init.random_count``."""
     return name.replace("_", "-")
 
 

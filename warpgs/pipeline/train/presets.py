@@ -30,7 +30,7 @@ MAX_BYTES = 2**16
 MAX_DEPTH = 8
 """Largest depth of nested tables and lists."""
 MAX_DOTS = 100
-"""Largest number of dots in a line: the time of Python's TOML reader grows with the square of the number of parts of a key."""
+"""Largest number of dots in a line: the time of Python's TOML reader is quadratic in the number of parts of a key."""
 MAX_BASES = 8
 """Longest chain of preset files, each the base of the next one."""
 DEFAULT_PRESET = "default"
@@ -98,8 +98,8 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
 
     Args:
         preset: Name of a preset; path of a .toml file; ``module:NAME`` or ``path/to/file.py:NAME`` of a `FitConfig` or a
-            mapping, which runs that code; the object itself; or None for the default preset. The keys of a mapping or a file
-            are the names of flags; the key ``base`` names the preset to start from, by default the default preset.
+            mapping (this runs the code); a `FitConfig` or mapping itself; or None for the default preset. The keys of a mapping
+            or a file are the names of flags; the key ``base`` names the preset to start from, by default the default preset.
 
     Raises:
         DataError: The file cannot be read or is not TOML.
@@ -129,7 +129,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
 def chosen_settings(
     preset: FitConfig | Mapping[str, Any] | str | Path | None, overrides: Mapping[str, object]
 ) -> tuple[FitConfig, list[str]]:
-    """Return the settings of a preset with some replaced, both as in `warpgs.fit`, and a note on their source.
+    """Return the settings of a preset, some of them replaced, and a note on their source; arguments are as in `warpgs.fit`.
 
     Raises:
         DataError: The file of a preset cannot be read or is not TOML.
@@ -188,7 +188,7 @@ def _read(path: Path) -> tuple[dict[str, Any], str]:
 
 
 def _config_of_file(path: Path, name: str, above: int = 0) -> tuple[FitConfig, str]:
-    """Return the settings of a file, and a note on their source; ``above`` is the number of files that start from it."""
+    """Return the settings of a file, and a note on their source; ``above`` is the number of files that build on it."""
     import dataclasses
 
     values, digest = _read(path)

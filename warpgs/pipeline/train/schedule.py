@@ -15,7 +15,7 @@ def log_linear(start: float, end: float, progress: float) -> float:
 
 
 def sh_degree(step: int, every: int, highest: int) -> int:
-    """Return the degree in use at a step counted from 1: one more after every ``every`` steps, up to ``highest``."""
+    """Return the degree in use at a step (from 1): it rises by one after each ``every`` steps, up to ``highest``."""
     return min(highest, (step - 1) // every)
 
 
@@ -26,7 +26,7 @@ MAX_DECAY = 0.1
 
 
 def check_lrs(of: str, **rates: float | None) -> None:
-    """Check learning rates, and factors of them, by name; None is allowed; ``of`` names the group of settings.
+    """Check learning rates, or factors of learning rates, by name; None is allowed; ``of`` names the group of settings.
 
     Raises:
         UsageError: A value is not positive, or above `MAX_LR`.
@@ -48,15 +48,15 @@ class OptimizerConfig:
     quats_lr: float = 1e-3
     """Learning rate of the rotations."""
     scales_lr: float | None = 0.01
-    """Learning rate of the log scales; 0.005 in the reference (docs/decisions/004-scale-rate.md). None: by the number of
-    views."""
+    """Learning rate of the log scales; 0.005 in the reference implementation (docs/decisions/004-scale-rate.md). None: chosen
+    by the number of views."""
     scales_decay: float = 1.0
     """Learning rate of the log scales at the last step, as a fraction of the first. It falls log-linearly during phase 3;
     without phases, during the whole fit. 1: constant."""
     opacities_lr: float | None = 0.05
-    """Learning rate of the opacity logits. None: by the number of views."""
+    """Learning rate of the opacity logits. None: chosen by the number of views."""
     opacities_decay: float | None = 0.0
-    """Fraction by which each step lowers every opacity, in [0, 0.1]; 0 for no decay. None: by the number of views."""
+    """Fraction by which each step lowers every opacity, in [0, 0.1]; 0 for no decay. None: chosen by the number of views."""
     sh_lr: float | None = 2.5e-3
     """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if --cpu-limit shortens the fit."""
     sh_rest_factor: float = 0.05
@@ -95,9 +95,9 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class PhaseConfig:
-    """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in the second.
+    """The paper's three phases (section "Training Strategy"), and when fine Gaussians are sampled in phase 2.
 
-    In a fit shorter than twice phases 1 and 3 together, these phases and the interval between events are shortened in
+    In a fit shorter than twice the sum of phases 1 and 3, these phases and the interval between events are shortened in
     proportion.
     """
 
@@ -110,7 +110,8 @@ class PhaseConfig:
     growth: float = 4.0
     """Growth of the interval between events over phase 2, gamma: T_sample(t) = T_base (1 + gamma t), t from 0 to 1."""
     least: float = 1.0
-    """Lower bound of T_base [steps] where a short fit shortens it. On a CPU an event takes as long as ten steps."""
+    """Smallest number of steps from the first sampling event to the second in a short fit, which shortens this interval. On a
+    CPU an event takes as long as ten steps."""
 
     def __post_init__(self):
         if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
@@ -146,7 +147,7 @@ class Phases:
         return begun + (1 - begun) * (step - self.stable_start) / (self.steps - self.stable_start)
 
     def stable_from(self, step: int, planned_start: int) -> Phases:
-        """Return the phases if the third begins after ``step`` instead of its planned start, and is shortened in proportion."""
+        """Return the phases for a third phase that begins after ``step``, not as planned, and is shortened in proportion."""
         length = round((self.planned - planned_start) * step / max(1, planned_start))
         return replace(self, stable_start=step, steps=min(self.planned, step + max(1, length)))
 

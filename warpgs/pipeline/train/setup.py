@@ -136,7 +136,7 @@ def _check_models(train: list[View], config: FitConfig) -> None:
 
 
 def samples(config: FitConfig) -> bool:
-    """Return whether the strategy places Gaussians behind pixels, for which depths of views are compared."""
+    """Return whether the strategy places Gaussians behind pixels, which needs depths that views confirm."""
     return find_strategy(config.strategy).samples(config.groups())
 
 
@@ -163,8 +163,8 @@ def prepared_views(
 ) -> tuple[list[TrainingView], list[np.ndarray]]:
     """Return the training views on the device, with their scores and the maps of loss terms.
 
-    Also returns each view's disparity (relative inverse depth in [0, 1], shape [H, W]) if the strategy samples and the views
-    have priors; only images of sampling events show it.
+    If the strategy samples and the views have priors, also returns each view's disparity (relative inverse depth in [0, 1],
+    shape [H, W]), which is only shown in images of sampling events.
 
     Raises:
         UsageError: Two loss terms need a map of the same name.

@@ -1,4 +1,4 @@
-"""Sums over the views of a step, its slots, in one order for any number of processes.
+"""Sums over the views of a step (slots), in one order for any number of processes.
 
 float32 values are added in a fixed binary tree over the slots 0 to B - 1. The sum of n slots is the sum of the first p slots
 plus the sum of the others, with p the largest power of two below n. Each process sums the largest subtrees of its own slots.
@@ -26,8 +26,8 @@ ALIGNMENT = 16
 FLOAT_BYTES = 4
 """Size of a float [bytes]."""
 DIVIDED_BYTES = 2**26
-"""Least size of a tensor whose rows are divided among processes [bytes]: updating a smaller tensor takes less time than
-two more exchanges need to begin."""
+"""Least size of a tensor whose rows are divided among processes [bytes]: for a smaller tensor, the update takes less time than
+the start of two more exchanges."""
 MAX_RENDERS = 2**24
 """Upper bound of the number of renders of a fit: the random numbers of a render depend on its index, a float32."""
 
@@ -135,7 +135,7 @@ class Tree:
 
 
 class SlotSums:
-    """Sums over slots of tensors of fixed shapes, side by side in one piece of memory for each sum.
+    """Sums of several tensors over slots; the tensors of a sum have fixed shapes and lie side by side in memory.
 
     The rows of a large tensor may be divided among processes. Each process gets the sums of its own rows, updates these rows,
     and sends the updated rows instead of sums.
@@ -144,7 +144,7 @@ class SlotSums:
     def __init__(
         self, tree: Tree, shapes: Sequence[tuple[int, ...]], device: torch.device, *, means: int = 0, large: int | None = None
     ):
-        """Allocate.
+        """Allocate memory for the sums.
 
         Args:
             tree: The tree.
@@ -178,17 +178,18 @@ class SlotSums:
         return slice(self.tree.ranks.rank * each, (self.tree.ranks.rank + 1) * each)
 
     def parts(self, row: int = 0) -> list[torch.Tensor]:
-        """Return the tensors of a sum, parts of its memory, in their shapes [...]."""
+        """Return the tensors of a sum, as parts of the sum's memory, in their shapes [...]."""
         sized = zip(self.starts, self.shapes, strict=True)
         return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
 
     def add_up(self, slot: Callable[[int, list[torch.Tensor], bool], None]) -> list[torch.Tensor]:
         """Add the slots of all processes; every process gets the same sums of the tensors, in their shapes [...].
 
-        Divided rows then hold the sum of this process's slots, until `sum_own_rows`.
+        Divided rows then hold the sum of this process's slots only, until `sum_own_rows` is called.
 
         Args:
-            slot: Function of a slot, the tensors of a sum, and whether to add to them; else the function overwrites them.
+            slot: Function of a slot's number, the tensors of a sum, and a flag: True to add to the tensors, False to overwrite
+                them.
 
         Raises:
             ResourceError: Another process was lost.
@@ -210,7 +211,7 @@ class SlotSums:
         self.rows[0, own.start * self._width : own.stop * self._width] = sums
 
     def share(self, tensor: torch.Tensor) -> None:
-        """Send this process's rows of a tensor [N, ...], contiguous and of the shape of the large one, to all others."""
+        """Send this process's rows of a tensor [N, ...], contiguous and shaped like the large tensor, to all others."""
         divided = tensor[: self.divided].view(-1)
         self.tree.ranks.gather(tensor[self.own_rows].view(-1), divided)
 
@@ -228,7 +229,7 @@ class SlotSums:
             self.rows[row].add_(self.rows[row + 1])
 
     def _own_sums(self, place: slice) -> torch.Tensor:
-        """Finish the tree for this process's slice of a part of the numbers; processes have slices of equal size, [S]."""
+        """Finish the sums of this process's part of the numbers in ``place``; all parts have equal size, [S]."""
         tree, ranks = self.tree, self.tree.ranks
         sent = self.rows[: tree.width, place].view(tree.width, ranks.count, -1).transpose(0, 1).contiguous()
         received = ranks.to_each(sent)
@@ -238,6 +239,6 @@ class SlotSums:
         return own
 
     def _average(self, start: int, sums: torch.Tensor) -> None:
-        """Divide the means among sums [S] by the number of slots; these sums begin at ``start`` in a sum."""
+        """Divide the means among sums [S] by the number of slots; ``start`` is the place of ``sums`` in a whole sum."""
         for first, end in self.means:
             sums[max(0, first - start) : max(0, end - start)].mul_(1 / self.tree.batch)

@@ -32,8 +32,8 @@ from warpgs.scene import Camera, Gaussians, Render
 MAX_STEPS = 100
 """Largest number of steps between two reads of results from the device."""
 MAX_VIEWS = 200
-"""Largest number of rendered views between two such reads, for steps of several views (a single step may have more): a request
-to stop waits for the next read."""
+"""Largest number of rendered views between two reads of results, for steps of several views; a single step may have more. A
+request to stop waits for the next read."""
 
 
 def steps_at_once(batch: int) -> int:
@@ -93,7 +93,7 @@ class StepBuffers:
         self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
-        """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next."""
+        """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next one."""
         done, stop = int(self.counter), int(self.stop)
         return done, stop, self.history[: done + 1].tolist()
 
@@ -168,7 +168,7 @@ class Learned:
     dropout_seed: int | None
     """Seed of the opacity dropout; None without dropout."""
     cameras: TrainingCameras
-    """Training cameras, to which limits of sizes refer."""
+    """Training cameras, for limits of sizes."""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Capacities:
             found[kind] = self._known[kind, plan]
             if max_instances is not None and found[kind] > max_instances:
                 raise OverLimitError(
-                    f"a captured step would need capacity for {found[kind]:,} instances, the limit allows {max_instances:,}"
+                    f"a captured step would need capacity for {found[kind]:,} instances, but the limit allows {max_instances:,}"
                 )
         return found
 
@@ -93,7 +93,7 @@ class StepGraphs:
         self.learned, self.buffers, self.options = learned, buffers, options
         device = buffers.device
         self.stream = torch.cuda.Stream(device)
-        """Stream of captures, always the same one, since torch keeps freed memory for the stream that it was used on."""
+        """Stream of captures, always the same one, since torch reuses freed memory only on the stream that used it before."""
         self.memory = GraphMemory(device)
         """Account of the memory that torch keeps for deleted graphs."""
         self.capacities = Capacities(learned, options)

@@ -29,8 +29,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.terminal import Detail
 
 LATELY = 1.5
-"""The gain is measured since the latest measurement at or before the present step divided by this factor, so over at least the
-last third of the steps."""
+"""A gain compares the present step with the latest measurement at or before this step divided by `LATELY`: it covers at least
+the last third of the steps."""
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class StoppingConfig:
     """Settings of early stopping."""
 
     min_gain_db: float | None = 0.0
-    """Growth ends when the gain of the left-out blocks over at least the last third of the steps, plus ``noise`` standard
-    errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does not end in its first third, nor
-    while views have half size. 0: no blocks are left out, and the fit takes the planned steps. None: 0.1, or 0 if --cpu-limit
-    shortens the fit."""
+    """Growth, the phase that adds Gaussians, ends when the gain of the left-out blocks over at least the last third of the
+    steps, plus ``noise`` standard errors, is below this [dB]. The rest of the fit is then shortened in proportion. Growth does
+    not end in its first third, nor while views have half size. 0: no blocks are left out, and the fit takes the planned steps.
+    None: 0.1, or 0 if --cpu-limit shortens the fit."""
     fraction: float = 0.03
-    """Fraction of the pixels in blocks that are left out until growth ends."""
+    """Fraction of the pixels that are left out, in blocks, until growth ends."""
     measurements: int = 12
     """Number of equal intervals of the growth phase; the blocks are measured after each interval."""
     noise: float = 1.0
@@ -139,11 +139,7 @@ class Stopping:
             return [Detail(f"early stopping is off, because {few}; the fit takes all its steps")]
         self.whole = context.views
         pixels = self.held_pixels / sum(v.camera.width * v.camera.height for v in self.whole)
-        return [
-            Detail(
-                f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, at step {ends} or before"
-            )
-        ]
+        return [Detail(f"stopping: {held} blocks, {pixels:.1%} of the pixels, are left out until growth ends, by step {ends}")]
 
     @property
     def held_pixels(self) -> int:
@@ -151,7 +147,7 @@ class Stopping:
         return sum(len(b) * b.side**2 for b in self.blocks)
 
     def hidden(self) -> list[TrainingView]:
-        """Return the views without their blocks."""
+        """Return the views with their held-out blocks masked."""
         return [hide(v, b) for v, b in zip(self.whole, self.blocks)]
 
     def sh_every(self, every: int, highest: int) -> int:
@@ -170,7 +166,7 @@ class Stopping:
         Args:
             step: Steps done.
             strategy: Density strategy.
-            context: Parts of the fit; when growth ends, its third phase begins.
+            context: Parts of the fit; when growth ends, the fit's third phase begins.
             degree: Degree of the harmonics in use.
         """
         if self.due(step) and self._measured(step, strategy, context, degree):
@@ -182,7 +178,7 @@ class Stopping:
             yield from strategy.update(step)
 
     def _measured(self, step: int, strategy: Strategy, context: StrategyContext, degree: int) -> bool:
-        """Measure the blocks if the set has changed since the previous mark, and at the last; return whether growth ends."""
+        """Measure the blocks if the set changed since the previous mark, and at the last mark; return whether growth ends."""
         last = max((m for m in self.marks if m < step), default=step)
         if last < step < self.marks[-1] and not any(strategy.due(s) for s in range(last, step)):
             return False

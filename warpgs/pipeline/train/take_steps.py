@@ -35,7 +35,7 @@ class StepTaker:
 
     @property
     def sums(self) -> int:
-        """Sums of gradients that a step of several views keeps."""
+        """Number of sums of gradients that a step of several views keeps."""
         return 0 if self.batched is None else self.batched.tree.buffers
 
     @property
@@ -56,11 +56,11 @@ class StepTaker:
         """Take the steps whose learning rates and settings the buffers hold.
 
         Args:
-            places: Kind and row of each step's view; in steps of several views, of the view of each slot, step by step.
+            places: Kind and row of each step's view; in steps of several views, kind and row of each slot's view, step by step.
             settings: Returns the settings of each slot, step by step.
             stacks: Views by kind.
             plan: Fixed choices of the steps.
-            max_instances: Instances that a view may have at a time; None for no limit.
+            max_instances: Largest number of (Gaussian, tile) instances of a view at a time; None for no limit.
             captured: Whether CUDA graphs are used.
 
         Raises:
@@ -79,9 +79,9 @@ class StepTaker:
                 step(self.learned, stacks[kind], self.buffers, plan, render)
 
     def agreed(self, stopped: bool) -> bool:
-        """Return whether to end after the last step, the same in all processes.
+        """Return whether to end after the last step; all processes get the same answer.
 
-        A request to one process reaches the others with its next steps.
+        A request to stop reaches one process first, and the others with the next steps.
         """
         if self.batched is None or self.ranks.count == 1:
             return stopped

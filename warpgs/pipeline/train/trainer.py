@@ -96,9 +96,9 @@ class Trainer:
         self.terms = terms_of(config, self.cutout, **given)
         self.step = 0  # taken
         self.memory_limit, self.captured = config.memory_limit, config.cuda_graph
-        """Memory limit of steps [bytes], None for no limit; and whether steps may be captured (`spare_memory`)."""
+        """Memory limit of steps [bytes], None for no limit; and whether steps may be captured. `spare_memory` changes both."""
         self.order: list[int] = []
-        """Views that are still to come in the current pass over all views, the next one last."""
+        """Views still to come in the current pass over all views, in reverse order."""
         self.extrapolated = made.start.extrapolated > 0
         """True if the start has extrapolated points: opacity decay then spares Gaussians that a step does not use."""
         self._make_parts(train, made.start, scene_extent(cameras, cloud))
@@ -183,8 +183,8 @@ class Trainer:
     def advance(self, limit: int = 1) -> list[StepReport]:
         """Take up to ``limit`` steps, and let the strategy change the set of Gaussians after the last step if a change is due.
 
-        On CUDA steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU, or
-        if a memory limit does not allow graphs, one step is taken.
+        On CUDA, steps are replayed as graphs, several at a time, up to the next step after which the host has work. On a CPU,
+        or if a memory limit does not allow graphs, one step is taken.
 
         Raises:
             NotFiniteError: A loss is not finite; the Gaussians are as before that step.
@@ -199,7 +199,7 @@ class Trainer:
             raise self._no_memory(e) from e
 
     def _no_memory(self, error: Exception) -> OutOfMemoryError:
-        """Return the error for a step that ran out of memory. If no step of its series was taken, its views are put back."""
+        """Return the error for a step that ran out of memory. If no step of the series was taken, its views come again."""
         chosen, self.chosen = self.chosen, None
         intact = chosen is not None and int(self.buffers.counter) == 0
         if chosen is not None and intact:
@@ -299,7 +299,7 @@ class Trainer:
         return c.optimizer.lrs(self.progress(step), self.context.extent, stable_start)
 
     def settings(self, step: int, slot: int | None = None) -> tuple[float, ...]:
-        """Return the settings of a step (`Setting`), or of a slot, which has its own number for random numbers."""
+        """Return the settings of a step (`Setting`), or of a slot, which has its own index for random numbers."""
         number = step if slot is None else (step - 1) * self.batch + slot + 1
         shifted = self.cutout and self.config.loss.random_background
         shift = random_shift(self.config.seed, number, self.scene_background) if shifted else (0.0, 0.0, 0.0)
@@ -353,7 +353,7 @@ class Trainer:
         self.count_changed()
 
     def count_changed(self) -> None:
-        """Update the limit of instances, which depends on the number of Gaussians; None for no limit."""
+        """Update the limit of (Gaussian, tile) instances, which depends on the number of Gaussians; None for no limit."""
         limit = self.memory_limit
         self.context.max_instances = None if limit is None else self.layout.most_instances(len(self.table), limit)
 

@@ -89,7 +89,7 @@ class TrainingView:
 def step_bytes(sizes: StepSizes) -> Needs:
     """Return the bytes of the view of a step.
 
-    On CUDA image, mask, opacity and one map of a loss term that reads depth are copied from the stacks. Views with an alpha
+    On CUDA, image, mask, opacity and one map of a loss term that reads depth are copied from the stacks. Views with an alpha
     channel are composited over the background of the step.
     """
     copies = (3 + sizes.masked + sizes.cutout + sizes.depth) * sizes.cuda
@@ -99,8 +99,8 @@ def step_bytes(sizes: StepSizes) -> Needs:
 def view_bytes(views: Iterable[TrainingView]) -> int:
     """Return the bytes of views: images, masks, opacities, maps and scores; shared memory is counted once.
 
-    Stacks are not counted: on CUDA images, masks, opacities and maps of the views are parts of the stacks (`stack_views`), and
-    on a CPU stacks have no memory of their own.
+    Stacks are not counted: on CUDA, images, masks, opacities and maps of the views are parts of the stacks (`stack_views`); on
+    a CPU, stacks have no memory of their own.
     """
     tensors = (t for v in views for t in (v.image, v.mask, v.alpha, v.semantic, v.geometry, v.consistent, *v.maps.values()))
     storages = (t.untyped_storage() for t in tensors if t is not None)
@@ -279,7 +279,7 @@ def current(stack: ViewStack, learned: LearnedViews) -> ViewStack:
 def show_learned(
     views: list[TrainingView], stacks: Mapping[Kind, ViewStack], places: list[tuple[Kind, int]], learned: LearnedViews
 ) -> None:
-    """Write the current learned values into views of `with_learned`, from which density strategies render.
+    """Write the current learned values into the views of `with_learned`; density strategies render these views.
 
     Args:
         views: Training views.

@@ -27,7 +27,7 @@ from warpgs.scene import Camera, PointCloud, Prior, View
 STEPS = 3
 """Number of steps of the tiny fit, one for each phase."""
 SIDE, POINTS, PLANES = 48, 200, 8
-"""Sides of the tiny fit's views [px]; its numbers of points and of sweep planes."""
+"""Side of the tiny fit's views [px], number of its points, and number of its sweep planes."""
 
 
 def _views(generator: np.random.Generator) -> list[View]:
@@ -41,7 +41,7 @@ def _views(generator: np.random.Generator) -> list[View]:
 
 
 def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Trainer:
-    """Fit noise in two small views with the same settings, including refinement and sampling, and score one view.
+    """Fit noise in two small views with the settings of the real fit, including refinement and sampling; score one view.
 
     Args:
         config: Settings of the real fit. If that fit sweeps on the device, these views are swept, too.

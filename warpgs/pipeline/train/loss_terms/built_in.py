@@ -17,7 +17,7 @@ class LossConfig:
     """Weights of the loss."""
 
     ssim_weight: float = 0.2
-    """Fraction lambda of the structural term, in [0, 1]."""
+    """Fraction lambda of the SSIM term, in [0, 1]."""
     random_background: bool = True
     """Put views with an alpha channel, and their renders, on a random background at each step. Without this, Gaussians of the
     background colour could cover empty areas. No effect on opaque views."""
@@ -25,8 +25,8 @@ class LossConfig:
     """Weight of the mean absolute difference of rendered and given opacity, for views with an alpha channel, in [0, 1000]; 0 to
     disable."""
     smooth_weight: float | None = 0.0
-    """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: by the
-    number of views."""
+    """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: chosen
+    by the number of views."""
     depth_weight: float = 0.3
     """Weight of the difference of rendered and given inverse depth, for views with given depth, in [0, 1000]; 0 to disable."""
     normal_weight: float = 0.03

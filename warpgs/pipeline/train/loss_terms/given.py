@@ -25,7 +25,7 @@ MIN_ALPHA = 0.5
 DEPTH_MAPS = 8
 """Number of maps with one float per pixel that the depth term and its gradient hold at the loss."""
 NORMAL_MAPS = 26
-"""Number of such maps for the normal term; points, differences and normals count as three each."""
+"""Number of maps with one float per pixel for the normal term; points, differences and normals count as three each."""
 
 
 def inverse_depth_difference(
@@ -36,7 +36,8 @@ def inverse_depth_difference(
     Args:
         depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
         alpha: Rendered opacity, shape [H, W].
-        target: Weight times q / d, weight, and weight times q [u], shape [H, W, 3]: averaging pixels keeps the weighted means.
+        target: Weight times q / d, weight, and weight times q [u], for given depth d and its median q, shape [H, W, 3].
+            Averages of pixels keep the weighted means.
         mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
     """
     shown = ~(alpha <= MIN_ALPHA)  # True for a NaN, so that it reaches the loss
@@ -61,7 +62,7 @@ class GivenDepthDifference(LossTerm):
             raise UsageError(f"given-depth: `weight` must be between 0 and 1000, not {self.weight}")
 
     def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
-        """Return weight times q / d, weight, and weight times q, [H, W, 3]; 0 where no depth is given."""
+        """Return weight times q / d, weight, and weight times q, [H, W, 3], for depth d with median q; 0 without depth."""
         given = view.depth
         if given is None:
             return {"given_depth": view.image.new_zeros(*view.image.shape[:2], 3)}

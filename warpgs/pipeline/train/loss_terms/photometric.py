@@ -56,7 +56,7 @@ class Photometric(LossTerm):
     """The photometric loss; every fit has it."""
 
     ssim_weight: float = 0.2
-    """Fraction lambda of the structural term, in [0, 1]."""
+    """Fraction lambda of the SSIM term, in [0, 1]."""
 
     def bytes(self, sizes: StepSizes) -> Needs:
         """Return the bytes of the differences and, with a mask, of both masked images."""

@@ -1,9 +1,9 @@
 """Smoothness of rendered depth, for few views: ambiguous depth becomes planar instead of fog.
 
 On a plane, inverse depth is a linear function of the pixel. So the term sums |z/z' + z/z'' - 2| over the pixels, with the
-depths z' and z'' of a pixel's two neighbours in its row, adds the same for its column, and divides by the number of pixels. It
-has no unit. Weights are lower at edges of colour and at pixels with consistent depth. A bound allows depth to jump where colour
-does not (docs/decisions/024-smooth-depth.md).
+depths z' and z'' of a pixel's two neighbours in its row, adds the same for its column, and divides by the number of pixels. The
+term has no unit. Weights are lower at edges of colour and at pixels with consistent depth. A bound allows depth to jump where
+colour does not (docs/decisions/024-smooth-depth.md).
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ MAPS = 12
 def depth_roughness(
     depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
 ) -> torch.Tensor:
-    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) over the number of pixels, shape [].
+    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) divided by pixel count, shape [].
 
-    z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum has only
+    z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum is over
     pixels that, like both neighbours, are unmasked and more opaque than `MIN_ALPHA`.
 
     Args:

@@ -21,7 +21,7 @@ class Strategy:
 
     To write a strategy, derive a class and override the methods that it needs. For each step the trainer calls `phase` on the
     host. As part of the step it then calls `statistics` for each view, `lr_factors` and `after_step`. After the step it calls
-    `due` on the host and, if that returns True, `update`.
+    `due` on the host and, if the result is True, `update`.
 
     The methods that are part of a step are captured once as a CUDA graph and replayed. So they must not read back from the
     device, must write their results into existing tensors, and may depend on the host only through `phase`.
@@ -61,7 +61,7 @@ class Strategy:
         return own
 
     def bytes(self, sizes: StepSizes) -> Needs:
-        """Return the bytes that the strategy needs at the moments of a step, or in an event, without its columns."""
+        """Return the bytes that the strategy needs at the moments of a step, or in an event; columns are not included."""
         return {}
 
     def columns(self) -> Mapping[str, Column]:
@@ -72,7 +72,7 @@ class Strategy:
         """Set up the strategy; the table, the training views and the memory plan exist already."""
 
     def growth(self) -> Growth:
-        """Return the times at which Gaussians are added, for early stopping; up to phase 3 by default."""
+        """Return the times at which Gaussians are added, for early stopping; by default until phase 3 begins."""
         return Growth(self.context.phases.refine, self.context.phases.stable_start)
 
     def phase(self, step: int) -> Hashable:
@@ -106,8 +106,8 @@ class Strategy:
     ) -> Mapping[str, torch.Tensor]:
         """Return the values that a view of a step adds to columns, by name of the column, shape [N] each.
 
-        They must depend on this view only, because other views of the step may be in other processes. They must be 0 where
-        ``visible`` is False, because gradients of a skipped step may be NaN.
+        The values must depend on this view only, because other views of the step may be in other processes. They must be 0
+        where ``visible`` is False, because gradients of a skipped step may be NaN.
 
         Args:
             phase: Value of `phase` for the step.
@@ -126,7 +126,7 @@ class Strategy:
         return iter(())
 
     def catch_up(self, step: int, views: list[TrainingView], held: int) -> Iterator[DensityUpdate]:
-        """Yield changes for the pixels that early stopping held out, when it ends growth.
+        """Yield changes, when early stopping ends growth, for the pixels that early stopping held out.
 
         Args:
             step: Steps done.

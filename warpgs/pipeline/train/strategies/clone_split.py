@@ -46,7 +46,7 @@ class CloneSplit(Strategy):
         return self.gradients.due(step)
 
     def update(self, step: int) -> Iterator[DensityUpdate]:
-        """Refine, then reset opacities, if either is due."""
+        """Refine, then reset opacities, each if it is due."""
         if self.gradients.refines(step):
             yield from self.gradients.refine()
         if self.gradients.resets(step):

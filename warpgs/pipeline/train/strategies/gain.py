@@ -13,8 +13,8 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.scene import Camera
 
 EVERY = 2
-"""Distance between pixels for which gains are computed [px]; pixels in between repeat these gains, since a footprint is
-wider."""
+"""Distance between pixels for which gains are computed [px]; pixels in between repeat these gains, since footprints are wider
+than this distance."""
 HIDDEN = 1.05
 """A point is hidden in a view if its depth exceeds the rendered depth by this factor."""
 

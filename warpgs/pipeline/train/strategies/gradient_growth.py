@@ -18,7 +18,7 @@ from warpgs.pipeline.train.strategies.event_times import EventTimes
 from warpgs.scene import Gaussians
 
 RESET_FREE_STEPS = 500
-"""Number of steps before the last event in which opacities are not reset: transparent Gaussians would stay transparent."""
+"""No opacities are reset in this number of steps before the last event: transparent Gaussians would stay transparent."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class DensityConfig:
 
 
 def _exp(x: torch.Tensor) -> torch.Tensor:
-    """Return e^x computed in float64, since the rounding of float32's depends on the processor (MKL)."""
+    """Return e^x computed in float64, since rounding in float32 depends on the processor (MKL)."""
     return x.double().exp().to(x.dtype)
 
 
@@ -114,7 +114,7 @@ def refine(
         protected: Gaussians that are not pruned, bool, shape [N]; None for none.
 
     Returns:
-        The change. If all Gaussians would be pruned, the most opaque one is not.
+        The change. If all Gaussians would be pruned, the most opaque one is kept.
     """
     with torch.no_grad():
         tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
@@ -148,7 +148,7 @@ def refine(
 
 
 class GradientGrowth:
-    """Gradients of the projected means, gathered in columns of the table, and growth and pruning by them."""
+    """Growth and pruning by the gradients of projected means, which are gathered in columns of the table."""
 
     STATE: ClassVar = {"was_reset": schema.flag}
     """Schema of the plain values of `state`, by name."""
@@ -161,7 +161,7 @@ class GradientGrowth:
 
     @staticmethod
     def columns() -> dict[str, Column]:
-        """Return the columns for the sum of a projected mean's gradient norms, and for the number of renders that show it."""
+        """Return the columns for each projected mean: the sum of its gradient norms, and the number of renders that show it."""
         return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
 
     @property
@@ -179,7 +179,7 @@ class GradientGrowth:
     def statistics(
         self, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
     ) -> dict[str, torch.Tensor]:  # fmt: skip
-        """Return the norm of each projected mean's gradient, and 1 for each that the view sees, shape [N] each.
+        """Return the norm of each projected mean's gradient, and 1 for each mean that the view sees, else 0, shape [N] each.
 
         The unit is half image widths and heights; arguments are those of `Strategy.statistics`.
         """

@@ -34,7 +34,7 @@ class ImportanceConfig:
     """Rendering residual: length, the length of the colour difference in the view (the paper); or gain, the estimated decrease
     of the squared error over all training views by a fine Gaussian at the pixel."""
     curvature: float = 0.5
-    """Weight of the second derivatives in the geometric score (lambda_curv; the paper gives no value)."""
+    """Weight of the second derivatives of inverse depth in the geometric score (lambda_curv; the paper gives no value)."""
 
     def __post_init__(self):
         if self.residual not in ("length", "gain"):

@@ -29,9 +29,9 @@ from warpgs.pipeline.train.views import TrainingView
 from warpgs.runtime.step_sizes import FLOAT, SAMPLING, Needs, StepSizes
 
 COARSE = 0
-"""Layer of the Gaussians that were not sampled; sampled Gaussians have `FINE`."""
+"""Number of the layer of Gaussians that were not sampled; sampled Gaussians have `FINE`."""
 NOT_SAMPLED = -(2**30)
-"""``created_step`` of the coarse layer, whose Gaussians were not sampled."""
+"""Value of ``created_step`` in the coarse layer, whose Gaussians were not sampled."""
 _COUNT = schema.whole(0)
 EVENT = schema.fields({"step": _COUNT, "added": _COUNT, "evicted": _COUNT, "quantiles": schema.items(schema.real)})
 """Schema of a stored event."""
@@ -63,7 +63,7 @@ class ImportanceSampling(Strategy):
         return {SAMPLING: 7 * FLOAT * sizes.pixels * min(sizes.views, MAX_VIEWS)} if self.method.events else {}
 
     def columns(self) -> Mapping[str, Column]:
-        """Return the columns of gradients, of the layer of each Gaussian, and of the step at which it was sampled."""
+        """Return the columns for gradients, each Gaussian's layer, and the step at which the Gaussian was sampled."""
         own = {"level": Column(COARSE, torch.int32), "created_step": Column(NOT_SAMPLED, torch.int32)}
         return {**self.gradients.columns(), **own}
 

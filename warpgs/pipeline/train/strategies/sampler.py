@@ -23,7 +23,7 @@ class SamplerConfig:
 
     depth: str = "rendered"
     """Depth of new Gaussians: rendered (the paper), or consistent, the initial depth that other views confirm. With consistent,
-    and with the reliability gate on, only pixels with such depth are sampled, in views that have some."""
+    and with the reliability gate on, views with consistent depth are sampled only where it exists."""
     fraction: float = 0.005
     """Gaussians per event and view, as a fraction of the view's pixels."""
     gate_quantile: float = 0.6
@@ -71,13 +71,14 @@ def valid_pixels(alpha: torch.Tensor, depth: torch.Tensor, mask: torch.Tensor | 
 
 
 def geometry_gate(geometry: torch.Tensor, valid: torch.Tensor, quantile: float, wanted: int) -> tuple[torch.Tensor, float]:
-    """Return M_reliable: the valid pixels whose geometric score is above a quantile of the valid pixels; and the quantile used.
+    """Return M_reliable, the valid pixels with a geometric score above a quantile over valid pixels, and the quantile used.
 
     Args:
         geometry: S_geometry, shape [H, W].
         valid: Pixels that may be sampled at all, bool, shape [H, W].
         quantile: tau_geometry as a quantile, in [0, 1).
-        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times as many or all valid pixels pass.
+        wanted: Number of pixels to be sampled; the gate is widened until `SUPPORT` times this number, or all valid pixels,
+            pass.
 
     Returns:
         The gate, bool, shape [H, W], and the quantile that was used; if the score is constant, all valid pixels pass.

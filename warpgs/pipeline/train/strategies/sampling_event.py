@@ -32,7 +32,7 @@ from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Prior, ViewDepth
 
 FINE = 1
-"""Layer of sampled Gaussians."""
+"""Number of the layer of sampled Gaussians."""
 MAX_VIEWS = 8
 """Largest number of views in which one event samples; of more views, a random subset is taken."""
 MAX_WEIGHED = 32
@@ -66,8 +66,8 @@ class MethodConfig:
     events: bool = False
     """Sampling events, which add fine Gaussians in phase 2."""
     hier: bool | None = False
-    """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: by the number
-    of views."""
+    """Two layers: from phase 2 on, the coarse layer is neither cloned nor split, and its means move slowly. None: chosen by the
+    number of views."""
     s_render: bool = True
     """Use the rendering residual in the importance."""
     s_semantic: bool = True
@@ -76,15 +76,15 @@ class MethodConfig:
     """Use the geometric score in the importance. With gate_quantile above 0 (preset paper-literal), the reliability gate uses
     the score even if this is off."""
     ra: bool = True
-    """Reliability gate: sample only pixels above gate_quantile of the geometric score and, with sampler.depth consistent, only
-    pixels with consistent depth, in views that have some."""
+    """Reliability gate: sample only pixels above gate_quantile of the geometric score. With sampler.depth consistent, views
+    with consistent depth are also sampled only where it exists."""
     agp: bool = True
     """Adaptive Gaussian placement: sample pixels at random in proportion to importance. If off, take the pixels of highest
     importance."""
     pm: bool = True
     """Protection mechanism: new fine Gaussians keep a minimum opacity and are not pruned."""
     coarse_lr_factor: float = 0.1
-    """Factor on the learning rate of coarse means from phase 2 on, with two layers, in [0, 1]."""
+    """Factor on the learning rate of the coarse layer's means from phase 2 on, with two layers, in [0, 1]."""
     keep: float = 1.0
     """Fraction of the Gaussians that is kept when phase 3 begins, in (0, 1]: those with the largest sums of blending weights
     over at most 32 training views."""
@@ -169,7 +169,7 @@ class Rendered(NamedTuple):
     """A render of a view before an event, and the pixels that can be sampled."""
 
     rgb: torch.Tensor
-    """Colours as the view shows them, shape [H, W, 3]."""
+    """Rendered colours after the view modules of the fit, shape [H, W, 3]."""
     surface: torch.Tensor
     """Rendered z-depth [u], shape [H, W]."""
     depth: torch.Tensor
@@ -193,7 +193,7 @@ def sample_view(
     view: TrainingView, number: int, rendered: Rendered, residuals: Sequence[Residual], config: MethodConfig,
     coefficients: int, generator: torch.Generator,
 ) -> tuple[SampledView, dict[str, torch.Tensor]]:  # fmt: skip
-    """Score one view, sample its pixels, and return them with the rows [S, ...] of the fine Gaussians behind them.
+    """Score one view and sample its pixels; return maps and samples, and rows [S, ...] of fine Gaussians behind the pixels.
 
     Args:
         view: The view.
@@ -254,7 +254,7 @@ def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView
 def _sampled(
     gaussians: Gaussians, views: list[TrainingView], config: MethodConfig, options: RasterizeOptions, generator: torch.Generator
 ) -> tuple[dict[str, torch.Tensor], tuple[SampledView, ...]]:
-    """Return the Gaussians that are sampled in the views, by name of the tensor, and the maps used."""
+    """Return the Gaussians sampled in the views, as tensors by name, and the maps used."""
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
         numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
@@ -285,8 +285,9 @@ def sampling_event(
 ) -> Event:
     """Sample fine Gaussians by the importance of the pixels of the training views.
 
-    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer) or the set its capacity, the unprotected
-    fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond the limit are not added.
+    If the fine layer reaches its limit (``sampler.max_fraction`` of the coarse layer) or the set reaches its capacity, the
+    unprotected fine Gaussians that contribute least to the training views are evicted. New Gaussians beyond these limits are
+    not added.
 
     Args:
         gaussians: The current set, N rows.
@@ -295,7 +296,7 @@ def sampling_event(
         views: Training views with their scores.
         config: Switches and settings.
         step: Steps done.
-        capacity: Gaussians that may be added.
+        capacity: Number of Gaussians that may be added.
         options: Settings of the rasterizer.
         generator: CPU generator, the same numbers on every device.
 

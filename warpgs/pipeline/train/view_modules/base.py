@@ -15,8 +15,8 @@ from warpgs.runtime.step_sizes import Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, View
 
 CAMERA_BYTES = 4 * (16 + 9)
-"""Bytes per Gaussian if cameras are learned: the Gaussian's part of the gradients of view matrix and intrinsics, before the
-sum."""
+"""Bytes per Gaussian if cameras are learned: its part of the gradients of view matrix and intrinsics, before the sum over
+Gaussians."""
 Tensors = Mapping[str, torch.Tensor]
 """Parameters of views, or values computed from them, by name."""
 
@@ -40,7 +40,7 @@ class FittedViews:
     gaussians: Gaussians
     """The fitted model."""
     options: RasterizeOptions
-    """Options for rendering it."""
+    """Options for rendering the model."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class ViewModule:
         return camera
 
     def after_render(self, rgb: torch.Tensor, values: Tensors) -> torch.Tensor:
-        """Return the rendered colours [H, W, 3] of one view after the module; differentiable. ``values`` are [...]."""
+        """Return the colours [H, W, 3] of one view after the module, which reads its ``values`` [...]; differentiable."""
         return rgb
 
     def regularisation(self, values: Tensors) -> torch.Tensor | None:

@@ -132,9 +132,9 @@ class Exposure(ViewModule):
         """Return the learned exposures and their effect.
 
         Returns:
-            ``views``, for each training view [A | b] as 3 rows of 4 and its ``gain``, the mean over channels of a middle gray
-            after exposure, divided by that gray; ``matched_psnr``, the mean over held-out views [dB], None without any;
-            ``summary``.
+            ``views``, for each training view [A | b] as 3 rows of 4, and ``gain``, the mean over channels of a middle gray
+            after exposure, divided by that gray; ``matched_psnr``, the mean PSNR of held-out views after colour matching [dB],
+            None without held-out views; ``summary``.
         """
         rows = fitted.params[EXPOSURE].double()
         numbers = exposure_of(rows, rows).detach().cpu().numpy().reshape(-1, CHANNELS, CHANNELS + 1)

@@ -110,8 +110,8 @@ def similar_cameras(
 
     Args:
         cameras: Cameras by name, in the world of the given ones.
-        given: Cameras before.
-        refined: The same cameras after, in the same order.
+        given: Cameras before refinement.
+        refined: The same cameras after refinement, in the same order.
         names: Names of the cameras to return.
     """
     R, scale, t = similarity(given, refined)
@@ -161,8 +161,8 @@ def pose_figures(
     """Return the changes by refinement, for metrics.json.
 
     Args:
-        given: Cameras before, in scene units.
-        refined: Cameras after.
+        given: Cameras before refinement, in scene units.
+        refined: Cameras after refinement.
         train: Names of the training views.
         held_out: Whether there are held-out views.
         scale: Scene units per unit of the scene's files.
@@ -204,7 +204,7 @@ class RefinePoses(ViewModule):
     """Learn a small correction of each training camera except the first, for inexact poses (docs/your-photos.md)."""
 
     start: float = 0.2
-    """Fraction of the steps before poses are refined, in [0, 1), because the initial Gaussians are inaccurate."""
+    """Fraction of the steps after which refinement of poses starts, in [0, 1): at first the Gaussians are inaccurate."""
     rotation_lr: float = 2e-4
     """Learning rate of the rotations of the training cameras [rad], when refinement starts."""
     translation_lr: float = 2e-4
