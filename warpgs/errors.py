@@ -8,7 +8,7 @@ class WarpgsError(Exception):
     """
 
     exit_code = 5
-    """Exit code of the program."""
+    """Exit code of `warpgs` after this error."""
 
 
 class UsageError(WarpgsError):

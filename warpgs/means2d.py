@@ -1,4 +1,4 @@
-"""Projected means that hold their gradients after a backward pass, as density strategies read them."""
+"""Projected means that hold their gradients after a backward pass, for density strategies."""
 
 from __future__ import annotations
 

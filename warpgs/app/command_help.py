@@ -15,7 +15,7 @@ WIDTH = 80
 NAMES = 22
 """Largest width of the column with flags and values [letters]."""
 FEW = 4
-"""Largest number of flags in a group that are explained; a larger group is only a list of names."""
+"""Largest number of flags in a group whose flags are explained; a larger group is only a list of names."""
 VALUES = {int: "N", float: "X", Path: "PATH", str: "VALUE"}
 """Placeholders for the value of a flag, by its type."""
 

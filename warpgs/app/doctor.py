@@ -58,7 +58,7 @@ class Package:
     required: bool
     """True where a fit needs it."""
     use: str
-    """Part that is lost without it."""
+    """Feature that does not work without it."""
     imported: bool = True
     """False if another check imports it in a subprocess; here it is only located."""
 

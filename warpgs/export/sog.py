@@ -48,8 +48,8 @@ MAX_META_BYTES = 2**20
 MAX_CONTENTS_BYTES = 2**16
 """Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
-"""Largest number of Gaussians per byte of a file, of pixels per Gaussian, and a number added to both limits: real files have
-one Gaussian per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
+"""Largest numbers of Gaussians per byte of a file and of pixels per Gaussian, and a number added to both limits. Real files
+have one Gaussian per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
 MAX_PIXEL_BYTES = 8
 """Largest number of bytes per pixel of a lossless WebP image; incompressible pixels take little more than 4."""
 MAX_PALETTE_PIXELS = 2**20

@@ -13,7 +13,7 @@ from warpgs.io.image_formats import avif, jpeg, png, webp
 from warpgs.io.image_formats.kinds import format_of
 
 MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
-"""Tags: maker and model of the device, orientation, place of the exposure data, and its equivalent focal length [mm]."""
+"""Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
 ASCII = 2
 NUMBERS = {3: "H", 4: "I"}
 """Layouts of the integers that these tags may hold, by type."""
@@ -42,7 +42,7 @@ class Exif:
 
     @property
     def device(self) -> str:
-        """Known parts of maker and model."""
+        """Maker and model, as far as known."""
         return " ".join(filter(None, (self.maker, self.model)))[:MAX_TEXT]
 
 

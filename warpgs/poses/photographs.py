@@ -166,8 +166,8 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
     """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata.
 
-    JPEG and PNG files that are upright keep their coded pixels; others are coded again, JPEG at quality `JPEG_QUALITY`, all
-    else as PNG of 8 bits.
+    JPEG and PNG files that are upright keep their coded pixels. Other files are coded again: JPEG files as JPEG of quality
+    `JPEG_QUALITY`, all others as PNG of 8 bits.
 
     Raises:
         DataError: The file has changed since it was matched.

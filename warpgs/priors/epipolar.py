@@ -1,8 +1,8 @@
 """Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
 
 After NexusGS (Zheng et al. 2025), with checks that its released code lacks: positive depths in both views, a smallest parallax,
-a position inside the image, and the round trip of the flow. The sensitivity is the true derivative. Derivation:
-docs/flow_epipolar.md.
+a position inside the image, and the round trip of the flow. The sensitivity of depth to the match is the true derivative.
+Derivation: docs/flow_epipolar.md.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return distances [px], shape [N], from pixels to their matches moved by the flow ``back`` [H, W, 2]; inf outside."""
+    """Return distances [px], shape [N], from pixels to their matches moved by the flow ``back`` [H, W, 2]; inf off it."""
     import cv2
 
     height, width = back.shape[:2]

@@ -1,4 +1,4 @@
-"""Given depth, converted to the scene's units, checked against consistent depth, and used instead of the sweep's depth.
+"""Given depth, converted to the scene's units, checked against consistent depth, and used instead of a plane sweep's.
 
 Derived in docs/decisions/022-given-depth.md. Depths are compared with the references of their view: depth of the sweep that
 other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to the
@@ -52,7 +52,7 @@ class Alignment:
     references: int = 0
     """Number of references."""
     difference: float = float("nan")
-    """Median relative difference from the references; NaN without any."""
+    """Median relative difference from the references; NaN without references."""
     why_not: str = ""
     """Reason why the map is not used; empty if it is used."""
 

@@ -72,7 +72,7 @@ def consistent_depth(
 def _backend(
     views: Mapping[int, View], planes: Mapping[int, np.ndarray], config: SweepConfig, device: torch.device
 ) -> tuple[Callable[[View, Sequence[View], np.ndarray], np.ndarray], list[str]]:
-    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on that."""
+    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on this."""
     notes: list[str] = []
     if device.type == "cuda":
         needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())

@@ -168,7 +168,7 @@ def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], ob
 
 
 def _stands_out(region: np.ndarray | None) -> bool:
-    """Return True where a region shows an object: False where a mask only cuts off a frame or a passer-by."""
+    """Return whether a region shows an object; False if a mask only cuts off a frame or a passer-by."""
     return region is not None and 0 < float(region.mean()) <= MAX_OBJECT_FRACTION
 
 

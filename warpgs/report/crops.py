@@ -1,4 +1,4 @@
-"""Windows in which images of one view differ most: the places worth enlarging."""
+"""Rectangular crops in which images of one view differ most, to be enlarged."""
 
 from __future__ import annotations
 

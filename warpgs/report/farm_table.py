@@ -33,7 +33,7 @@ class JobRow:
     step: int = 0
     """Steps done; 0 if unknown."""
     seconds: float = 0.0
-    """Time that it has taken [s]."""
+    """Time that the job has taken [s]."""
     psnr: float | None = None
     """Mean over held-out views [dB]."""
     gaussians: int = 0

@@ -99,11 +99,11 @@ class Stages:
 
     The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line is
     written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`. Elsewhere
-    the first line of a stage is shown at once, and then one every few seconds; the same line is shown once.
+    the first line of a stage is shown at once, and then one every few seconds; a repeated line is skipped.
     """
 
     def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
-        """Print plain lines with ``show``; ``live`` None writes lines in place if ``show`` is the default, in a terminal."""
+        """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
 

@@ -28,7 +28,7 @@ MAPS = {
 }
 """Images by name, with their descriptions."""
 NEAR = 1e-3
-"""Distance from a camera within which a view counts as at the camera, as a fraction of the cameras' extent."""
+"""Distance from a known camera, as a fraction of the cameras' extent, within which a browser's camera counts as there."""
 
 
 class Maps:

@@ -28,7 +28,7 @@ BOX, GIZMO = "/crop/box", "/crop"
 
 
 class Shown(Protocol):
-    """The window, as the panel uses it."""
+    """Methods of the window that the panel calls."""
 
     def redraw(self) -> None:
         """Send the current image."""

@@ -1,4 +1,4 @@
-"""The viewer's server: viser's, bound to this machine, without tunnels, for clients with its full address."""
+"""The viewer's server: viser's server without tunnels, open only to this machine and only at its full address."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ class Window:
                 frustum.visible = not frustum.visible
 
     def _eyes(self) -> list[np.ndarray]:
-        """Return the position [3] of each browser's camera: the first view's until the browser sends its own."""
+        """Return the position [3] of each browser's camera; until a browser sends it, the position of the first camera."""
         eyes = []
         for client in self.server.get_clients().values():
             try:

@@ -16,7 +16,7 @@ SWITCHES = ("help", "help-all")
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     import tyro
 
     from warpgs.pipeline.farm.run import EngineRequest, check_failures, make_engine, run_and_show
@@ -33,7 +33,7 @@ def run(arguments: list[str], about: str) -> int:
         engine: str = "local"
         """local (processes of this machine), ray or slurm."""
         slots: int | None = None
-        """Number of concurrent jobs. Default: --per-gpu for each GPU; one on a CPU; the capacity of a cluster."""
+        """Number of concurrent jobs. Default: --per-gpu times the GPUs; 1 on a CPU; a cluster's capacity."""
         per_gpu: int = 1
         """Jobs that share a GPU."""
         threads: int = 1

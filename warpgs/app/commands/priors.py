@@ -16,7 +16,7 @@ USAGE = (
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help.
+    """Run the command; ``about`` describes it in its help.
 
     Raises:
         UsageError: The first argument is neither show nor export.

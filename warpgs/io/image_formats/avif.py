@@ -1,4 +1,4 @@
-"""AVIF, decoded to 8 bits by Pillow's libavif, and its detection: HEIC files are ISO base media files, too.
+"""AVIF, decoded to 8 bits by Pillow's libavif, and its detection among ISO base media files, which HEIC files are, too.
 
 libavif rejects a file that ends early. Damage inside the coded pixels is not detected.
 """
@@ -22,7 +22,7 @@ BRANDS = {
 HEAD = 12
 """Bytes that decide: length, ``ftyp`` and the major brand."""
 BRANDS_END = 32
-"""End of the bytes in which the compatible brands are looked for."""
+"""End of the bytes that are searched for compatible brands."""
 BROKEN = (OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, struct.error)
 """Errors that Pillow raises about malformed files, as fuzzing shows."""
 
