@@ -202,7 +202,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class ViewDepth:
-    """Depth that other views confirm at the pixels of one view: evidence, not a render."""
+    """Depth at the pixels of one view, where other views confirm it; it is estimated or given, not rendered."""
 
     depth: np.ndarray
     """z-depth [u], float32, shape [H, W]; 0 where not valid."""

@@ -1,4 +1,4 @@
-"""Temporary files and folders, each locked by its owner: any process may remove those that are not locked.
+"""Temporary files and folders, each locked by its owner; any process may remove unlocked ones.
 
 The system releases a lock when its holder ends, killed or not. So a temporary file of a running process is never removed as a
 leftover, and the next command removes the files of a killed process.

@@ -47,7 +47,7 @@ class Exif:
 
 
 def read_exif(data: bytes) -> Exif:
-    """Return the EXIF values of an image file; damaged ones count as missing."""
+    """Return the EXIF values of an image file; damaged values count as missing."""
     try:
         return parse_exif(_block(data))
     except ValueError:
@@ -55,7 +55,7 @@ def read_exif(data: bytes) -> Exif:
 
 
 def parse_exif(block: bytes) -> Exif:
-    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged ones count as missing."""
+    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged values count as missing."""
     block = block.removeprefix(PREFIX)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
     if order is None:

@@ -14,7 +14,7 @@ MIN_KEYPOINTS = 100
 MIN_MATCHES = 15
 """Number of matches that a pair needs, all in agreement with one motion of the camera."""
 WEAK_MATCHES = 60
-"""Matches below which the link between two photographs is called weak: a few wrong ones bend the poses."""
+"""Matches below which the link between two photographs is called weak: a few wrong matches bend the poses."""
 WIDE_ANGLE = 30.0
 """Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few matches."""
 MAX_ADVICE = 8

@@ -33,7 +33,7 @@ MAX_KEYPOINTS = 4096
 MAX_CHANNELS = 256
 """Longest descriptor."""
 MIN_COSINE = 0.82
-"""Smallest cosine of the descriptors of a match: that of XFeat (Potje et al. 2024)."""
+"""Smallest cosine between the descriptors of a match, as in XFeat (Potje et al. 2024)."""
 TURN_SIDE, TURN_KEYPOINTS = 512, 512
 """Longer side [px] and number of keypoints of a photograph for the search of rotations between photographs."""
 TURN_GAIN = 2

@@ -27,7 +27,7 @@ RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
 SHOWN_FOLDERS = 10
 """Largest number of folders of photographs that a note names."""
 MATCHING_SIDE = 2000
-"""Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
+"""Longer side of the copies that are matched [px]; larger copies cost time and give the same points."""
 DIAGONAL_35MM = math.hypot(36, 24)
 """Diagonal of 35 mm film [mm], by which the equivalent focal length in EXIF is defined (CIPA DCG-001)."""
 JPEG_QUALITY = 98

@@ -28,7 +28,8 @@ MIN_RATIO = 0.6
 """Fraction of a network's matches of a pair that must agree with one motion: for most places that only look alike it
 is smaller (decision 017)."""
 PEAK = 0.003
-"""Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on temple, fern."""
+"""Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on the scenes temple and
+fern."""
 CAMERA_MODEL = "SIMPLE_RADIAL"
 """One focal length and one coefficient of distortion, which a few photographs can determine."""
 

@@ -171,7 +171,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
         depths: Candidates [u], shape [S, N], nearest source first.
         sensitivities: |dz/dpx| of each [u/px], at least 0, shape [S, N].
         valid: True where a candidate passed the checks, shape [S, N].
-        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties that of the nearest source; nearest_first
+        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties the nearest source's; nearest_first takes
             the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
 
     Returns:

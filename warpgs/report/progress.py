@@ -138,7 +138,7 @@ class Stages:
 
 
 def waiting() -> Stages:
-    """Return stages that are shown only in a terminal, for waits that no log needs."""
+    """Return stages that are shown only in a terminal, for waits that a log need not mention."""
     return Stages(lambda line: None, live=is_live())
 
 

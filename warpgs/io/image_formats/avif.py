@@ -1,4 +1,4 @@
-"""AVIF, decoded to 8 bits by Pillow's libavif, and its detection among ISO base media files, which HEIC files are, too.
+"""AVIF: decoding to 8 bits by Pillow's libavif, and detection; HEIC files have the same container (ISO base media file).
 
 libavif rejects a file that ends early. Damage inside the coded pixels is not detected.
 """
