@@ -20,8 +20,8 @@ ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
 
 LOW_PASS = 0.3
-"""Variance added to a projected Gaussian along both image axes [px^2]: the 1/12 of a pixel's box filter, plus a margin against
-aliasing."""
+"""Variance added to a projected Gaussian along both image axes [px^2]: the variance of a pixel's box filter, 1/12, plus a
+margin against aliasing."""
 
 TILE_SIZE = 16
 """Default side of a tile [px], also in fits."""

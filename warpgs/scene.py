@@ -39,8 +39,8 @@ class Camera:
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
     """Coefficients of the model, shape [P] (shared by all cameras) or [C, P]; None for models without coefficients. An opencv
-    camera has k1 k2 p1 p2 k3 k4 k5 k6, a fisheye k1 to k4; zeros mean an ideal lens. They have no gradients: a tensor that
-    requires gradients is an error."""
+    camera has k1 k2 p1 p2 k3 k4 k5 k6, a fisheye k1 to k4; zeros mean an ideal lens. Coefficients get no gradients: a
+    tensor that requires gradients is an error."""
 
     @property
     def center(self) -> np.ndarray:
@@ -346,8 +346,8 @@ class Render:
     alpha: torch.Tensor
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
-    """Expected z-depth [u] (for a fisheye the distance): the mean by blending weights; 0 where nothing is blended. Shape
-    [..., H, W]."""
+    """Expected z-depth [u] (for a fisheye the distance): the mean weighted by blending weights; 0 where nothing is blended.
+    Shape [..., H, W]."""
     projected: torch.Tensor
     """Projected Gaussians, laid out as in kernels/project_inputs.py, shape [C, N, 12]; ``retain_grad()`` keeps gradients."""
     tile_counts: torch.Tensor

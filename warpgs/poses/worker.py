@@ -167,10 +167,10 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether EXIF's focal length is kept: whether the best model of ``kept``, which has it, is as good as of ``free``.
+    """Return whether EXIF's focal length is kept: models ``kept`` have it, for models ``free`` it was estimated.
 
-    It must have at least as many photographs, and at most `MAX_RATIO` times the error. If a list is empty, return whether
-    ``kept`` has models.
+    The best of ``kept`` must have at least as many photographs as the best of ``free``, and at most `MAX_RATIO` times its
+    error. If a list is empty, return whether ``kept`` has models.
     """
     if not kept or not free:
         return bool(kept)

@@ -149,7 +149,7 @@ def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return distances [px], shape [N], from pixels to their matches moved by the flow ``back`` [H, W, 2]; inf off it."""
+    """Return the distance [px] from each pixel to its match after the flow ``back`` [H, W, 2], shape [N]; inf outside."""
     import cv2
 
     height, width = back.shape[:2]

@@ -1,4 +1,4 @@
-"""Given depth, converted to the scene's units, checked against consistent depth, and used instead of a plane sweep's.
+"""Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a sweep.
 
 Derived in docs/decisions/022-given-depth.md. Depths are compared with the references of their view: depth of the sweep that
 other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to the

@@ -29,7 +29,7 @@ MAX_TINT = 1.1
 """The white balance is reported if a channel's factor differs from the factor of brightness by more than this ratio, up or
 down."""
 NEIGHBORS = 4
-"""Number of nearest photographs with which each photograph is compared; it is also compared where it is one of the nearest."""
+"""Each photograph is compared with this many nearest ones, and with all that have it among their nearest ones."""
 MIN_MATCHES = 10
 """Smallest number of matches for a comparison of two photographs."""
 MAX_FEATURES = 1000

@@ -33,7 +33,7 @@ def run(arguments: list[str], about: str) -> int:
         engine: str = "local"
         """local (processes of this machine), ray or slurm."""
         slots: int | None = None
-        """Number of concurrent jobs. Default: --per-gpu times the GPUs; 1 on a CPU; a cluster's capacity."""
+        """Number of concurrent jobs. Default: --per-gpu times the number of GPUs; on a CPU, 1; on a cluster, its capacity."""
         per_gpu: int = 1
         """Jobs that share a GPU."""
         threads: int = 1
