@@ -64,7 +64,7 @@ def load_scene(
             `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
         black_is_empty: True to make dark pixels around an object and in its holes transparent, if every image shows an object
-            on black, without an alpha channel or a mask.
+            on black and none has an alpha channel or a mask.
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder, if it
             exists.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.

@@ -47,8 +47,8 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
 
     Args:
         loaded: The image at its final size.
-        values: The map, as the image was stored or upright, at its size or another of the same aspect, shape [H, W] or
-            [H, W, C].
+        values: The map, upright or oriented like the stored image, at the image's size or another size of the same aspect,
+            shape [H, W] or [H, W, C].
         path: File of the map, for errors.
 
     Raises:

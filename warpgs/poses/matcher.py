@@ -1,7 +1,7 @@
 """Keypoints and matches of photographs by a network that the user names, for photographs without a pose from SIFT.
 
-The network is one ONNX file. It takes an image, colours in [0, 1], and returns `keypoints` [K, 2] in pixels of its input (pixel
-centres at +0.5), `scores` [K], positive where there is a keypoint, and `descriptors` [K, D] of length 1.
+The network is one ONNX file. It takes an image with colours in [0, 1]. Its outputs are `keypoints` [K, 2] in pixels of its
+input (centres at +0.5), `scores` [K] (positive for a keypoint), and `descriptors` [K, D] of length 1.
 """
 
 from __future__ import annotations

@@ -60,8 +60,8 @@ class PairDepth:
     sensitivity: np.ndarray
     """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
     valid: np.ndarray
-    """True where both depths are positive, the parallax suffices, the point of the line nearest to the match is in the second
-    image, and the depth is finite."""
+    """True where both depths are positive, the parallax suffices, the depth is finite, and the epipolar line's point nearest to
+    the match is in the second image."""
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
