@@ -56,8 +56,8 @@ SHORTEST_QUAT = 1e-15
 quaternion is divided by its length."""
 
 COVARIANCE_TOLERANCE = 1e-5
-"""Largest negative eigenvalue of a covariance that counts as 0, as a fraction of its largest variance: 80 roundings of float32.
-A Gaussian with a lower eigenvalue is culled."""
+"""Largest magnitude of a negative eigenvalue that counts as 0, as a fraction of the covariance's largest variance: 80 roundings
+of float32. A Gaussian with a lower eigenvalue is culled."""
 
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""

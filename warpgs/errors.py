@@ -27,7 +27,7 @@ class NotFiniteError(WarpgsError):
     """A non-finite loss or parameter of a fit."""
 
     view: int | None = None
-    """Number of the training view with a non-finite loss; None for other values."""
+    """Number of the training view with a non-finite loss; None if another value is not finite."""
     slot: int = 0
     """Index of this view among the views of the step."""
 

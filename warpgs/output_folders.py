@@ -256,7 +256,7 @@ def open_file(path: Path, below: Path) -> BinaryIO:
 
 
 def _opened(name: str, more: int, at: int | None) -> int:
-    """Open a folder and return its descriptor, also where it may not be listed."""
+    """Open a folder and return its descriptor, even if the folder may not be listed."""
     try:
         return os.open(name, FOLDER | more, dir_fd=at)
     except PermissionError:

@@ -31,9 +31,9 @@ T = TypeVar("T", bound=Named)
 class Registry(Generic[T]):
     """Classes of one kind by name.
 
-    Built-in classes are in the modules of a package; looking up a name imports them all. So a new class is a new file. A
-    user's own class is passed in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A name in
-    a stored file never causes an import.
+    Built-in classes are in the modules of a package; looking up a name imports them all. So a new class needs only a new
+    file. A user's own class is passed in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A
+    name in a stored file never causes an import.
     """
 
     def __init__(self, kind: str, base: type[T], package: str):

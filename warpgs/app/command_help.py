@@ -26,7 +26,7 @@ def help_text(kind: type, program: str, description: str) -> str:
     Args:
         kind: Dataclass of the flags, as for `parse_flags`.
         program: Name of the program and the command.
-        description: Description of the command; lines of lists begin with two spaces.
+        description: Description of the command; lines of a list begin with two spaces.
     """
     docs, usage, positionals, flags, more = field_docs(kind), [program], [], [], []
     for field in dataclasses.fields(kind):

@@ -78,7 +78,7 @@ PACKAGES = (
 )
 EXTRAS = {
     "poses": ("pycolmap", "photographs without cameras"),
-    "view": ("viser", "the viewer and pages to send"),
+    "view": ("viser", "the viewer and HTML pages of models"),
     "formats": ("zstandard", "SPZ of version 4"),
 }
 """Optional dependencies by name: the module by which each is detected, and its purpose."""

@@ -138,7 +138,7 @@ def half_turn(arrays: Arrays, axis: str) -> Arrays:
 
     Args:
         arrays: The Gaussians.
-        axis: x (between the axes of SPZ, RUB, and those of PLY, RDF) or z (between PLY and the y-up axes of glTF).
+        axis: x (converts between SPZ's axes, RUB, and PLY's, RDF) or z (between PLY's axes and the y-up axes of glTF).
     """
     copies = arrays | {name: np.array(arrays[name]) for name in ("means", "quats", "sh")}
     half_turn_in_place(copies, axis)

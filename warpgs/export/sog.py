@@ -106,7 +106,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a codebook of 256 ascending entries, and the index of the entry nearest to each of ``values``, uint8, equal shape.
+    """Return a codebook of 256 ascending entries, and the index of the entry nearest to each of ``values``, uint8, same shape.
 
     Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that results repeat.
     """
@@ -211,7 +211,7 @@ def _harmonics(
 
 
 def _colors(book: np.ndarray, pixels: np.ndarray, sh: np.ndarray) -> np.ndarray:
-    """Set the first of the coefficients [N, K, 3] by their pixels [P, 4]; returns the logits of the opacities [N]."""
+    """Set the first coefficient in ``sh`` [N, K, 3] from colour pixels [P, 4]; returns the logits of the opacities [N]."""
     for part in parts(len(sh)):
         sh[part, 0] = book[pixels[part, :3]]
     return by_rows(len(sh), (), lambda p: logits(pixels[p, 3] / 255, 1 / 255))

@@ -91,7 +91,7 @@ class _Names:
         self._ends: dict[tuple[bool, int], dict[str, list[str]]] = {}
 
     def find(self, wanted: str) -> str:
-        """Return the view of a name, given whole or by its last parts, with suffix or without; the strictest match decides."""
+        """Return the view with the wanted name or name end, with suffix or without; the strictest kind of match decides."""
         parts = wanted.count("/") + 1
         for count in (0, parts):
             for bare in (False, True):

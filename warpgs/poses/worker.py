@@ -84,7 +84,7 @@ def verification_options(pycolmap: Any) -> Any:
 
 
 def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Write the keypoints and matches of a network into the database and verify them; return what `matched` does."""
+    """Write the keypoints and matches of a network into the database and verify them; return the result of `matched`."""
     with np.load(job["learned"], allow_pickle=False) as learned:
         pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
         matches = np.split(learned["matches"], ends[:-1])
@@ -113,7 +113,7 @@ def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Match pairs of photographs; return what `matched` does."""
+    """Match pairs of photographs; return the result of `matched`."""
     with pycolmap.Database.open(job["database"]) as database:
         order = numbers_of(database, job)
         few = len(order) <= job["exhaustive"]

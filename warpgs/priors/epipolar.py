@@ -149,7 +149,7 @@ def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return the distance [px] from each pixel to its match after the flow ``back`` [H, W, 2], shape [N]; inf outside."""
+    """Return the distance [px] from each pixel to its match moved by the flow ``back`` [H, W, 2], shape [N]; inf outside."""
     import cv2
 
     height, width = back.shape[:2]
@@ -169,7 +169,7 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
     Args:
         depths: Candidates [u], shape [S, N], nearest source first.
-        sensitivities: |dz/dpx| of each [u/px], at least 0, shape [S, N].
+        sensitivities: |dz/dpx| of each candidate [u/px], at least 0, shape [S, N].
         valid: True where a candidate passed the checks, shape [S, N].
         mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties the nearest source's; nearest_first takes
             the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.

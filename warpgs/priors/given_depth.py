@@ -144,7 +144,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
 
     Args:
         view: A view with given depth.
-        found: Depth of the view from the sweep that other views confirm; None without a sweep.
+        found: Swept depth of the view, where other views confirm it; None without a sweep.
         known: Points of the reconstruction, with the views that saw them.
     """
     assert view.depth is not None
@@ -157,7 +157,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
         made = Alignment(1.0, 0.0, count, float(np.median(np.abs(values / wanted - 1))))
         if 1 / MAX_RATIO <= ratio <= MAX_RATIO:
             return made
-        return replace(made, why_not=f"its depths are {ratio:.4g} times those that the views confirm")
+        return replace(made, why_not=f"its depths are {ratio:.4g} times the depths that the views confirm")
     if count < MIN_OVERLAP:
         why_not = f"{count} depths are known at its pixels, and the fit needs at least {MIN_OVERLAP}"
         return Alignment(references=count, why_not=why_not)
@@ -188,7 +188,7 @@ def votes(
 
     Args:
         views: All views, pinholes.
-        depths: Depth of each [u], 0 for missing values, shape [H, W] each.
+        depths: Depth of each view [u], 0 for missing values, shape [H, W] each.
         index: Index of the view.
         near: Number of nearest views to compare with.
 
@@ -224,7 +224,7 @@ def with_given_depth(
 
     Args:
         views: Training views, pinholes.
-        found: Estimated depth of each view that other views confirm; None if not estimated.
+        found: Estimated depth of each view, where other views confirm it; None if not estimated.
         known: Points of the reconstruction.
 
     Raises:
@@ -283,11 +283,11 @@ def _notes(
     if compared:
         off = [a.difference for a in compared]
         notes[0] += (
-            f"; median difference from depth that other views confirm {np.median(off):.1%} (worst view {max(off):.1%}), at "
+            f"; median difference from depths that other views confirm: {np.median(off):.1%} (worst view {max(off):.1%}), at "
             f"{sum(a.references for a in compared):,} pixels"
         )
     if len(compared) < len(used):
-        notes[0] += f"; {len(used) - len(compared)} of them without a comparison"
+        notes[0] += f"; {len(used) - len(compared)} of these views without a comparison"
     if removed:
         notes[0] += f"; {removed:.1%} of the given depths left out, because other views see through them"
     if refused:

@@ -24,7 +24,7 @@ class Sight(NamedTuple):
     """Shared sight of pairs of V views, as fractions of what the first view of a pair sees."""
 
     overlap: np.ndarray
-    """Fraction of the first view's sight that the second shares, less at larger angles, in [0, 1], shape [V, V]."""
+    """Fraction of what the first view sees that the second sees, too, less at larger angles, in [0, 1], shape [V, V]."""
     matching: np.ndarray
     """Shared fraction, weighted by how well depth can be found at the angle; 0 for a view and itself, shape [V, V]."""
 

@@ -65,7 +65,7 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
     Raises:
         DataError: There are no frames, or they differ in size.
         ResourceError: Pillow cannot encode the image, or the file cannot be written.
-        UsageError: There are too many frames, or too many a second for browsers.
+        UsageError: There are too many frames, or too many per second for browsers.
     """
     from PIL import Image
 

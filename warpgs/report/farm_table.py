@@ -121,7 +121,7 @@ class FarmTable:
         bar = Table.grid()  # alone, the bar does not end its line
         bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
         more = len(running) - MOST_RUNNING
-        rest = [Text(f"and {more} more at work", style="dim")] if more > 0 else []
+        rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
         messages = [
             Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
             for r in reversed(last) if r.message

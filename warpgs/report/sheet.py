@@ -24,7 +24,7 @@ class Cell:
     """One image of a row."""
 
     image: np.ndarray
-    """Colours in [0, 1], [H, W, 3], one size in a row."""
+    """Colours in [0, 1], [H, W, 3]; all images of a row have one size."""
     caption: str
     """Text below the image."""
 

@@ -27,7 +27,7 @@ def run(arguments: list[str], about: str) -> int:
     class Farm:
         jobs: tyro.conf.Positional[str]
         """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} per line, with any flags of
-        `warpgs fit`. Place it before switches of `warpgs fit`, such as --strict."""
+        `warpgs fit`. Place this argument before switches of `warpgs fit`, such as --strict."""
         out: Path
         """Folder of the results. Repeat the command to continue; start it on several machines to share the work."""
         engine: str = "local"
@@ -77,7 +77,7 @@ def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
-    """Return the jobs, each with the settings of the shared arguments and of its own."""
+    """Return the jobs, each with settings from the shared arguments and from its own arguments."""
     from warpgs.pipeline.farm.job import FarmJob
 
     requests: dict = {}

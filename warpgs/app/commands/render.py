@@ -25,8 +25,8 @@ def run(arguments: list[str], about: str) -> int:
         rule: str | None = None
         """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
-        """Render a file of Gaussians with antialiasing, for antialiased models (gsplat's rasterize_mode antialiased) in files
-        that do not declare this."""
+        """Render a file of Gaussians with antialiasing. Needed for antialiased models (gsplat's rasterize_mode antialiased) if
+        the file does not declare this."""
         path: str = "auto"
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""

@@ -20,7 +20,7 @@ BRANDS = {
 }  # fmt: skip
 """Major brands of ISO base media files (ISO/IEC 14496-12; 23008-12 for HEIC), and the formats that they stand for."""
 HEAD = 12
-"""Bytes that decide: length, ``ftyp`` and the major brand."""
+"""Number of first bytes that determine the format: length, ``ftyp`` and the major brand."""
 BRANDS_END = 32
 """End of the bytes that are searched for compatible brands."""
 BROKEN = (OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, struct.error)
