@@ -16,7 +16,7 @@ SAMPLES = 20_000
 ROUNDS = 8
 """Rounds of k-means."""
 NEIGHBOURS = {"photographs": 2, "video": 10}
-"""By kind of source: a photograph is matched with this many before and this many after it, in the order of names."""
+"""Number of neighbours on each side, in the order of names, that a photograph is matched with, by kind of source."""
 LOOKALIKES = {"photographs": 20, "video": 5}
 """Number of most similar photographs that a photograph is matched with, by kind of source."""
 
