@@ -38,9 +38,9 @@ NEAR = 0.01
 """Nearest depth that is rendered [u]."""
 
 FAR = 1e10
-"""Farthest depth that is rendered [u]. This limit, the next four and `LARGEST_COEFFICIENT` are far beyond any usual scene. They
-are narrow enough that no product in the backward pass overflows float32 (docs/extremes.md). So every rendered Gaussian has
-finite gradients, and float64 renders the same Gaussians."""
+"""Farthest depth that is rendered [u]. This limit, `FARTHEST_PIXEL`, `LARGEST_AXIS`, `SMALLEST_DETERMINANT`, `SHORTEST_QUAT`
+and `LARGEST_COEFFICIENT` are far beyond any usual scene. They are narrow enough that no product in the backward pass overflows
+float32 (docs/extremes.md). So every rendered Gaussian has finite gradients, and float64 renders the same Gaussians."""
 
 FARTHEST_PIXEL = 1e9
 """Largest coordinate of a projected mean [px]. Beyond it, neighbouring floats are 64 px and more apart."""

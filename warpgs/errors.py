@@ -29,7 +29,7 @@ class NotFiniteError(WarpgsError):
     view: int | None = None
     """Number of the training view with a non-finite loss; None if another value is not finite."""
     slot: int = 0
-    """Index of this view among the views of the step."""
+    """Index of the view ``view`` among the views of the step."""
 
 
 class ResourceError(WarpgsError):

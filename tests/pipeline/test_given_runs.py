@@ -82,7 +82,7 @@ def test_a_wrong_unit_is_named_before_the_first_step(folder, tmp_path, capsys):
     out = tmp_path / "run"
     assert main(command(folder, out, "--depths", str(folder / "depths"), "--depth-unit", "1")) == 3
     said = capsys.readouterr().err
-    assert "no depth map can be used" in said and "times the depths that the views confirm" in said and "--depth-unit" in said
+    assert "no depth map can be used" in said and "times those that the views confirm" in said and "--depth-unit" in said
     assert not (out / "metrics.jsonl").exists()
     assert main(command(folder, out, "--depths", "nowhere")) == 3 and "no such folder" in capsys.readouterr().err
 

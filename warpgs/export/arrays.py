@@ -11,7 +11,7 @@ from warpgs.errors import DataError
 from warpgs.scene import Gaussians
 
 ROWS = 16384
-"""Gaussians that are decoded at a time, so that float64 copies of a whole model never exist."""
+"""Number of Gaussians decoded at a time, so that float64 copies of a whole model never exist."""
 Arrays = dict[str, np.ndarray]
 """The five tensors of `Gaussians` by field name, as numpy arrays of any float type, means and log scales in file units."""
 

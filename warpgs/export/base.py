@@ -148,5 +148,5 @@ def warn_of_antialiasing(path: Path) -> None:
 
 
 FORMATS: Registry[Format] = Registry("format", Format, __package__)
-"""File formats of Gaussians by name; those in the modules of this folder are built in."""
+"""File formats of Gaussians by name; those in the modules of `warpgs.export` are built in."""
 register = FORMATS.register

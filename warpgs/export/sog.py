@@ -37,7 +37,7 @@ from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
 
 LEVELS = 256
-"""Entries of a codebook."""
+"""Number of entries of a codebook."""
 PALETTE = 65536
 """Largest number of rows of harmonics."""
 COLUMNS = 64

@@ -38,7 +38,7 @@ class Pose:
     name: str
     """Path below the image folder, POSIX style, as in the file."""
     camera_id: int
-    """Number of its camera."""
+    """Number of the image's camera."""
     quat: tuple[float, ...]
     """Rotation of camera_from_world, wxyz."""
     translation: tuple[float, ...]

@@ -16,7 +16,7 @@ MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769,
 """Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
 ASCII = 2
 NUMBERS = {3: "H", 4: "I"}
-"""Layouts of the integers that these tags may hold, by type."""
+"""Layouts of the integers that EXIF tags may hold, by type."""
 MAX_ENTRIES = 1000
 """Largest number of tags in a directory."""
 MAX_TEXT = 100

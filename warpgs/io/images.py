@@ -96,9 +96,9 @@ class LoadedImage:
     undone: Lens | None = None
     """Lens whose distortion was removed at ``full_size``; None without distortion."""
     depth: GivenDepth | None = None
-    """Given depth of its pixels, metric depth in file units; None without given depth."""
+    """Given depth of the image's pixels, metric depth in file units; None without given depth."""
     normals: np.ndarray | None = None
-    """Given normals of its pixels, as `View.normals`; None without given normals."""
+    """Given normals of the image's pixels, as `View.normals`; None without given normals."""
 
 
 def list_images(folder: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from warpgs.scene import DEPTH_KINDS
 
 SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
-"""Suffixes of other files that may hold maps, which a message names."""
+"""Suffixes of unsupported files that may hold maps, for a message."""
 NONE = "none"
 """Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"

@@ -38,7 +38,7 @@ class FoundView:
     center: np.ndarray
     """Camera centre [file units], shape [3]."""
     points: int
-    """Number of points that it sees."""
+    """Number of points that the photograph sees."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class Mapping:
     views: dict[int, FoundView]
     """Views of the largest model."""
     cameras: tuple[FoundCamera, ...]
-    """Cameras of these views."""
+    """Cameras of the views in ``views``."""
     groups: tuple[tuple[int, ...], ...]
     """Photographs of each model, the largest first: photographs of different models share too little."""
     points: int
     """Number of points of the largest model."""
     error: float
-    """Mean reprojection error of these points [px of the photograph]; 0 without a model."""
+    """Mean reprojection error of the largest model's points [px of the photograph]; 0 without a model."""
     method: str
     """Mapper that made the model: incremental or global."""
     version: str

@@ -31,7 +31,7 @@ MULTIPLE = 32
 MAX_KEYPOINTS = 4096
 """Largest number of keypoints of a photograph; those with the highest scores are kept."""
 MAX_CHANNELS = 256
-"""Longest descriptor."""
+"""Largest number of entries of a descriptor."""
 MIN_COSINE = 0.82
 """Smallest cosine between the descriptors of a match, as in XFeat (Potje et al. 2024)."""
 TURN_SIDE, TURN_KEYPOINTS = 512, 512

@@ -12,7 +12,7 @@ import numpy as np
 WORDS = 256
 """Size of the vocabulary."""
 SAMPLES = 20_000
-"""Descriptors that the vocabulary is made from."""
+"""Number of descriptors from which the vocabulary is made."""
 ROUNDS = 8
 """Rounds of k-means."""
 NEIGHBOURS = {"photographs": 2, "video": 10}

@@ -157,7 +157,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
         made = Alignment(1.0, 0.0, count, float(np.median(np.abs(values / wanted - 1))))
         if 1 / MAX_RATIO <= ratio <= MAX_RATIO:
             return made
-        return replace(made, why_not=f"its depths are {ratio:.4g} times the depths that the views confirm")
+        return replace(made, why_not=f"its depths are {ratio:.4g} times those that the views confirm")
     if count < MIN_OVERLAP:
         why_not = f"{count} depths are known at its pixels, and the fit needs at least {MIN_OVERLAP}"
         return Alignment(references=count, why_not=why_not)

@@ -14,7 +14,7 @@ from warpgs.scene import Camera
 SAMPLES = 4
 """Number of sampled pixels along each side of an image."""
 DEPTHS = 3
-"""Number of depths at each of these pixels."""
+"""Number of depths at each sampled pixel."""
 LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
 """Angles between two rays to a point [deg]. Below the first, depth is uncertain. Above the second, a surface looks different to
 both views. From the third on, the views are assumed to share nothing."""

@@ -35,7 +35,7 @@ class JobCard:
 
     row: JobRow
     ssim: float | None = None
-    """Mean over held-out views."""
+    """Mean SSIM over held-out views."""
     ply_bytes: int = 0
     """Size of the PLY file."""
     thumbnail: str = ""

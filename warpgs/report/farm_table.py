@@ -35,7 +35,7 @@ class JobRow:
     seconds: float = 0.0
     """Time that the job has taken [s]."""
     psnr: float | None = None
-    """Mean over held-out views [dB]."""
+    """Mean PSNR over held-out views [dB]."""
     gaussians: int = 0
     message: str = ""
     """Reason of a failure, or a note."""

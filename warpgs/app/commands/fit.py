@@ -215,7 +215,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         out: Path
         """Run folder."""
         resume: bool = False
-        """Continue it."""
+        """Continue the run."""
         device: str | None = None
         """auto, cpu or cuda. Default: the device of the run."""
         threads: int = 0
