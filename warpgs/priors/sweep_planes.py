@@ -23,7 +23,7 @@ to memory takes as long as the computation."""
 MAX_LARGE_STEP = 0.99
 """Largest penalty P2 at which the sum of four path costs, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
 PLANES_AT_ONCE = 16
-"""Number of planes per kernel launch on the GPU."""
+"""Number of planes per launch on the GPU."""
 
 
 @dataclass(frozen=True)
