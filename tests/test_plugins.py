@@ -118,7 +118,7 @@ def test_an_unknown_name_lists_those_there_are(registry):
 def test_a_name_with_a_colon_is_never_imported_by_find(registry, own):
     """Whatever it names, module or file."""
     for spec in (f"{own}:Own", "own_strategy:Own"):
-        with pytest.raises(UsageError, match="does not load its code"):
+        with pytest.raises(UsageError, match="does not load your code"):
             registry.find(spec)
     assert not own.with_suffix(".ran").exists() and "own_strategy" not in sys.modules
 

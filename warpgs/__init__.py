@@ -1,8 +1,8 @@
 """Sparse-view Gaussian splatting on any machine: `warpgs fit scene/`, or only the rasterizer, `warpgs.rasterize`.
 
-Units: Gaussians and cameras are in ``scene`` units, those of a `Scene` that `load_scene` returned (recentred and rescaled), or
-in ``file`` units, those of the scene's own files and of PLY. Functions that convert have an argument ``units``. Others, such as
-`rasterize`, need Gaussians and cameras in the same units.
+Units: Gaussians and cameras are in ``scene`` units or in ``file`` units. A `Scene` that `load_scene` returns is in scene units:
+recentred and rescaled. The scene's own files and PLY files are in file units. Functions that convert between the two have an
+argument ``units``. All other functions, such as `rasterize`, need Gaussians and cameras in the same units.
 """
 
 from __future__ import annotations
@@ -125,8 +125,8 @@ _HOMES = {
     }.items()
     for name in names
 }
-"""Module of each public name: modules load on first use, since importing torch and Warp takes seconds, which would delay
-`warpgs --help`."""
+"""Module of each public name. Modules load on first use, because importing torch and Warp would delay `warpgs --help` by
+seconds."""
 
 
 def __getattr__(name: str) -> object:

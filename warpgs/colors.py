@@ -1,4 +1,4 @@
-"""Colours as spherical-harmonics coefficients of degree 0: the part of a Gaussian's colour that all directions share."""
+"""Colours as spherical-harmonics coefficients of degree 0, the part of a colour that is the same in all directions."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ C0 = 0.28209479177387814
 
 
 def base_colors(sh: np.ndarray | torch.Tensor) -> np.ndarray | torch.Tensor:
-    """Return the colours [N, 3], not clipped, that the degree-0 terms of coefficients [N, K, 3] give."""
+    """Return the unclipped colours [N, 3] given by the degree-0 terms of coefficients [N, K, 3]."""
     return 0.5 + C0 * sh[:, 0]
 
 

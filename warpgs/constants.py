@@ -1,4 +1,4 @@
-"""Cut-offs and limits of rendering, each with its derivation, and the rules made of them."""
+"""Cut-offs and limits of rendering with their derivations, and rules: named sets of cut-offs."""
 
 from __future__ import annotations
 
@@ -20,25 +20,27 @@ ALPHA_MAX = 0.99
 """Largest alpha of one Gaussian, so that 1 / (1 - alpha) in the backward pass stays below 100."""
 
 LOW_PASS = 0.3
-"""Variance added to both image axes [px^2]: the variance 1/12 of a pixel's box filter, plus a margin against aliasing."""
+"""Variance added to a projected Gaussian along both image axes [px^2]: the variance of a pixel's box filter, 1/12, plus a
+margin against aliasing."""
 
 TILE_SIZE = 16
 """Default side of a tile [px], also in fits."""
 
 K_TOLERANCE = 1e-5
-"""Largest error of the fixed entries of K. Such an error moves the pixels of an image of 2000 px by 0.02 px."""
+"""Largest accepted error of the fixed entries of K, the zeros and the 1. Such an error moves the pixels of an image of 2000 px
+by 0.02 px."""
 
 POSE_TOLERANCE = 1e-3
-"""Largest rounding error of an entry of R R^T - 1, and of the last row of a pose. The product of a thousand rotations in
+"""Largest accepted error of an entry of R R^T - 1 and of a pose's last row. The product of a thousand rotations in
 float32 is off by at most 1000 x 3 x 2^-23 = 4e-4. An error as large as the tolerance changes lengths by 0.05 %."""
 
 NEAR = 0.01
 """Nearest depth that is rendered [u]."""
 
 FAR = 1e10
-"""Farthest depth that is rendered [u]. This limit, the next four and `LARGEST_COEFFICIENT` are far beyond any usual scene. They
-are narrow enough that no product in the backward pass overflows float32 (docs/extremes.md). So every rendered Gaussian has
-finite gradients, and float64 renders the same Gaussians."""
+"""Farthest depth that is rendered [u]. This limit, `FARTHEST_PIXEL`, `LARGEST_AXIS`, `SMALLEST_DETERMINANT`, `SHORTEST_QUAT`
+and `LARGEST_COEFFICIENT` are far beyond any usual scene. They are narrow enough that no product in the backward pass overflows
+float32 (docs/extremes.md). So every rendered Gaussian has finite gradients, and float64 renders the same Gaussians."""
 
 FARTHEST_PIXEL = 1e9
 """Largest coordinate of a projected mean [px]. Beyond it, neighbouring floats are 64 px and more apart."""
@@ -50,12 +52,12 @@ SMALLEST_DETERMINANT = 1e-36
 """Smallest determinant, and smallest yy entry, of a scaled-down projected covariance (docs/project.md, section 4)."""
 
 SHORTEST_QUAT = 1e-15
-"""Length of the shortest quaternion that gives a rotation; the longest has 1 / SHORTEST_QUAT. The gradient of a quaternion is
-divided by its length."""
+"""Length of the shortest quaternion that gives a rotation; the longest has the length 1 / SHORTEST_QUAT. The gradient of a
+quaternion is divided by its length."""
 
 COVARIANCE_TOLERANCE = 1e-5
-"""Largest negative eigenvalue of a covariance that counts as 0, as a fraction of its largest variance: 80 roundings of float32.
-A Gaussian with a lower eigenvalue is culled."""
+"""Largest magnitude of a negative eigenvalue that counts as 0, as a fraction of the covariance's largest variance: 80 roundings
+of float32. A Gaussian with a lower eigenvalue is culled."""
 
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""
@@ -66,10 +68,10 @@ divided by this sum: the factor is at most 1e30, within float32. Smaller sums oc
 
 FRUSTUM_MARGIN = 0.15
 """Margin around the image, as a fraction of its size on every side. The Jacobian is taken at the projected mean, clamped to the
-image with this margin: the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023 for a centred principal point."""
+image with this margin. For a centred principal point, that is the factor 1.3 on tan(fov / 2) of Kerbl et al. 2023."""
 
 RIM_SAMPLES = 16
-"""Number of points at which a lens is tested for folding back, from the axis to a position; the last is the position."""
+"""Number of points, from the axis to a position, at which a lens is tested for folding back; the position is the last."""
 
 
 @document_fields
@@ -85,20 +87,21 @@ class Rule:
     alpha_cut: float = ALPHA_CUT
     """Smallest alpha that is blended, 1/255 by default. With 0 all are blended, and every Gaussian touches every tile."""
     alpha_max: float = ALPHA_MAX
-    """Largest alpha; where alpha is clamped to it, its gradient is zero."""
+    """Largest alpha; larger values are clamped to it and have no gradient."""
     transmittance_stop: float = TRANSMITTANCE_STOP
     """Transmittance below which a pixel is finished."""
     inclusive_stop: bool = True
-    """True to blend the Gaussian that crosses the stop. With the default stop, at most 1e-4 of the pixel is then lost, and
-    alpha is monotone in every opacity up to that amount. False to drop this Gaussian, which loses up to 1e-2."""
+    """True to blend the Gaussian at which transmittance falls below the stop. With the default stop, at most 1e-4 of the pixel
+    is then lost, and alpha is monotone in every opacity up to that amount. False to drop this Gaussian, which loses up to 1e-2.
+    """
     near: float = NEAR
     """Nearest depth rendered [u], at least 0."""
     far: float = FAR
     """Farthest depth rendered [u], at most 1e10."""
     low_pass: float = LOW_PASS
-    """Variance added to both image axes [px^2]."""
+    """Variance added to a projected Gaussian along both image axes [px^2]."""
     square_sigma: float = 0.0
-    """0 to render Gaussians exactly where alpha >= alpha_cut. Else they are rendered in the tiles that a square of half side
+    """0 to render a Gaussian exactly where alpha >= alpha_cut. Otherwise it is rendered in all tiles that a square of half side
     ceil(square_sigma * longest axis) touches, as in the first 3DGS renderer."""
 
     def __post_init__(self) -> None:

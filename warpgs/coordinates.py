@@ -1,7 +1,7 @@
 """The two systems of units that Gaussians and cameras come in, and the similarity between them.
 
 ``scene`` units [u] are those of a `Scene` that `load_scene` returned: recentred and rescaled, as the fit sees it. ``file``
-units are those of the scene's own files; PLY files of a run use them, too. `Normalization` holds the similarity from file to
+units are those of the scene's own files and of a run's PLY files. `Normalization` holds the similarity from file to
 scene units: ``x_scene = scale * (x_file - offset)``.
 """
 
@@ -61,7 +61,7 @@ def check_stored(gaussians: object) -> None:
     """Check that Gaussians have log scales and logits, as in files, and tensors of matching shapes.
 
     Raises:
-        TypeError: The Gaussians have other parameters, or one is not a tensor.
+        TypeError: The Gaussians have other parameters, or a parameter is not a tensor.
         ValueError: A shape disagrees.
     """
     if not isinstance(gaussians, Gaussians):

@@ -8,7 +8,7 @@ class WarpgsError(Exception):
     """
 
     exit_code = 5
-    """Exit code of the program."""
+    """Exit code of `warpgs` after this error."""
 
 
 class UsageError(WarpgsError):
@@ -27,9 +27,9 @@ class NotFiniteError(WarpgsError):
     """A non-finite loss or parameter of a fit."""
 
     view: int | None = None
-    """Number of the training view with a non-finite loss; None for other values."""
+    """Number of the training view with a non-finite loss; None if another value is not finite."""
     slot: int = 0
-    """Index of this view among the views of the step."""
+    """Index of the view ``view`` among the views of the step."""
 
 
 class ResourceError(WarpgsError):

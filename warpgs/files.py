@@ -66,7 +66,7 @@ def writing(path: Path, size: int | None = None) -> Iterator[BinaryIO]:
 def _replaced(
     path: Path, size: int | None, check: Callable[[Path], object] | None = None, suffix: str = ""
 ) -> Iterator[tuple[TemporaryFile, Folder]]:
-    """Give a temporary file and its folder; after the block the file is synced, checked, and put in the place of ``path``."""
+    """Give a temporary file and its folder; after the block the file is synced and checked, and replaces ``path``."""
     try:
         with open_folder(path.parent) as folder:
             with TemporaryFile(folder, suffix) as temporary:
@@ -101,8 +101,8 @@ def _reachable(folder: Folder) -> Path:
 def filling(folder: Path) -> Iterator[Path]:
     """Give the path of a temporary folder beside ``folder``; the block fills it, and then it is renamed to ``folder``.
 
-    The temporary folder is locked during the block, and removed on any error, including one in the block. Leftovers of killed
-    processes beside it are removed.
+    The temporary folder is locked during the block, and removed on any error, including one in the block. Temporary folders
+    that killed processes left beside ``folder`` are removed.
 
     Args:
         folder: Folder to make; it may exist if it is empty.
@@ -204,7 +204,7 @@ def readable(text: str) -> str:
 
 
 def write_json(path: Path, values: object) -> None:
-    """Replace a JSON file as `write_bytes` does; NaN and infinity become null, which JSON can hold."""
+    """Replace a JSON file as `write_bytes` does; NaN and infinity become null, because JSON cannot hold them."""
     write_text(path, json.dumps(plain(values), indent=1) + "\n")
 
 
@@ -260,7 +260,7 @@ def remove_file(path: Path) -> None:
 
 
 def move_folder(folder: Path, name: str) -> Path:
-    """Rename a folder in its place, and return its path.
+    """Rename a folder within its parent folder, and return the new path.
 
     Raises:
         OSError: The folder cannot be moved, or is a link.

@@ -142,7 +142,7 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u], as in `project_points`.
+    """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u]; inverts `project_points`.
 
     A pixel that a lens does not reach gives NaN.
 
@@ -209,7 +209,7 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
 
 
 def _at_depth(camera: Camera, rays: Any, depths: Any) -> Any:
-    """Return the positions in the camera [S, 3] at depths [S] on ``rays``, positions at depth 1 [S, 3]."""
+    """Return positions in camera axes [S, 3] at depths [S]; ``rays`` are the positions at depth 1 [S, 3]."""
     scaled = rays * depths[:, None]
     if camera.model == "orthographic":  # parallel rays
         scaled[:, :2] = rays[:, :2]
@@ -257,7 +257,7 @@ def depth_normals(camera: Camera, depth: torch.Tensor) -> torch.Tensor:
 
 
 def gaussian_normals(gaussians: Gaussians | ActivatedGaussians, camera: Camera) -> torch.Tensor:
-    """Compute the normal of each Gaussian: its shortest axis, on the side of the camera.
+    """Compute the normal of each Gaussian: its shortest axis, turned towards the camera.
 
     Differentiable in ``quats``; the choice of axis and side has no gradient. The normal of a round Gaussian is meaningless.
     Pass the normals as `RasterizeOptions.features` to render an image of normals.

@@ -1,7 +1,7 @@
 """Opening of input files: only regular files of bounded size, so that no pipe hangs a command and no device fills its memory.
 
-Every untrusted file is opened here. An unreadable file raises an OSError with the reason as its ``strerror``; callers turn it
-into a `DataError` with a remedy, with the text of `unread_reason`.
+Every untrusted file is opened here. An unreadable file raises an OSError with the reason as its ``strerror``. Callers then
+raise a `DataError` with the text of `unread_reason` and a remedy.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def open_input(path: str | os.PathLike[str], below: Path | None = None) -> Binar
 
     Args:
         path: The file.
-        below: Folder above the file, such as a run folder; no link from there to the file is followed. None for a file that the
-            user names, which may be a link.
+        below: Folder above the file, such as a run folder; no link between the two is followed. None for a file that the user
+            names, which may be a link.
 
     Raises:
         OSError: The file is missing, unreadable, a folder, a link that is not followed, or not a regular file (a pipe, a
@@ -63,7 +63,7 @@ def read_input(path: str | os.PathLike[str], most: int = MAX_BYTES, below: Path 
     """Return the contents of a regular file of at most ``most`` bytes; ``below`` as in `open_input`.
 
     Raises:
-        OSError: The file cannot be opened or read, is not a regular file, or is larger.
+        OSError: The file cannot be opened or read, is not a regular file, or is larger than ``most``.
     """
     with open_input(path, below) as file:
         size = os.fstat(file.fileno()).st_size

@@ -80,7 +80,7 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
 def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
     """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN if not on the lens.
 
-    For an orthographic camera they are (u, v, 1), and positions (u, v, z) of any depth have the same point.
+    For an orthographic camera the result is (u, v, 1); positions (u, v, z) of all other depths share that point.
 
     Raises:
         UsageError: The model is unknown here.

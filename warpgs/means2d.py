@@ -1,4 +1,4 @@
-"""Projected means that hold their gradients after a backward pass, as density strategies read them."""
+"""Projected means that hold their gradients after a backward pass, for density strategies."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ProjectedMeans(torch.Tensor):
         return copied
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Pickle the means and their ``absgrad``; as with every tensor, not their ``grad``."""
+        """Pickle the means and their ``absgrad``, but not their ``grad``, as for every tensor."""
         copied = copy.deepcopy(self)
         copied.grad = None
         return torch.Tensor.__reduce_ex__(copied, protocol)
@@ -60,7 +60,7 @@ def projected_means(projected: torch.Tensor, absgrad: bool) -> torch.Tensor:
         UsageError: A backward pass went through them already.
     """
     if getattr(projected, PASSED, None):
-        raise UsageError("read render.means2d before the backward pass: gradients of a pass before the first read are not kept")
+        raise UsageError("read render.means2d before the backward pass: gradients of earlier passes are not kept")
     means2d = projected.detach()[..., :2].as_subclass(ProjectedMeans)
     columns = {"grad": slice(0, 2)} | ({"absgrad": slice(10, 12)} if absgrad else {})
 

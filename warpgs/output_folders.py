@@ -146,7 +146,7 @@ class Folder:
         os.replace(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename a folder; the new name must be free, or an empty folder must have it."""
+        """Rename a folder; the new name must be free, or belong to an empty folder."""
         os.rename(self._name(old), self._name(new), src_dir_fd=self.descriptor, dst_dir_fd=self.descriptor)
 
     def remove_tree(self, name: str) -> None:
@@ -256,7 +256,7 @@ def open_file(path: Path, below: Path) -> BinaryIO:
 
 
 def _opened(name: str, more: int, at: int | None) -> int:
-    """Open a folder and return its descriptor, also where it may not be listed."""
+    """Open a folder and return its descriptor, even if the folder may not be listed."""
     try:
         return os.open(name, FOLDER | more, dir_fd=at)
     except PermissionError:

@@ -31,9 +31,9 @@ T = TypeVar("T", bound=Named)
 class Registry(Generic[T]):
     """Classes of one kind by name.
 
-    Built-in classes are in the modules of a package, which are imported to look up a name. So a new class is a new file. A
-    user's own class is passed in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A name in
-    a stored file never causes an import.
+    Built-in classes are in the modules of a package; looking up a name imports them all. So a new class needs only a new
+    file. A user's own class is passed in Python, or as ``module:Class`` or ``path/to/file.py:Class`` on the command line. A
+    name in a stored file never causes an import.
     """
 
     def __init__(self, kind: str, base: type[T], package: str):
@@ -114,7 +114,7 @@ class Registry(Generic[T]):
             own = name.rpartition(":")[2]
             in_study = f'; in a study, use a preset in a .py file with "strategy": {own}' if self.kind == "strategy" else ""
             raise UsageError(
-                f"the {self.kind} {name!r} is a class of your own. The file of a preset or run does not load its code: "
+                f"the {self.kind} {name!r} is a class of your own. The file of a preset or run does not load your code: "
                 f"name the class on the command line, or pass it in Python{in_study}"
             )
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
@@ -176,7 +176,7 @@ def own_code(classes: Iterable[type]) -> dict[str, str]:
 
 @functools.cache
 def _digest(cls: type) -> str:
-    """Return the SHA-256 of the file of a class when first requested, as it may be edited later; empty if it has no file."""
+    """Return the SHA-256 of a class's file, read at the first call because it may be edited later; empty without a file."""
     return module_digest(sys.modules.get(cls.__module__))
 
 

@@ -30,7 +30,7 @@ class Camera:
     viewmat: Array
     """camera_from_world, rigid, shape [4, 4] or [C, 4, 4]."""
     K: Array
-    """Intrinsics [px] with zero skew, shape [3, 3], for all cameras, or [C, 3, 3]."""
+    """Intrinsics [px] with zero skew, shape [3, 3] (shared by all cameras) or [C, 3, 3]."""
     width: int
     """Image width [px]."""
     height: int
@@ -38,9 +38,9 @@ class Camera:
     model: str = "pinhole"
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
-    """Coefficients of the model, shape [P], for all cameras, or [C, P]: for opencv k1 k2 p1 p2 k3 k4 k5 k6, for fisheye k1 to
-    k4, zeros for an ideal lens; None for models without coefficients. Their gradients are not supported: a tensor that requires
-    gradients is an error."""
+    """Coefficients of the model, shape [P] (shared by all cameras) or [C, P]; None for models without coefficients. An opencv
+    camera has k1 k2 p1 p2 k3 k4 k5 k6, a fisheye k1 to k4; zeros mean an ideal lens. Coefficients get no gradients: a
+    tensor that requires gradients is an error."""
 
     @property
     def center(self) -> np.ndarray:
@@ -84,7 +84,7 @@ class View:
     """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None if the
     image is opaque."""
     alpha_estimated: bool = False
-    """True if ``alpha`` was estimated from a black background: it then selects pixels that start Gaussians and are scored.
+    """True if ``alpha`` was estimated from a black background: it then selects the pixels that start Gaussians and are scored.
     The loss does not use it, because dark parts of the object may count as background."""
     depth: GivenDepth | None = None
     """Given depth, for the start and the loss of a fit; None if there is none."""
@@ -129,7 +129,7 @@ class Normalization:
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene: views, points and notes, in the conventions above."""
+    """A scene: views, points and notes, in the conventions of docs/conventions.md."""
 
     path: str
     """Folder that was read."""
@@ -146,7 +146,7 @@ class Scene:
     fingerprint: str = ""
     """SHA-256 over names, cameras, pixels, masks and given maps of the views, hexadecimal."""
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Colour behind the scene that the format implies (white for Blender's transparent images)."""
+    """Background colour, as implied by the format (white for Blender's transparent images)."""
     pixels: str = ""
     """Source of the pixels: the image folder, and whether they are as stored or area-resampled. Scores against `images_8` and
     against `images` resampled by 8 cannot be compared."""
@@ -202,7 +202,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class ViewDepth:
-    """Depth that other views confirm at the pixels of one view: evidence, not a render."""
+    """Depth at the pixels of one view, where other views confirm it; it is estimated or given, not rendered."""
 
     depth: np.ndarray
     """z-depth [u], float32, shape [H, W]; 0 where not valid."""
@@ -282,11 +282,11 @@ class ActivatedGaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree given; 0 without."""
+        """Highest spherical-harmonics degree given; 0 without ``sh``."""
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return the five tensors by field name, in the order of `Gaussians`; zeros [N, 1, 3] if ``sh`` is None."""
+        """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` is zeros [N, 1, 3] if it is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
         return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
 
@@ -307,7 +307,7 @@ class CovarianceGaussians:
     """World positions [u], shape [N, 3]."""
     covars: torch.Tensor
     """Covariances [u^2], positive semi-definite, shape [N, 3, 3]. Only the symmetric part of a matrix is used. Eigenvalues
-    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite one is not rendered. A
+    between 0 and -1e-5 times the largest variance count as 0; a Gaussian with a lower or non-finite eigenvalue is culled. A
     covariance of zeros renders as a point with the width of the pixel filter."""
     opacities: torch.Tensor
     """Opacities in [0, 1], shape [N]."""
@@ -320,7 +320,7 @@ class CovarianceGaussians:
 
     @property
     def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree given; 0 without."""
+        """Highest spherical-harmonics degree given; 0 without ``sh``."""
         return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -330,7 +330,7 @@ class CovarianceGaussians:
 
 
 RasterizedGaussians = Gaussians | ActivatedGaussians | CovarianceGaussians
-"""All that `rasterize` takes as Gaussians."""
+"""Types of Gaussians that `rasterize` accepts."""
 
 
 @document_fields
@@ -346,8 +346,8 @@ class Render:
     alpha: torch.Tensor
     """Accumulated opacity in [0, 1], shape [..., H, W]."""
     depth: torch.Tensor
-    """Expected z-depth [u] (for a fisheye the distance): the mean under the blending weights; 0 where nothing is blended. Shape
-    [..., H, W]."""
+    """Expected z-depth [u] (for a fisheye the distance): the mean weighted by blending weights; 0 where nothing is blended.
+    Shape [..., H, W]."""
     projected: torch.Tensor
     """Projected Gaussians, laid out as in kernels/project_inputs.py, shape [C, N, 12]; ``retain_grad()`` keeps gradients."""
     tile_counts: torch.Tensor
@@ -359,7 +359,7 @@ class Render:
     """Largest blending weight of a Gaussian over the pixels, shape [C, N]; only with ``RasterizeOptions.contributions``. It has
     no gradient: a backward pass through it is an error."""
     overflow: torch.Tensor | None = None
-    """1 if the instances exceeded ``RasterizeOptions.capacity``, so that the images are unusable; else 0. Int32, shape [1]."""
+    """1 if the (Gaussian, tile) pairs exceeded ``RasterizeOptions.capacity`` (the images are unusable), else 0; int32, [1]."""
     median_depth: torch.Tensor | None = None
     """Depth [u] (along z; for a fisheye the distance) of the Gaussian at which transmittance falls to one half, shape [..., H,
     W]; 0 where alpha is below 1/2. Only if requested. It has no gradient: a backward pass through it is an error."""
@@ -369,8 +369,8 @@ class Render:
     features: torch.Tensor | None = None
     """Channels of ``RasterizeOptions.features`` over their background, shape [..., H, W, D]; only with features."""
     heaviest_ids: torch.Tensor | None = None
-    """Indices of the k Gaussians of largest blending weight in each pixel, heaviest first, the nearer first if equal; -1 if
-    there are fewer. Int32, shape [..., H, W, k]; only with ``RasterizeOptions.heaviest``."""
+    """Indices of the k Gaussians of largest blending weight in each pixel, heaviest first, at equal weights the nearer
+    first; -1 if there are fewer. Int32, shape [..., H, W, k]; only with ``RasterizeOptions.heaviest``."""
     heaviest_weights: torch.Tensor | None = None
     """Blending weights of ``heaviest_ids``, 0 for missing ones, shape [..., H, W, k]. They have no gradient: a backward pass
     through them is an error."""

@@ -220,7 +220,7 @@ def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = Non
 
 
 def of_type(hint: Any) -> Schema:
-    """Return the schema of the plain values of a field by its type hint: bool, int, float, str, tuples, and these or None.
+    """Return the schema of a field's values by its type hint: bool, int, float, str or a tuple, each also as ``... | None``.
 
     Every value is allowed for other types.
     """

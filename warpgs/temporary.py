@@ -1,4 +1,4 @@
-"""Temporary files and folders, each locked by its owner: any process may remove those that are not locked.
+"""Temporary files and folders, each locked by its owner; any process may remove unlocked ones.
 
 The system releases a lock when its holder ends, killed or not. So a temporary file of a running process is never removed as a
 leftover, and the next command removes the files of a killed process.
@@ -39,7 +39,7 @@ _LOCK = threading.Lock()
 def shared_locks() -> Iterator[tuple[int, ...]]:
     """Give descriptors of all locks of temporary folders, for a child process to inherit (``pass_fds``).
 
-    The child may work in these folders. So they stay locked until it has ended, even if this process dies first.
+    The child may work in these folders. So the folders stay locked until it has ended, even if this process dies first.
     """
     with _LOCK:
         copies = tuple(map(os.dup, _HELD)) if sys.platform != "win32" else ()
@@ -200,7 +200,7 @@ def _sweep_one(folder: Folder, name: str, mode: int) -> None:
 
 
 def _own_file(folder: Folder, suffix: str, *, locks: bool, prefix: str = ".warpgs-", mode: int = 0o666) -> tuple[str, int]:
-    """Make a file with a name of its own and lock it; return name and descriptor."""
+    """Make a file with a unique name and lock it; return name and descriptor."""
     while True:
         name = f"{prefix}{secrets.token_hex(8)}.tmp{suffix}"
         descriptor = folder.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)

@@ -156,7 +156,7 @@ def test_an_option_of_ours_is_a_flag(tmp_path):
 def test_no_file_names_code(own, tmp_path):
     """A name with a colon is looked up where something stored names it, and never imported."""
     before = set(sys.modules)
-    with pytest.raises(UsageError, match="does not load its code"):
+    with pytest.raises(UsageError, match="does not load your code"):
         FORMATS.find(f"{own}:Archive")
     with pytest.raises(UsageError, match="is not supported"):
         format_of(tmp_path / f"{own.name}:Archive")

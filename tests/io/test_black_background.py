@@ -37,7 +37,7 @@ def test_dark_pixels_around_objects_and_in_holes_are_transparent(tmp_path):
         assert v.alpha_estimated and not before.alpha_estimated
         assert (v.image[alpha == 1] == before.image[alpha == 1]).all() and before.alpha is None
         assert (counted_region(v)[0] == counted_region(before)[0]).all()
-    note = "every image shows an object on black: the dark pixels around the object and in its holes (74.8% of all) become"
+    note = "every image shows an object on black: the dark pixels around the object and in its holes (74.8% of all pixels)"
     assert any(n.startswith(note) and "--no-black-is-empty" in n for n in scene.notes)
     assert not any("object on black" in n for n in plain.notes) and scene.fingerprint != plain.fingerprint
 

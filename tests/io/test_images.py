@@ -294,7 +294,7 @@ def test_alpha_is_freed_of_distortion_with_its_image(tmp_path):
 def test_an_image_that_shows_nothing_is_named(tmp_path):
     scenes.write_colmap(tmp_path)
     scenes.save(tmp_path / "images" / "photo0.png", rgba(0, np.zeros((12, 16), np.uint8)))
-    assert "1 image wholly transparent: it shows nothing" in load_scene(tmp_path).notes
+    assert "1 image wholly transparent, showing nothing" in load_scene(tmp_path).notes
 
 
 def test_masks_cut_out(tmp_path):
@@ -313,7 +313,7 @@ def test_masks_cut_out(tmp_path):
     np.testing.assert_allclose(first.image, alpha[..., None] * scenes.image(0) / 255, atol=1e-6)
     assert first.mask is None and not second.alpha.any() and third.alpha is None
     assert {
-        "3 images cut out by a mask file", "1 image wholly transparent: it shows nothing",
+        "3 images cut out by a mask file", "1 image wholly transparent, showing nothing",
         "masks that keep no pixel: photo1.png (1)", "masks that keep every pixel: photo2.png (1)",
     } <= set(scene.notes)  # fmt: skip
     assert any("the white ones (--mask-keeps white); the others are transparent (--masks cutout)" in n for n in scene.notes)

@@ -102,6 +102,6 @@ def test_links_that_lead_round_in_circles(kind, tmp_path):
     if kind in ("transforms", "instant-ngp", "blender"):  # frames without a file are skipped and named
         assert len(load_scene(scene).views) == scenes.VIEWS - 1
         return
-    message = r"images.*restore the set|counts must agree|is a broken link; restore it"
+    message = r"images.*Copy the scene again|counts must agree|is a broken link; restore it"
     with pytest.raises(DataError, match=message):
         load_scene(scene)

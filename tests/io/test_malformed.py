@@ -215,7 +215,7 @@ def test_broken_poses_in_text(changes, message, tmp_path):
 @pytest.mark.parametrize(
     "name,content,message",
     [
-        ("points3D.txt", "1 0 0\n", r"points3D.txt, line 1: cannot be understood \(a point has 8 numbers"),
+        ("points3D.txt", "1 0 0\n", r"points3D.txt, line 1: cannot be understood \(a point needs 8 numbers"),
         ("points3D.txt", "1 0 0 nan 1 1 1 0\n", r"points3D.txt: 1 of 1 points are not finite"),
         ("points3D.txt", "1 0 0 0 1 1 1 0 1\n", r"points3D.txt, line 1"),
         ("cameras.txt", "1 PINHOLE 16 12 20 20 8\n", r"cameras.txt, line 1: .*PINHOLE has 4 parameters, not 3"),

@@ -10,7 +10,7 @@ from tests.io.scenes import refused
 def test_llff_counts_must_agree(tmp_path):
     scenes.write_llff(tmp_path)
     (tmp_path / "images" / "photo4.png").unlink()
-    refused(tmp_path, r"poses_bounds.npy: has 5 poses, but .*images holds 4 images.*restore the set")
+    refused(tmp_path, r"poses_bounds.npy: has 5 poses, but .*images holds 4 images.*Copy the scene again")
 
 
 def llff_with(tmp_path, row, column, value):

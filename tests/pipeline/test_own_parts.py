@@ -166,7 +166,7 @@ def test_a_strategy_of_ones_own(tmp_path, named):
     (tmp_path / "own.py").write_text(OWN)
     spec = f"{tmp_path / 'own.py'}:OneMore"
     config = dataclasses.replace(PLAIN, strategy=spec, steps=12)
-    with pytest.raises(UsageError, match="does not load its code"):
+    with pytest.raises(UsageError, match="does not load your code"):
         Trainer(photos(2), seeds(), config, CPU)
     cls = STRATEGIES.load(spec)
     if named == "by name":

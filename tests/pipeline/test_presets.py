@@ -95,7 +95,7 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ('strategy = "best"', "my.toml: unknown strategy 'best'"),
         ("strategy = 3", "3 is not a strategy"),
         ('strategy = "json:JSONDecoder"', 'in a study, use a preset in a .py file with "strategy": JSONDecoder'),
-        ('loss-terms = "json:JSONDecoder"', "does not load its code"),
+        ('loss-terms = "json:JSONDecoder"', "does not load your code"),
         ('base = "json:dumps"', "is code; a preset file never loads code"),
         ('base = "best"', "base 'best' is not one of"),
         ("base = 3", "base must be text, not 3"),

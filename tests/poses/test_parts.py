@@ -162,9 +162,9 @@ def test_reasons_and_advice():
     assert [
         "between d and c" in said[0],
         "take e again" in said[1],
-        "between b and c: their axes differ by 50 degrees" in said[2],
+        "between b and c, whose axes differ by 50 degrees" in said[2],
     ] == [True] * 3
-    assert said[3] == "take a photograph between c and b: they share only 40 matches" and len(said) == 4
+    assert said[3] == "take a photograph between c and b, which share only 40 matches" and len(said) == 4
     well = mapping(keypoints=(900, 800), matches={(0, 1): 200}, views=dict(list(mapping().views.items())[:2]))
     assert advice(well, ["a", "b"]) == []
     assert "matches no other" in reason(mapping(matches={}), 3, names)

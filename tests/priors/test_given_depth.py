@@ -162,7 +162,7 @@ def test_the_start_is_at_the_given_depth():
     again = initial_points(mapped, None, config, np.random.default_rng(0))
     assert np.array_equal(start.cloud.points, again.cloud.points)
     alone = initial_points(mapped[:1], None, config, np.random.default_rng(0))
-    assert "1 of them without a comparison" in alone.how and len(alone.cloud) > 500
+    assert "1 of these views without a comparison" in alone.how and len(alone.cloud) > 500
 
 
 def test_maps_from_python_are_checked():

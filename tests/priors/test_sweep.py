@@ -177,7 +177,7 @@ def test_of_many_views_some_are_swept():
     config = SweepConfig(max_views=3, max_pixels=10_000)
     found = sweep_depths(views, [(2, 12)] * 5, config, progress=lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
-    left = [f for f in found if f.notes[0].startswith("not swept: the 3 swept views, of 5, see")]
+    left = [f for f in found if f.notes[0].startswith("not swept: the 3 swept views (of 5) see")]
     assert len(left) == 2 and all(f.coverage == 0 and not f.depth.any() and np.isinf(f.sensitivity).all() for f in left)
     for f, true in zip(found, depths):
         if not f.notes[0].startswith("not swept"):

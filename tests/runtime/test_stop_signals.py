@@ -131,7 +131,7 @@ def test_within_the_steps_the_one_in_progress_is_saved(scene, tmp_path, capsys, 
     assert capsys.readouterr().err == 2 * SENTENCE
     monkeypatch.undo()
     assert main(["fit", "--out", str(tmp_path / "run"), "--resume"]) == 0  # all else is as the run was started
-    assert "continuing as before: preset 3dgs, 3 steps" in capsys.readouterr().out
+    assert "continuing the run: preset 3dgs, 3 steps" in capsys.readouterr().out
     assert load_checkpoint(tmp_path / "run")[1]["step"] == 3
 
 

@@ -15,7 +15,7 @@ WIDTH = 80
 NAMES = 22
 """Largest width of the column with flags and values [letters]."""
 FEW = 4
-"""Largest number of flags in a group that are explained; a larger group is only a list of names."""
+"""Largest number of flags in a group whose flags are explained; a larger group is only a list of names."""
 VALUES = {int: "N", float: "X", Path: "PATH", str: "VALUE"}
 """Placeholders for the value of a flag, by its type."""
 
@@ -26,7 +26,7 @@ def help_text(kind: type, program: str, description: str) -> str:
     Args:
         kind: Dataclass of the flags, as for `parse_flags`.
         program: Name of the program and the command.
-        description: Description of the command; lines of lists begin with two spaces.
+        description: Description of the command; lines of a list begin with two spaces.
     """
     docs, usage, positionals, flags, more = field_docs(kind), [program], [], [], []
     for field in dataclasses.fields(kind):

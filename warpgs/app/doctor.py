@@ -44,7 +44,7 @@ class Finding:
     remedy: str = ""
     """Fix; never empty where the status is ``missing``."""
     required: bool = False
-    """True where a fit needs it."""
+    """True if a fit needs what was checked."""
 
 
 @dataclass(frozen=True)
@@ -56,9 +56,9 @@ class Package:
     module: str
     """Module to import."""
     required: bool
-    """True where a fit needs it."""
+    """True if a fit needs the package."""
     use: str
-    """Part that is lost without it."""
+    """Feature that does not work without the package."""
     imported: bool = True
     """False if another check imports it in a subprocess; here it is only located."""
 
@@ -78,7 +78,7 @@ PACKAGES = (
 )
 EXTRAS = {
     "poses": ("pycolmap", "photographs without cameras"),
-    "view": ("viser", "the viewer and pages to send"),
+    "view": ("viser", "the viewer and HTML pages of models"),
     "formats": ("zstandard", "SPZ of version 4"),
 }
 """Optional dependencies by name: the module by which each is detected, and its purpose."""

@@ -24,9 +24,9 @@ def missing_package(error: Exception) -> str:
 
 
 def report_defect(error: Exception, arguments: list[str]) -> int:
-    """Keep the traceback for a bug report; the user sees one line. Returns the exit code.
+    """Store the traceback in a file for a bug report, and print one line; return the exit code.
 
-    A dependency that has been uninstalled is not a defect of warpgs: the error names it.
+    An uninstalled dependency is not a defect of warpgs: the line then only names the package.
     """
     import tempfile
     import traceback

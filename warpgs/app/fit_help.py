@@ -5,7 +5,7 @@ from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 FLAGS = (
     ("--out", "RUN", "", "run folder to fill; new or empty"),
     ("--split", "SPEC", "", "views to hold out for scores; default: none"),
-    ("--preset", "NAME", DEFAULT_PRESET, "settings to start from: below, or a .toml file"),
+    ("--preset", "NAME", DEFAULT_PRESET, "a preset listed below, or a .toml file"),
     ("--steps", "N", "", "number of optimisation steps; default: from the preset"),
     ("--device", "NAME", "auto", "auto, cpu or cuda"),
     ("--downscale", "F", "", "divide both sides of the images by F"),

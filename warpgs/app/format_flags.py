@@ -37,7 +37,7 @@ def format_flags(arguments: list[str]) -> type:
         sh_degree: int | None = None
         """Highest degree of harmonics; 0 for colours without view dependence. Default: all."""
         rotate: str | None = None
-        """Rotate the model about the origin: x,y,z,degrees (axis and angle); for a run also level (the cameras' up becomes
+        """Rotate the model about the origin: x,y,z,degrees (axis and angle); or level, for a run only (turns the cameras' up to
         -y)."""
 
     fields: list[tuple[str, Any, Any]] = []
@@ -62,7 +62,7 @@ def _found(choice: str) -> Format:
 
 
 def chosen_formats(a: Any, target: Path) -> list[Format]:
-    """Return formats to prefer: that of the file to write, if it has options, then the one that --format names, if any.
+    """Return formats to prefer: the target file's format if it has options, then the format of --format if given.
 
     Args:
         a: Parsed flags of `format_flags`.

@@ -1,4 +1,4 @@
-"""Flags for reading a scene: those of `SceneRequest`, for every command that reads a scene."""
+"""Flags for reading a scene, made from `SceneRequest`; every command that reads a scene has them."""
 
 import dataclasses
 import os
@@ -15,7 +15,7 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
     """Return the dataclass of the flags, and their defaults.
 
     Args:
-        positional: Whether the scene folder is a positional argument; else the command defines its own argument for scenes.
+        positional: True if the scene folder is a positional argument; False if the command has its own argument for scenes.
     """
     import tyro
 

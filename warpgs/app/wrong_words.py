@@ -23,7 +23,7 @@ def refuse(kind: type, arguments: list[str], program: str, complaint: str) -> No
         kind: The dataclass of flags.
         arguments: Arguments after the name of the command.
         program: Name of the program and the command.
-        complaint: Text that tyro printed: a box with a title, the reason, and a hint on the help below a line.
+        complaint: Text that tyro printed: a box with a title, the reason and, below a line, a hint on the help.
 
     Raises:
         UsageError: Always; the message names the wrong, missing or extra argument, and the fix.

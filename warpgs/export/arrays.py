@@ -11,7 +11,7 @@ from warpgs.errors import DataError
 from warpgs.scene import Gaussians
 
 ROWS = 16384
-"""Gaussians that are decoded at a time, so that float64 copies of a whole model never exist."""
+"""Number of Gaussians decoded at a time, so that float64 copies of a whole model never exist."""
 Arrays = dict[str, np.ndarray]
 """The five tensors of `Gaussians` by field name, as numpy arrays of any float type, means and log scales in file units."""
 
@@ -138,7 +138,7 @@ def half_turn(arrays: Arrays, axis: str) -> Arrays:
 
     Args:
         arrays: The Gaussians.
-        axis: x (between the axes of SPZ, RUB, and those of PLY, RDF) or z (between PLY and the y-up axes of glTF).
+        axis: x (converts between SPZ's axes, RUB, and PLY's, RDF) or z (between PLY's axes and the y-up axes of glTF).
     """
     copies = arrays | {name: np.array(arrays[name]) for name in ("means", "quats", "sh")}
     half_turn_in_place(copies, axis)

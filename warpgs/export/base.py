@@ -44,7 +44,7 @@ class Format:
     description: ClassVar[str] = ""
     """One line about the format, for the help."""
     Config: ClassVar[type | None] = None
-    """Frozen dataclass of the options for writing; None for none. They become flags, grouped under the format's name."""
+    """Frozen dataclass of the options for writing, which become flags, grouped under the format's name; None for no options."""
     cleaned: ClassVar[bool] = True
     """True to remove floaters and needles by default."""
     sorted: ClassVar[bool] = False
@@ -148,5 +148,5 @@ def warn_of_antialiasing(path: Path) -> None:
 
 
 FORMATS: Registry[Format] = Registry("format", Format, __package__)
-"""File formats of Gaussians by name; those in the modules of this folder are built in."""
+"""File formats of Gaussians by name; those in the modules of `warpgs.export` are built in."""
 register = FORMATS.register

@@ -31,7 +31,7 @@ from warpgs.export.ply_header import MAX_HEADER_BYTES, Element, is_antialiased, 
 from warpgs.input_files import read_start, unread_reason
 
 CHUNK = 256
-"""Gaussians that share bounds."""
+"""Number of Gaussians that share bounds."""
 SH_RANGE = 8
 """Width of the range about 0 that harmonics above degree 0 are stored in."""
 _GROUPS = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))

@@ -114,7 +114,7 @@ def decode(path: Path, data: bytes) -> Arrays:
 
     Raises:
         DataError: The file is malformed or truncated, needs another file, or has a kernel, colour space, transformation or
-            number of Gaussian primitives that this program does not read.
+            number of Gaussian primitives that is not supported.
     """
     document, body = _split(path, data)
     buffers = document.get("buffers")

@@ -91,7 +91,7 @@ def rotation_to_y(up: np.ndarray) -> list[float]:
 def _glb(path: Path, mesh: Mesh, up: np.ndarray | None) -> list[bytes]:
     """Return the chunks of a glTF 2.0 file: one node, one unlit mesh, positions, colours and triangles.
 
-    Positions are float32 around their middle, which is the node's translation: far from the origin float32 is coarse.
+    Positions are float32 relative to their middle, the node's translation, because float32 is coarse far from the origin.
     """
     middle = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2 if len(mesh.vertices) else np.zeros(3)
     positions = (mesh.vertices - middle).astype("<f4")

@@ -9,7 +9,7 @@ from pathlib import Path
 from warpgs.errors import DataError
 
 MAX_HEADER_BYTES = 65536
-"""Largest accepted header [bytes]: a real one has some two thousand."""
+"""Largest accepted header [bytes]; real headers have some two thousand."""
 REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
 
 _TYPES = {

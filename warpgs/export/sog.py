@@ -37,7 +37,7 @@ from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
 
 LEVELS = 256
-"""Entries of a codebook."""
+"""Number of entries of a codebook."""
 PALETTE = 65536
 """Largest number of rows of harmonics."""
 COLUMNS = 64
@@ -48,8 +48,8 @@ MAX_META_BYTES = 2**20
 MAX_CONTENTS_BYTES = 2**16
 """Size of the largest table of contents: a real one has 500 bytes, and zipfile takes ten times its size as memory."""
 MAX_PER_BYTE, MAX_PIXELS, SMALL = 1, 4, 4096
-"""Largest number of Gaussians per byte of a file, of pixels per Gaussian, and a number added to both limits: real files have
-one Gaussian per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
+"""Largest numbers of Gaussians per byte of a file and of pixels per Gaussian, and a number added to both limits. Real files
+have one Gaussian per ten bytes, and one pixel per Gaussian. Files beyond these limits count as decompression bombs."""
 MAX_PIXEL_BYTES = 8
 """Largest number of bytes per pixel of a lossless WebP image; incompressible pixels take little more than 4."""
 MAX_PALETTE_PIXELS = 2**20
@@ -106,7 +106,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def codebook(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a codebook of 256 ascending entries, and the index of the entry nearest to each of ``values``, uint8, equal shape.
+    """Return a codebook of 256 ascending entries, and the index of the entry nearest to each of ``values``, uint8, same shape.
 
     Lloyd's algorithm from evenly spaced values and quantiles, on sorted numbers, so that results repeat.
     """
@@ -211,7 +211,7 @@ def _harmonics(
 
 
 def _colors(book: np.ndarray, pixels: np.ndarray, sh: np.ndarray) -> np.ndarray:
-    """Set the first of the coefficients [N, K, 3] by their pixels [P, 4]; returns the logits of the opacities [N]."""
+    """Set the first coefficient in ``sh`` [N, K, 3] from colour pixels [P, 4]; returns the logits of the opacities [N]."""
     for part in parts(len(sh)):
         sh[part, 0] = book[pixels[part, :3]]
     return by_rows(len(sh), (), lambda p: logits(pixels[p, 3] / 255, 1 / 255))

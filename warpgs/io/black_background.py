@@ -64,6 +64,6 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
         alpha = 1 - nothing.astype(np.float32)
         done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
     return done, (
-        f"every image shows an object on black: the dark pixels around the object and in its holes ({empty:.1%} of all) become "
-        f"transparent; --no-black-is-empty keeps them"
+        f"every image shows an object on black: the dark pixels around the object and in its holes ({empty:.1%} of all "
+        f"pixels) become transparent; --no-black-is-empty keeps them"
     )

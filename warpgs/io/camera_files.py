@@ -50,13 +50,13 @@ def _json(path: Path) -> Any:
         check_parts(text)
         return json.loads(text)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path, or write it again") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path, or write the file again") from e
     except (ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}). Check the path, or write it again") from e
+        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}). Check the path, or write the file again") from e
 
 
 def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
-    """Return pose and lens of each row, which has a camera-to-world rotation in OpenCV axes, and the camera centre."""
+    """Return pose and lens of each row; a row has a camera-to-world rotation in OpenCV axes and the camera centre."""
     found = _Names()
     for i, row in enumerate(rows):
         where = f"{path}, camera {i}"
@@ -81,9 +81,9 @@ def _transforms(path: Path) -> dict[str, tuple[np.ndarray, Lens]]:
     for i, frame in enumerate(shared["frames"]):
         where = f"{path}, frame {i}"
         if not isinstance(frame, dict):
-            raise DataError(f"{where}: expected an object with file_path and transform_matrix. Write it again")
+            raise DataError(f"{where}: expected an object with file_path and transform_matrix. Write the file again")
         if any(frame.get(key, shared.get(key)) is None for key in ("w", "h")):
-            raise DataError(f"{where}: gives no w and h, so its size is unknown. Add them, or give the scene's folder")
+            raise DataError(f"{where}: gives no w and h, so the image size is unknown. Add them, or give the scene's folder")
         lens = transforms.lens_of(frame, shared, 0, 0, where)
         viewmat = from_camera_to_world(transforms.matrix_of(frame, where), where, opengl=True)
         found.add(str(frame.get("file_path", i)), viewmat, lens)
@@ -116,7 +116,7 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
 
 
 class _Names(dict[str, tuple[np.ndarray, Lens]]):
-    """Pose and lens by a name that is unique: equal names, except the first, get a number."""
+    """Poses and lenses by unique names: a repeated name gets a number."""
 
     def __init__(self) -> None:
         super().__init__()

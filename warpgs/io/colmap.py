@@ -26,7 +26,7 @@ MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 
 NATIVE_MODELS = {
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 8: ("SIMPLE_RADIAL_FISHEYE", 4), 9: ("RADIAL_FISHEYE", 5),
 }  # fmt: skip
-"""Models that are only read with native lenses; undistortion is not implemented for them."""
+"""Models that are only read with `--lenses native`, because undistortion is not implemented for them."""
 OTHER_MODELS = {7: "FOV", 10: "THIN_PRISM_FISHEYE"} | {number: name for number, (name, _) in NATIVE_MODELS.items()}
 STEMS = ("cameras", "images", "points3D")
 
@@ -38,7 +38,7 @@ class Pose:
     name: str
     """Path below the image folder, POSIX style, as in the file."""
     camera_id: int
-    """Number of its camera."""
+    """Number of the image's camera."""
     quat: tuple[float, ...]
     """Rotation of camera_from_world, wxyz."""
     translation: tuple[float, ...]
@@ -166,7 +166,7 @@ def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]])
 
 
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows `NATIVE_MODELS`.
+    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion.
 
     Raises:
         DataError: The file is malformed, or a camera model is not supported.
@@ -226,8 +226,8 @@ def read_poses(path: Path) -> dict[int, Pose]:
         line, text = next(lines, (0, ""))
         if len(text.split()) % 3:
             raise DataError(
-                f"{path}, line {line}: must list the observations of image {pose.name!r} as X Y POINT, and may be empty but "
-                "not left out; write the file again"
+                f"{path}, line {line}: expected the observations of image {pose.name!r} as X Y POINT, or an empty line; "
+                "write the file again"
             )
     return poses
 
@@ -260,7 +260,7 @@ def read_points(path: Path, names: dict[int, str]) -> PointCloud:
     else:
         for line, words in _rows(path):
             with _understood(path, line):
-                _expect(len(words) >= 8 and len(words) % 2 == 0, "a point has 8 numbers, then pairs IMAGE OBSERVATION")
+                _expect(len(words) >= 8 and len(words) % 2 == 0, "a point needs 8 numbers, then pairs IMAGE OBSERVATION")
                 points.append(tuple(float(w) for w in words[1:4]))
                 colors.append(tuple(min(max(int(w), 0), 255) for w in words[4:7]))
                 tracks.append(frozenset(names[i] for w in words[8::2] if (i := int(w)) in names))

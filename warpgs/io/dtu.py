@@ -117,7 +117,7 @@ class DTUReader(Reader):
         if not files or cameras != len(files):
             raise DataError(
                 f"{path}: has {cameras} cameras, but {images} holds {len(files)} images. They are matched in sorted order, so "
-                "the counts must agree: restore the set"
+                "the counts must agree. Copy the scene again"
             )
         masks, views = _masks(folder, files), ViewList()
         for i, file in enumerate(files):

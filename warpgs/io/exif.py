@@ -13,10 +13,10 @@ from warpgs.io.image_formats import avif, jpeg, png, webp
 from warpgs.io.image_formats.kinds import format_of
 
 MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
-"""Tags: maker and model of the device, orientation, place of the exposure data, and its equivalent focal length [mm]."""
+"""Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
 ASCII = 2
 NUMBERS = {3: "H", 4: "I"}
-"""Layouts of the integers that these tags may hold, by type."""
+"""Layouts of the integers that EXIF tags may hold, by type."""
 MAX_ENTRIES = 1000
 """Largest number of tags in a directory."""
 MAX_TEXT = 100
@@ -42,12 +42,12 @@ class Exif:
 
     @property
     def device(self) -> str:
-        """Known parts of maker and model."""
+        """Maker and model, as far as known."""
         return " ".join(filter(None, (self.maker, self.model)))[:MAX_TEXT]
 
 
 def read_exif(data: bytes) -> Exif:
-    """Return the EXIF values of an image file; damaged ones count as missing."""
+    """Return the EXIF values of an image file; damaged values count as missing."""
     try:
         return parse_exif(_block(data))
     except ValueError:
@@ -55,7 +55,7 @@ def read_exif(data: bytes) -> Exif:
 
 
 def parse_exif(block: bytes) -> Exif:
-    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged ones count as missing."""
+    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged values count as missing."""
     block = block.removeprefix(PREFIX)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
     if order is None:

@@ -157,7 +157,7 @@ class SceneFolder:
         """Choose the image folder: `images_N` for a factor N, else the full-size folder, whose images are then resampled.
 
         Returns:
-            The folder, the remaining factor for resampling, and a note for the user (empty without a choice).
+            The folder, the remaining factor for resampling, and a note for the user (empty if there was no choice).
 
         Raises:
             DataError: There is no image folder, or it is a link that points outside the scene folder.

@@ -45,7 +45,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
 
     Returns:
         Name by id. Names without numbers are counted in sorted order. Numbered images must have no gaps: after a gap, the
-        numbers may not be the protocol's ids.
+        numbers might differ from the protocol's ids.
 
     Raises:
         DataError: There are too few images, or some ids are missing; the message names them.

@@ -96,9 +96,9 @@ class LoadedImage:
     undone: Lens | None = None
     """Lens whose distortion was removed at ``full_size``; None without distortion."""
     depth: GivenDepth | None = None
-    """Given depth of its pixels, metric depth in file units; None without given depth."""
+    """Given depth of the image's pixels, metric depth in file units; None without given depth."""
     normals: np.ndarray | None = None
-    """Given normals of its pixels, as `View.normals`; None without given normals."""
+    """Given normals of the image's pixels, as `View.normals`; None without given normals."""
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -146,7 +146,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Map the pixels of a pinhole image to the distorted image: return their columns and rows there, [H, W] each, as OpenCV.
+    """Return the columns and rows [H, W] in the distorted image of a pinhole image's pixels, in OpenCV's convention.
 
     Args:
         K: Intrinsics [px] of both images at this size, shape [3, 3].
@@ -162,7 +162,7 @@ def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tup
 
 
 def _undistort(loaded: LoadedImage, lens: Lens) -> LoadedImage:
-    """Resample to a pinhole of the same K; pixels that the lens never saw leave the mask."""
+    """Resample to a pinhole of the same K; pixels that the lens never saw are masked out."""
     import cv2
 
     height, width = loaded.image.shape[:2]
@@ -194,7 +194,7 @@ def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float,
 
 
 def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
-    """Keep the pixels and record the camera model; pixels that the lens does not reach leave the mask."""
+    """Keep the pixels and record the camera model; pixels that the lens does not reach are masked out."""
     height, width = loaded.image.shape[:2]
     model, count = ("fisheye", 4) if lens.fisheye else ("opencv", 8)
     distortion = np.zeros(count)
@@ -263,7 +263,7 @@ def _upright(path: Path, lens: Lens, image: np.ndarray) -> int:
 
 
 def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
-    """Return an image with its mask applied, as opacity with ``cutout``, and its colours multiplied by the opacity."""
+    """Return an image with its mask applied (with ``cutout`` as opacity) and with colours multiplied by opacity."""
     image, mask, alpha, done, kept = loaded.image, loaded.mask, loaded.alpha, list(loaded.done), None
     if mask is not None:
         kept = float(mask.mean(dtype=np.float64))
@@ -273,7 +273,7 @@ def _with_mask(path: Path, loaded: LoadedImage, cutout: bool) -> LoadedImage:
     if alpha is not None and alpha.min() < 1:
         image *= alpha[..., None]  # until it is resampled
         if not alpha.any():
-            done.append("wholly transparent: it shows nothing")
+            done.append("wholly transparent, showing nothing")
         elif kept is None or not cutout:
             done.append("transparent in part, by the alpha channel")
     else:

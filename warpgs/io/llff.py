@@ -64,7 +64,7 @@ class LLFFReader(Reader):
         if len(files) != len(rows):
             raise DataError(
                 f"{path}: has {len(rows)} poses, but {images} holds {len(files)} images. They are matched in sorted order, so "
-                "one missing or extra file would give every image the wrong pose: restore the set, or make the array again."
+                "one missing or extra file would give every image the wrong pose. Copy the scene again, or remake the array."
             )
         views = ViewList()
         for file, row in zip(files, rows):

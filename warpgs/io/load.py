@@ -57,14 +57,14 @@ def load_scene(
             ``module:Class`` or ``path/to/file.py:Class``. None for the built-in reader that recognises the folder.
         downscale: Factor by which both image sides shrink; a folder `images_N` is used if it exists. None for 1.
         max_side: Largest image side [px], 0 for no limit; larger images are reduced to it, and the intrinsics with them. None
-            for 1600 if ``downscale`` is None too, else for no limit.
+            means 1600 if ``downscale`` is None, too, and no limit otherwise.
         strict: True to treat a frame without an image file as an error instead of a note.
         allow_outside: True to allow names and links that point to files outside the scene folder.
         masks: Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent, gray pixels partly:
             `View.alpha`).
         mask_keeps: Colour of a mask file that keeps a pixel: white or black.
         black_is_empty: True to make dark pixels around an object and in its holes transparent, if every image shows an object
-            on black, without an alpha channel or a mask.
+            on black and none has an alpha channel or a mask.
         score_masks: Folder with object masks for scoring, matched by image id; None for `idrmasks` in the scene folder, if it
             exists.
         max_pixels: Largest number of pixels that an image or a mask may have as stored.
@@ -75,7 +75,7 @@ def load_scene(
         normals: Folder of normal maps, as for ``depths``.
         depth_kind: Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths up to a scale and a
             shift of each view) or disparity (inverse lengths up to a scale and a shift).
-        depth_unit: Length of one unit of a metric depth map in units of the cameras; None for 0.001 for integers and 1 for
+        depth_unit: Length of one unit of a metric depth map in units of the cameras; None means 0.001 for integers and 1 for
             floats.
         normal_axes: Axes of the normals: opencv (y down, z forward) or opengl (y up, z back) of the camera.
         progress: Called with a line for the user before each image is decoded; None for no messages.
@@ -166,7 +166,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
 def _finished(
     root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None, options: ReadOptions
 ) -> Scene:
-    """Return a scene as read from files, checked, sorted, in scene coordinates, with score masks and fingerprint."""
+    """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     if not isinstance(scene, Scene) or scene.normalization.scale != 1 or scene.normalization.offset.any():
         raise UsageError(f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it")
     views, points, more = list(scene.views), scene.points, scene.notes

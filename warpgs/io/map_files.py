@@ -16,7 +16,7 @@ from warpgs.scene import DEPTH_KINDS
 
 SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
-"""Suffixes of other files that may hold maps, which a message names."""
+"""Suffixes of unsupported files that may hold maps, for a message."""
 NONE = "none"
 """Value in place of a folder, to ignore maps."""
 CONFIDENCE = ".confidence"
@@ -45,7 +45,7 @@ class MapOptions:
     depth_kind: str = "metric"
     """Meaning of the depth maps, one of `DEPTH_KINDS`."""
     depth_unit: float | None = None
-    """Length of one unit of a depth map in units of the cameras; None for 0.001 for integers and 1 for floats."""
+    """Length of one unit of a depth map in units of the cameras; None means 0.001 for integers and 1 for floats."""
     normal_axes: str = "opencv"
     """Axes of the normals: camera axes of OpenCV (y down, z forward) or OpenGL (y up, z back)."""
 
@@ -158,7 +158,7 @@ def _read_array(path: Path, max_pixels: int) -> np.ndarray:
 
 
 def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
-    """Return the one channel of a map [H, W]; a gray map may be stored in three equal ones."""
+    """Return the one channel of a map [H, W]; a gray map may be stored in three equal channels."""
     if raw.ndim == 2:
         return raw
     if raw.shape[2] == 1 or (raw.shape[2] == 3 and (raw == raw[..., :1]).all()):
@@ -212,7 +212,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
         raise DataError(
-            f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; give a map of that size"
+            f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; make both equal in size"
         )
     values = raw.astype(np.float32)
     if raw.dtype.kind == "u":

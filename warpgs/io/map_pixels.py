@@ -47,8 +47,8 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
 
     Args:
         loaded: The image at its final size.
-        values: The map, as the image was stored or upright, at its size or another of the same aspect, shape [H, W] or
-            [H, W, C].
+        values: The map, upright or oriented like the stored image, at the image's size or another size of the same aspect,
+            shape [H, W] or [H, W, C].
         path: File of the map, for errors.
 
     Raises:
@@ -82,5 +82,5 @@ def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndar
 
 
 def _same_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
-    """Return True where a raster has the aspect of a size (height, width), within a pixel of the smaller of the two."""
+    """Return True where a raster has the aspect of a size (height, width), within a pixel of the smaller one."""
     return abs(shape[1] * size[0] - shape[0] * size[1]) <= max(*size, *shape[:2])

@@ -20,8 +20,8 @@ MAX_COORDINATE = 1e12
 def normalization_of(views: list[View], points: PointCloud | None, where: str) -> Normalization:
     """Return the similarity that puts the mean camera centre at the origin and the farthest camera at a distance of 1 / 1.1.
 
-    If all cameras are in one place, the median over the points of their largest offset along an axis becomes 1; without points
-    the scale is unchanged.
+    If all cameras are in one place, points set the scale: the median of their largest offsets along an axis becomes 1. Without
+    points the scale is unchanged.
 
     Raises:
         DataError: A camera centre is absurdly far away; the message begins with ``where`` and names the image.

@@ -50,7 +50,7 @@ class ReadOptions:
     max_side: int = 0
     """Largest image side [px], after ``downscale``; 0 for no limit."""
     lenses: str = "undistort"
-    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (`Camera.model` has the lens)."""
+    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (`Camera.model` names the lens)."""
     maps: MapOptions = NO_MAPS
     """Given maps of depth and normals."""
     on_image: Callable[[Path], object] | None = None

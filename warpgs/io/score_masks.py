@@ -60,7 +60,7 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
         The views with ``score_mask`` set, inside the view's own mask where it has one, and a note for the user.
 
     Raises:
-        DataError: No masks are found, one is missing (the message names the ids) or does not fit, or it cannot be known whether
+        DataError: No masks are found; a mask is missing (the message names the ids) or does not fit; or it is unclear whether
             the images count from 0 or from 1.
     """
     inner = folder / "mask"

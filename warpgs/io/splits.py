@@ -30,7 +30,7 @@ SPECS = "llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all, or train=NAMES;te
 
 @dataclass(frozen=True)
 class Split:
-    """Names of the views that train and of those held out; disjoint."""
+    """Names of the training views and of the held-out views; disjoint."""
 
     train: tuple[str, ...]
     test: tuple[str, ...]
@@ -91,7 +91,7 @@ class _Names:
         self._ends: dict[tuple[bool, int], dict[str, list[str]]] = {}
 
     def find(self, wanted: str) -> str:
-        """Return the view of a name, given whole or by its last parts, with suffix or without; the strictest match decides."""
+        """Return the view with the wanted name or name end, with suffix or without; the strictest kind of match decides."""
         parts = wanted.count("/") + 1
         for count in (0, parts):
             for bare in (False, True):
@@ -108,7 +108,7 @@ class _Names:
         raise DataError(f"split {self.spec}: no view {wanted!r}; the nearest names are {some}")
 
     def _by_end(self, bare: bool, count: int) -> dict[str, list[str]]:
-        """Return the names that have more than ``count`` parts, by their last ``count`` parts; for 0 all, by the whole name."""
+        """Return names of more than ``count`` parts by their last ``count`` parts; if it is 0, all names by the whole name."""
         if (bare, count) not in self._ends:
             table: dict[str, list[str]] = {}
             for name in self.names:
@@ -202,7 +202,7 @@ def held_out_split(scene: Scene) -> tuple[str, str]:
 
 
 def coincident_views(scene: Scene, split: Split) -> list[tuple[str, str]]:
-    """Return pairs (held-out view, training view) with the same camera: a copy of the training image would score as well.
+    """Return pairs (held-out view, training view) with the same camera: a copy of the training image would score well.
 
     Two cameras count as the same if all entries of their poses differ by less than a thousandth; lengths are in camera extents.
     """

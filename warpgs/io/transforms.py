@@ -24,7 +24,7 @@ BLENDER_FILES = tuple(f"transforms_{split}.json" for split in ("train", "val", "
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 FISHEYE = "OPENCV_FISHEYE"
 UNSUPPORTED_TERMS = ("k4", "k5", "k6", "is_fisheye", "fisheye_crop_radius")
-"""Keys of lens models that the five distortion terms of OpenCV cannot express; a fisheye's k4 is read with native lenses."""
+"""Keys of lens models that the five distortion terms of OpenCV cannot express; for native lenses, a fisheye's k4 is read."""
 WHITE = (1.0, 1.0, 1.0)
 MAX_BYTES = 32 * 2**20
 """Largest file [bytes]; ten thousand frames take about ten million bytes."""
@@ -171,7 +171,7 @@ class _Reading:
         return self.scene.child(folder, name, where, root=self.root)
 
     def image_path(self, folder: Path, name: object, where: str) -> Path:
-        """Return the image file of a frame; Blender leaves the suffix out."""
+        """Return the image file of a frame; Blender's file names have no suffix."""
         path = self.child(folder, name, where)
         if path.suffix.lower() in SUFFIXES:
             return path
@@ -184,7 +184,7 @@ class _Reading:
         return self.scene.find_mask(path, self.root / "images")
 
     def named(self, file: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
-        """Return the maps that a frame names, as nerfstudio does."""
+        """Return the maps that a frame names under nerfstudio's keys."""
 
         def path(key: str, flag: str) -> Path | None:
             if not frame.get(key) or getattr(self.scene.options.maps, flag) is not None:

@@ -14,7 +14,7 @@ MIN_KEYPOINTS = 100
 MIN_MATCHES = 15
 """Number of matches that a pair needs, all in agreement with one motion of the camera."""
 WEAK_MATCHES = 60
-"""Matches below which the link between two photographs is called weak: a few wrong ones bend the poses."""
+"""Matches below which the link between two photographs is called weak: a few wrong matches bend the poses."""
 WIDE_ANGLE = 30.0
 """Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few matches."""
 MAX_ADVICE = 8
@@ -79,11 +79,11 @@ def advice(found: Mapping, names: Sequence[str]) -> list[str]:
     for i, j, angle in sorted(tree, key=lambda t: -t[2]):
         if angle > WIDE_ANGLE:
             said.append(
-                f"take one or two photographs between {names[i]} and {names[j]}: their axes differ by {angle:.0f} degrees"
+                f"take one or two photographs between {names[i]} and {names[j]}, whose axes differ by {angle:.0f} degrees"
             )
     for i in found.views:
         best = [(n, j) for j, n in partners(found, i) if j in found.views]
         if best and best[0][0] < WEAK_MATCHES:
-            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}: they share only {best[0][0]} matches")
+            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}, which share only {best[0][0]} matches")
     more = len(said) - MAX_ADVICE
-    return said[:MAX_ADVICE] + ([f"and {more} more; do these first"] if more > 0 else [])
+    return said[:MAX_ADVICE] + ([f"and {more} more; begin with those above"] if more > 0 else [])

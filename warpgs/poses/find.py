@@ -244,7 +244,7 @@ def _notes(photographs: list[Photograph]) -> list[str]:
 
 
 def _links(found: Mapping, photographs: list[Photograph]) -> str:
-    """Return which pairs match best, and which photographs match none; those with the fewest matches first."""
+    """Return which pairs match best, and which photographs match none; fewest matches first."""
     pairs: dict[tuple[int, ...], int] = {}
     for i in range(len(photographs)):
         best = partners(found, i)[:1]

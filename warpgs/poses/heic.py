@@ -37,7 +37,7 @@ def is_heic(path: Path) -> bool:
 def to_jpeg(
     paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Callable[[str], object] = lambda line: None
 ) -> dict[Path, Path]:
-    """Write upright JPEG copies of HEIC files, with only maker, model and focal length as EXIF; return them by file.
+    """Write upright JPEG copies of HEIC files, with only maker, model and focal length as EXIF; return the copy of each.
 
     Args:
         paths: HEIC files below ``root``.

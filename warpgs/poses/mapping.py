@@ -38,7 +38,7 @@ class FoundView:
     center: np.ndarray
     """Camera centre [file units], shape [3]."""
     points: int
-    """Number of points that it sees."""
+    """Number of points that the photograph sees."""
 
 
 @dataclass(frozen=True)
@@ -68,13 +68,13 @@ class Mapping:
     views: dict[int, FoundView]
     """Views of the largest model."""
     cameras: tuple[FoundCamera, ...]
-    """Cameras of these views."""
+    """Cameras of the views in ``views``."""
     groups: tuple[tuple[int, ...], ...]
     """Photographs of each model, the largest first: photographs of different models share too little."""
     points: int
     """Number of points of the largest model."""
     error: float
-    """Mean reprojection error of these points [px of the photograph]; 0 without a model."""
+    """Mean reprojection error of the largest model's points [px of the photograph]; 0 without a model."""
     method: str
     """Mapper that made the model: incremental or global."""
     version: str
@@ -105,13 +105,13 @@ def check_installed() -> None:
 
 
 def camera_groups(photographs: list[Photograph]) -> list[int]:
-    """Return the number of the camera of each photograph: one for each device, focal length and image size."""
+    """Return each photograph's camera number; photographs of one device, focal length and image size share a camera."""
     numbers: dict[tuple[str, float | None, int, int], int] = {}
     return [numbers.setdefault((p.device, p.focal, p.width, p.height), len(numbers)) for p in photographs]
 
 
 def cameras_of(photographs: list[Photograph], groups: list[int]) -> list[Photograph]:
-    """Return the first photograph of each camera, by the number of the camera, from `camera_groups`."""
+    """Return the first photograph of each camera, in the order of the camera numbers (``groups``, from `camera_groups`)."""
     first: dict[int, Photograph] = {}
     for number, photograph in zip(groups, photographs):
         first.setdefault(number, photograph)
@@ -140,7 +140,7 @@ def _job(
 
 
 def _lines(job: dict[str, Any], folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the worker's messages, and end it when the reader stops."""
+    """Yield the worker's messages; end the worker when the reader stops."""
     write_json(folder / JOB, job)
     try:
         for line in python_lines("warpgs.poses.worker", JOB, folder=folder, environment={"GLOG_logtostderr": "1"}):

@@ -1,7 +1,7 @@
 """Keypoints and matches of photographs by a network that the user names, for photographs without a pose from SIFT.
 
-The network is one ONNX file. It takes an image, colours in [0, 1], and returns `keypoints` [K, 2] in pixels of its input (pixel
-centres at +0.5), `scores` [K], positive where there is a keypoint, and `descriptors` [K, D] of length 1.
+The network is one ONNX file. It takes an image with colours in [0, 1]. Its outputs are `keypoints` [K, 2] in pixels of its
+input (centres at +0.5), `scores` [K] (positive for a keypoint), and `descriptors` [K, D] of length 1.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ MULTIPLE = 32
 MAX_KEYPOINTS = 4096
 """Largest number of keypoints of a photograph; those with the highest scores are kept."""
 MAX_CHANNELS = 256
-"""Longest descriptor."""
+"""Largest number of entries of a descriptor."""
 MIN_COSINE = 0.82
-"""Smallest cosine of the descriptors of a match: that of XFeat (Potje et al. 2024)."""
+"""Smallest cosine between the descriptors of a match, as in XFeat (Potje et al. 2024)."""
 TURN_SIDE, TURN_KEYPOINTS = 512, 512
 """Longer side [px] and number of keypoints of a photograph for the search of rotations between photographs."""
 TURN_GAIN = 2

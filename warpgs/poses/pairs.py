@@ -1,8 +1,8 @@
 """Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
 
 Photographs look alike if their descriptors, of SIFT or a network, belong to the same visual words. The small vocabulary of
-words is made from the descriptors themselves (tf-idf: Sivic and Zisserman, "Video Google", 2003). Sums of products of integers
-below 2^24 are exact in float32, so the order of additions changes no bit.
+words is made from the descriptors themselves (tf-idf: Sivic and Zisserman, "Video Google", 2003). Sums of integer products
+are exact in float32 while they are below 2^24, so the order of additions changes no bit.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ import numpy as np
 WORDS = 256
 """Size of the vocabulary."""
 SAMPLES = 20_000
-"""Descriptors that the vocabulary is made from."""
+"""Number of descriptors from which the vocabulary is made."""
 ROUNDS = 8
 """Rounds of k-means."""
 NEIGHBOURS = {"photographs": 2, "video": 10}
-"""A photograph is matched with this many before it and after it, in the order of names; by kind of source."""
+"""Number of neighbours on each side, in the order of names, that a photograph is matched with, by kind of source."""
 LOOKALIKES = {"photographs": 20, "video": 5}
 """Number of most similar photographs that a photograph is matched with, by kind of source."""
 
@@ -42,7 +42,7 @@ def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
 
 
 def _nearest(rows: np.ndarray, centers: np.ndarray) -> np.ndarray:
-    """Return the number of the nearest centre of each row [K]; the first of equals."""
+    """Return the number of the nearest centre of each row [K]; of several equally near, the first."""
     return np.argmin((centers * centers).sum(1)[None] - 2 * (rows @ centers.T), axis=1)
 
 

@@ -27,7 +27,7 @@ RUN_FILES = ("metrics.jsonl", "checkpoint.safetensors")
 SHOWN_FOLDERS = 10
 """Largest number of folders of photographs that a note names."""
 MATCHING_SIDE = 2000
-"""Longer side of the copies that are matched [px]; larger ones cost time and find the same points."""
+"""Longer side of the copies that are matched [px]; larger copies cost time and give the same points."""
 DIAGONAL_35MM = math.hypot(36, 24)
 """Diagonal of 35 mm film [mm], by which the equivalent focal length in EXIF is defined (CIPA DCG-001)."""
 JPEG_QUALITY = 98
@@ -166,8 +166,8 @@ def prepare(path: Path, root: Path, small: Path, max_pixels: int = MAX_PIXELS) -
 def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXELS) -> None:
     """Write a photograph into the image folder of a scene: upright, at full size, and without its metadata.
 
-    JPEG and PNG files that are upright keep their coded pixels; others are coded again, JPEG at quality `JPEG_QUALITY`, all
-    else as PNG of 8 bits.
+    JPEG and PNG files that are upright keep their coded pixels. Other files are coded again: JPEG files as JPEG of quality
+    `JPEG_QUALITY`, all others as PNG of 8 bits.
 
     Raises:
         DataError: The file has changed since it was matched.

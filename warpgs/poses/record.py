@@ -1,4 +1,4 @@
-"""Records of found poses: poses.json for programs, which is read again, and poses.txt for people."""
+"""Records of found poses: poses.json, which warpgs reads again, and poses.txt for people."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames of a video: the sharpest of each of equally long parts."""
+"""Frames of a video: the sharpest frame of each of several equally long parts."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def sharpness(frame: np.ndarray) -> float:
 
 
 def sharpest(values: list[float], count: int) -> list[int]:
-    """Return the indices of at most ``count`` frames: the sharpest of each of ``count`` equal parts, the earliest of equals."""
+    """Return indices of at most ``count`` frames: the sharpest of each of ``count`` equal parts, the first if several are."""
     bounds = np.linspace(0, len(values), min(count, len(values)) + 1).round().astype(int)
     return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
 

@@ -23,20 +23,21 @@ from warpgs.runtime.terminal import answer
 SEED = 0
 """Seed of everything that is sampled."""
 MIN_INLIERS = 15
-"""Smallest number of matches of a pair that agree with one motion of the camera, and of points that a new photograph sees."""
+"""Smallest number of a pair's matches that agree with one camera motion; also of points that a new photograph must see."""
 MIN_RATIO = 0.6
-"""Fraction of a network's matches of a pair that must agree with one motion: most places that only look alike have less
-(decision 017)."""
+"""Fraction of a network's matches of a pair that must agree with one motion: for most places that only look alike it
+is smaller (decision 017)."""
 PEAK = 0.003
-"""Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on temple and fern."""
+"""Contrast that a SIFT keypoint needs, half of pycolmap's: few photographs need more points. Chosen on the scenes temple and
+fern."""
 CAMERA_MODEL = "SIMPLE_RADIAL"
 """One focal length and one coefficient of distortion, which a few photographs can determine."""
 
 KEEP_FOCAL = 4
-"""Largest number of photographs with which EXIF's focal length is kept: a free one is less accurate (decision 017)."""
+"""Largest number of photographs with which EXIF's focal length is kept: estimating it is less accurate (decision 017)."""
 MAX_RATIO = 1.05
-"""Largest ratio of mean reprojection errors, with EXIF's focal length and with a free one, at which EXIF's is kept (decision
-017)."""
+"""EXIF's focal length is kept if its mean reprojection error is at most this many times that of an estimated focal length
+(decision 017)."""
 
 
 def _say(**values: Any) -> None:
@@ -83,7 +84,7 @@ def verification_options(pycolmap: Any) -> Any:
 
 
 def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Write the keypoints and matches of a network into the database and verify them; return what `matched` does."""
+    """Write the keypoints and matches of a network into the database and verify them; return the result of `matched`."""
     with np.load(job["learned"], allow_pickle=False) as learned:
         pairs, ends = learned["pairs"], np.cumsum(learned["counts"])
         matches = np.split(learned["matches"], ends[:-1])
@@ -112,7 +113,7 @@ def verify_learned(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def match(pycolmap: Any, job: dict[str, Any]) -> dict[str, Any]:
-    """Match pairs of photographs; return what `matched` does."""
+    """Match pairs of photographs; return the result of `matched`."""
     with pycolmap.Database.open(job["database"]) as database:
         order = numbers_of(database, job)
         few = len(order) <= job["exhaustive"]
@@ -166,9 +167,10 @@ def map_incrementally(pycolmap: Any, job: dict[str, Any], keep_focal: bool = Fal
 
 
 def believes_exif(kept: list[Any], free: list[Any]) -> bool:
-    """Return whether the best of ``kept``, with EXIF's focal length, has at least as many photographs as that of ``free``.
+    """Return whether EXIF's focal length is kept: models ``kept`` have it, for models ``free`` it was estimated.
 
-    Its error must be at most `MAX_RATIO` times as large. If a list is empty, return whether ``kept`` has models.
+    The best of ``kept`` must have at least as many photographs as the best of ``free``, and at most `MAX_RATIO` times its
+    error. If a list is empty, return whether ``kept`` has models.
     """
     if not kept or not free:
         return bool(kept)

@@ -70,8 +70,8 @@ def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, 
     """Fill the gaps of a depth map in inverse depth, along surfaces of uniform colour and not across colour edges.
 
     The result is the ratio of smoothed ``w / z`` and smoothed ``w``, by the fast global smoother (Min et al. 2014), a solver
-    of weighted least squares that the image guides. The weight w falls with the change of 1 / z for a shift of the match
-    by one pixel, so badly conditioned depths have less weight than their neighbours.
+    of weighted least squares that the image guides. The weight w is small where 1 / z changes much when the match shifts by
+    one pixel. So badly conditioned depths have less weight than their neighbours.
 
     Args:
         image: Colours in [0, 1], shape [H, W, 3].

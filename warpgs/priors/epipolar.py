@@ -1,8 +1,8 @@
 """Depth from optical flow between views with known poses: epipolar lines, checks, and the blending of source views.
 
 After NexusGS (Zheng et al. 2025), with checks that its released code lacks: positive depths in both views, a smallest parallax,
-a position inside the image, and the round trip of the flow. The sensitivity is the true derivative. Derivation:
-docs/flow_epipolar.md.
+a position inside the image, and the round trip of the flow. The sensitivity of depth to the match is the true derivative.
+Derivation: docs/flow_epipolar.md.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class PairDepth:
     sensitivity: np.ndarray
     """|dz/dpx| [u/px], shape [N]; infinite where a shift by half a pixel moves the point behind a camera or to infinity."""
     valid: np.ndarray
-    """True where both depths are positive, the parallax suffices, the point of the line nearest to the match is in the second
-    image, and the depth is finite."""
+    """True where both depths are positive, the parallax suffices, the depth is finite, and the epipolar line's point nearest to
+    the match is in the second image."""
 
 
 def pixel_grid(camera: Camera) -> np.ndarray:
@@ -149,7 +149,7 @@ def _triangulate(rays: np.ndarray, others: np.ndarray, tau: np.ndarray) -> tuple
 
 
 def round_trip(matches: np.ndarray, pixels: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Return distances [px], shape [N], from pixels to their matches moved by the flow ``back`` [H, W, 2]; inf outside."""
+    """Return the distance [px] from each pixel to its match moved by the flow ``back`` [H, W, 2], shape [N]; inf outside."""
     import cv2
 
     height, width = back.shape[:2]
@@ -169,9 +169,9 @@ def blend(depths: np.ndarray, sensitivities: np.ndarray, valid: np.ndarray, mode
 
     Args:
         depths: Candidates [u], shape [S, N], nearest source first.
-        sensitivities: |dz/dpx| of each [u/px], at least 0, shape [S, N].
+        sensitivities: |dz/dpx| of each candidate [u/px], at least 0, shape [S, N].
         valid: True where a candidate passed the checks, shape [S, N].
-        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties that of the nearest source; nearest_first
+        mode: least_sensitive takes the candidate with the smallest |dz/dpx|, on ties the nearest source's; nearest_first takes
             the first valid one; mean_valid the mean; inverse_sensitivity the mean weighted by 1 / |dz/dpx|.
 
     Returns:

@@ -78,7 +78,7 @@ def _dpt(request: ExportRequest) -> torch.nn.Module:
         name = request.weights or DPT_WEIGHTS
         raise DataError(
             f"{name}: the weights cannot be loaded ({str(e).splitlines()[0][:200]}); connect to the internet to download "
-            "them, or give a folder that contains them with --weights"
+            "them, or name their folder with --weights"
         ) from e  # fmt: skip
 
 

@@ -122,7 +122,7 @@ def _gray(view: View) -> np.ndarray:
 
 
 def _same_size(views: Sequence[View], i: int, j: int, compute: Callable[[View, View], np.ndarray | None]) -> np.ndarray | None:
-    """Return flow by a method that needs both images at one size: the second is resized to the first's."""
+    """Return flow by a method that needs both images at one size: the second is resized to the first's size."""
     import cv2
 
     first, second = views[i], views[j]

@@ -1,4 +1,4 @@
-"""Given depth, converted to the scene's units, checked against consistent depth, and used instead of the sweep's depth.
+"""Given depth: converted to the scene's units, checked against consistent depth, and used instead of the depth of a sweep.
 
 Derived in docs/decisions/022-given-depth.md. Depths are compared with the references of their view: depth of the sweep that
 other views confirm, and points of the reconstruction that the view saw. Maps of unknown scale and shift are fitted to the
@@ -52,7 +52,7 @@ class Alignment:
     references: int = 0
     """Number of references."""
     difference: float = float("nan")
-    """Median relative difference from the references; NaN without any."""
+    """Median relative difference from the references; NaN without references."""
     why_not: str = ""
     """Reason why the map is not used; empty if it is used."""
 
@@ -144,7 +144,7 @@ def align(view: View, found: ViewDepth | None, known: PointCloud) -> Alignment:
 
     Args:
         view: A view with given depth.
-        found: Depth of the view from the sweep that other views confirm; None without a sweep.
+        found: Swept depth of the view, where other views confirm it; None without a sweep.
         known: Points of the reconstruction, with the views that saw them.
     """
     assert view.depth is not None
@@ -188,7 +188,7 @@ def votes(
 
     Args:
         views: All views, pinholes.
-        depths: Depth of each [u], 0 for missing values, shape [H, W] each.
+        depths: Depth of each view [u], 0 for missing values, shape [H, W] each.
         index: Index of the view.
         near: Number of nearest views to compare with.
 
@@ -224,7 +224,7 @@ def with_given_depth(
 
     Args:
         views: Training views, pinholes.
-        found: Estimated depth of each view that other views confirm; None if not estimated.
+        found: Estimated depth of each view, where other views confirm it; None if not estimated.
         known: Points of the reconstruction.
 
     Raises:
@@ -283,11 +283,11 @@ def _notes(
     if compared:
         off = [a.difference for a in compared]
         notes[0] += (
-            f"; median difference from depth that other views confirm {np.median(off):.1%} (worst view {max(off):.1%}), at "
+            f"; median difference from depths that other views confirm: {np.median(off):.1%} (worst view {max(off):.1%}), at "
             f"{sum(a.references for a in compared):,} pixels"
         )
     if len(compared) < len(used):
-        notes[0] += f"; {len(used) - len(compared)} of them without a comparison"
+        notes[0] += f"; {len(used) - len(compared)} of these views without a comparison"
     if removed:
         notes[0] += f"; {removed:.1%} of the given depths left out, because other views see through them"
     if refused:

@@ -29,7 +29,7 @@ MAX_TINT = 1.1
 """The white balance is reported if a channel's factor differs from the factor of brightness by more than this ratio, up or
 down."""
 NEIGHBORS = 4
-"""Number of nearest photographs that each photograph is compared with, besides those to which it is one of the nearest."""
+"""Each photograph is compared with this many nearest ones, and with all that have it among their nearest ones."""
 MIN_MATCHES = 10
 """Smallest number of matches for a comparison of two photographs."""
 MAX_FEATURES = 1000
@@ -138,7 +138,7 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
 
 
 def _typical(differences: list[float]) -> float | None:
-    """Return the median, or of two middle values the number between them that is nearest to 0; None if all are NaN.
+    """Return the median; with two middle values, the number between them nearest to 0; None if all are NaN.
 
     A faulty photograph differs from most others, so the choice does not hide it.
     """
@@ -217,5 +217,5 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
 
 
 def _listed(words: list[str]) -> str:
-    """Return words as a list; of more than `MAX_NAMED` the first, and how many more there are."""
+    """Return words as a list: all if there are at most `MAX_NAMED`, otherwise the first ones and the number of the others."""
     return ", ".join(words[:MAX_NAMED]) + (f" and {len(words) - MAX_NAMED} more" if len(words) > MAX_NAMED else "")

@@ -80,7 +80,7 @@ def lens_depth(camera: Camera, found: ViewDepth) -> ViewDepth:
 
 
 def _lens_pixels(camera: Camera) -> np.ndarray:
-    """Return the lens pixels [H * W, 2] in the directions of a pinhole's pixels with the same K; far off if none exists."""
+    """Return for each pixel of a pinhole with the same K the lens pixel [H * W, 2] in its direction; far off if none exists."""
     plane = (pixel_grid(camera) - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     positions = np.concatenate([plane, np.ones((len(plane), 1))], 1)
     with np.errstate(all="ignore"):

@@ -1,6 +1,6 @@
 """Semantics of an image as three maps: confidence of the labels, their boundaries, and foreground.
 
-Paper, Multi-Modal Importance Assessment: S_semantic = F_seg(I) (omega_boundary + omega_foreground).
+In the paper's section on Multi-Modal Importance Assessment: S_semantic = F_seg(I) (omega_boundary + omega_foreground).
 """
 
 from __future__ import annotations
@@ -113,9 +113,9 @@ def network_semantics(network: Network, preprocessing: Preprocessing, image: np.
 
 
 def _fast_length(length: int) -> int:
-    """Return the largest product of 2, 3 and 5 up to a length: other Fourier transforms take up to ten times as long.
+    """Return the largest number up to ``length`` with the prime factors 2, 3 and 5 only, for fast Fourier transforms.
 
-    ``length`` is the side of a reduced image, at least 1 [px].
+    Transforms of other lengths take up to ten times as long. ``length`` is the side of a reduced image, at least 1 [px].
     """
     while length > 1:
         rest = length

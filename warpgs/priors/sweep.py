@@ -51,7 +51,7 @@ def consistent_depth(
 
     Args:
         views: Views by index.
-        inverses: Inverse depths of each [1/u], float64, shape [H, W].
+        inverses: Inverse depths of each view [1/u], float64, shape [H, W].
         index: Index of the view.
         others: Indices of the views to check it with.
         config: Checks.
@@ -72,7 +72,7 @@ def consistent_depth(
 def _backend(
     views: Mapping[int, View], planes: Mapping[int, np.ndarray], config: SweepConfig, device: torch.device
 ) -> tuple[Callable[[View, Sequence[View], np.ndarray], np.ndarray], list[str]]:
-    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on that."""
+    """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on this."""
     notes: list[str] = []
     if device.type == "cuda":
         needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())
@@ -86,7 +86,7 @@ def _backend(
 
 
 def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) -> ViewDepth:
-    """Return the depth that was found in a smaller image at the view's own size, without masked pixels."""
+    """Return depth found in a smaller image, resized to the view's own size and without masked pixels."""
     import cv2
 
     depth, valid, sensitivity = found.depth, found.valid, found.sensitivity
@@ -145,7 +145,7 @@ def sweep_depths(
             else:
                 inverses[i] = np.full(small[i].image.shape[:2], planes[i][0])
             progress(done, len(swept))
-        out = [_unswept(v, f"not swept: the {len(swept)} swept views, of {len(views)}, see most of the scene") for v in views]
+        out = [_unswept(v, f"not swept: the {len(swept)} swept views (of {len(views)}) see most of the scene") for v in views]
         for i in swept:
             partners = matching_views(sight, cameras, i, config.near_count, swept)
             found = consistent_depth(small, inverses, i, partners, config)

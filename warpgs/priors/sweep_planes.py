@@ -14,16 +14,16 @@ from warpgs.priors.epipolar import homogeneous
 from warpgs.scene import Camera, View
 
 NOISE = (2 / 255) ** 2
-"""Variance of a window below which its pattern is noise: correlation fades to 0 there."""
+"""Variance below which the pattern in a correlation window counts as noise: correlation fades to 0 there."""
 EDGE = 0.06
 """Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
 UNIT = 4096
-"""Integer that stands for cost 1 in cost volumes of 16 bits. These need half the memory of float32, and the first access to
-memory takes as long as the computation."""
+"""Integer that stands for cost 1 in cost volumes of 16 bits. Such volumes need half the memory of float32; the first access
+to memory takes as long as the computation."""
 MAX_LARGE_STEP = 0.99
-"""P2 up to which the sum of four paths, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
+"""Largest penalty P2 at which the sum of four path costs, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
 PLANES_AT_ONCE = 16
-"""Planes per launch on the GPU."""
+"""Number of planes per launch on the GPU."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class SweepConfig:
     large_step: float = 0.5
     """Penalty for any other depth (P2) where the image is uniform; less across the image's edges, but at least 1.5 P1."""
     max_round_trip: float = 0.6
-    """Largest error [px] of a round trip of a pixel through another view and back by that view's depth."""
+    """Largest error [px] when a pixel is projected into another view and back by that view's depth."""
     min_parallax: float = 0.5
     """Smallest angle between the two rays [deg]; below it depth is noise."""
 

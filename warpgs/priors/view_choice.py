@@ -14,7 +14,7 @@ from warpgs.scene import Camera
 SAMPLES = 4
 """Number of sampled pixels along each side of an image."""
 DEPTHS = 3
-"""Number of depths at each of these pixels."""
+"""Number of depths at each sampled pixel."""
 LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
 """Angles between two rays to a point [deg]. Below the first, depth is uncertain. Above the second, a surface looks different to
 both views. From the third on, the views are assumed to share nothing."""
@@ -24,7 +24,7 @@ class Sight(NamedTuple):
     """Shared sight of pairs of V views, as fractions of what the first view of a pair sees."""
 
     overlap: np.ndarray
-    """Fraction of the first view's sight that the second shares, less at larger angles, in [0, 1], shape [V, V]."""
+    """Fraction of what the first view sees that the second sees, too, less at larger angles, in [0, 1], shape [V, V]."""
     matching: np.ndarray
     """Shared fraction, weighted by how well depth can be found at the angle; 0 for a view and itself, shape [V, V]."""
 

@@ -44,9 +44,9 @@ class PriorConfig:
     depth_guides: bool = False
     """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
     depth_size: int = 0
-    """Shorter input side of the depth network [px], unless the file fixes it; 0 for FILE.onnx.json's value, else 384."""
+    """Shorter input side of the depth network [px], unless the ONNX file fixes it. Default (0): FILE.onnx.json, else 384."""
     depth_multiple: int = 0
-    """Divisor of both sides of the depth network's input [px]; 0 for the value of FILE.onnx.json, else 32.
+    """Divisor of both sides of the depth network's input [px]. Default (0): FILE.onnx.json, else 32.
     Depth Anything needs 14."""
     depth_mean: Colors | None = None
     """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
@@ -55,9 +55,10 @@ class PriorConfig:
     segmentation_model: str | None = None
     """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
     segmentation_size: int = 0
-    """Shorter input side of the segmentation network [px], unless the file fixes it; 0 for FILE.onnx.json's value, else 512."""
+    """Shorter input side of the segmentation network [px], unless the ONNX file fixes it. Default (0): FILE.onnx.json, else
+    512."""
     segmentation_multiple: int = 0
-    """Divisor of both sides of the segmentation network's input [px]; 0 for the value of FILE.onnx.json, else 32."""
+    """Divisor of both sides of the segmentation network's input [px]. Default (0): FILE.onnx.json, else 32."""
     segmentation_mean: Colors | None = None
     """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else ImageNet's 0.485 0.456 0.406."""
     segmentation_std: Colors | None = None
@@ -168,7 +169,7 @@ def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], ob
 
 
 def _stands_out(region: np.ndarray | None) -> bool:
-    """Return True where a region shows an object: False where a mask only cuts off a frame or a passer-by."""
+    """Return whether a region shows an object; False if a mask only cuts off a frame or a passer-by."""
     return region is not None and 0 < float(region.mean()) <= MAX_OBJECT_FRACTION
 
 

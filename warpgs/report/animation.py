@@ -19,7 +19,7 @@ MAX_FPS = 50
 QUALITY = 80
 """Quality of WebP, from 0 to 100."""
 PALETTE_PIXELS = 2**18
-"""Pixels of all frames that a GIF's palette is chosen from."""
+"""Number of pixels, taken from all frames, from which a GIF's palette is chosen."""
 
 
 def _pixels(path: Path, frames: Iterable[np.ndarray]) -> list[np.ndarray]:
@@ -64,8 +64,8 @@ def write_animation(path: Path, frames: Iterable[np.ndarray], fps: int) -> int:
 
     Raises:
         DataError: There are no frames, or they differ in size.
-        ResourceError: Pillow cannot encode it, or the file cannot be written.
-        UsageError: There are too many frames, or too many a second for browsers.
+        ResourceError: Pillow cannot encode the image, or the file cannot be written.
+        UsageError: There are too many frames, or too many per second for browsers.
     """
     from PIL import Image
 

@@ -16,7 +16,7 @@ LEGEND = (72, 8)  # width and height of a colour bar [px]
 DOT = (240, 78, 35)
 """Colour of dots."""
 MAX_DOT_FRACTION = 0.08
-"""Fraction of an image above which dots shrink, down to a radius of 0.9 px."""
+"""Fraction of an image that dots may cover before they shrink, down to a radius of 0.9 px."""
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 UNSEEN, ONCE = (0.82, 0.0, 0.52), (1.0, 0.69, 0.0)
-"""Magenta and amber: apart in brightness, too, and for every kind of colour vision."""
+"""Magenta and amber: they differ in brightness, too, and for every kind of colour vision."""
 LEGEND = "striped magenta: seen by no training view; amber: seen by one; unchanged: seen by two or more, or background"
-"""Meaning of the pattern."""
+"""Meaning of the colours."""
 STRIPES = 90
 """Stripes along the larger side of an image."""
 

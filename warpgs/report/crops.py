@@ -1,4 +1,4 @@
-"""Windows in which images of one view differ most: the places worth enlarging."""
+"""Rectangular crops in which images of one view differ most, to be enlarged."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
 
 
 def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
-    """Return the top left corners (x, y) [px] of ``count`` windows with the largest sums of ``values`` [H, W], largest first.
+    """Return the top left corners (x, y) [px] of ``count`` crops with the largest sums of ``values`` [H, W], largest first.
 
-    Windows do not overlap; fewer are returned if no more fit. If all values are 0, the first window is in the middle.
+    Crops do not overlap; fewer are returned if no more fit. If all values are 0, the first crop is in the middle.
     """
     H, W = values.shape
     width, height = min(width, W), min(height, H)

@@ -118,6 +118,6 @@ def read_events(path: Path) -> list[dict]:
 
 
 def _line(event: dict) -> bytes:
-    """Return an event as a line; numbers that are not finite become null, which JSON can hold."""
+    """Return an event as a line; numbers that are not finite become null, because JSON cannot hold them."""
     plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in event.items()}
     return (json.dumps(plain, allow_nan=False) + "\n").encode()

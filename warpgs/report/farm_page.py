@@ -35,13 +35,13 @@ class JobCard:
 
     row: JobRow
     ssim: float | None = None
-    """Mean over held-out views."""
+    """Mean SSIM over held-out views."""
     ply_bytes: int = 0
     """Size of the PLY file."""
     thumbnail: str = ""
-    """Path of its image from the page, or empty."""
+    """Path of the job's image, relative to the page; empty without one."""
     report: str = ""
-    """Path of its report from the page, or empty."""
+    """Path of the job's report, relative to the page; empty without one."""
 
 
 def _address(path: str) -> str:

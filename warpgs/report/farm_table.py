@@ -33,9 +33,9 @@ class JobRow:
     step: int = 0
     """Steps done; 0 if unknown."""
     seconds: float = 0.0
-    """Time that it has taken [s]."""
+    """Time that the job has taken [s]."""
     psnr: float | None = None
-    """Mean over held-out views [dB]."""
+    """Mean PSNR over held-out views [dB]."""
     gaussians: int = 0
     message: str = ""
     """Reason of a failure, or a note."""
@@ -121,7 +121,7 @@ class FarmTable:
         bar = Table.grid()  # alone, the bar does not end its line
         bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
         more = len(running) - MOST_RUNNING
-        rest = [Text(f"and {more} more at work", style="dim")] if more > 0 else []
+        rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
         messages = [
             Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
             for r in reversed(last) if r.message

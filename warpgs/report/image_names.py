@@ -20,9 +20,8 @@ NOT_EVERYWHERE = re.compile(
 def image_names(views: Iterable[str]) -> dict[str, str]:
     """Return the file name, without suffix, of the images of each view of a scene.
 
-    A file has the view's name without suffix, with _ for /, if no other view has the same name, ignoring capitals. A name that
-    is ambiguous, longer than 100 bytes or not allowed on some system is shortened and followed by digits of a hash of the whole
-    name.
+    A file has the view's name without suffix, with _ for /, if this name is unique, ignoring capitals. A name that is
+    ambiguous, longer than 100 bytes or not allowed on some system is shortened; digits of a hash of the whole name follow.
 
     Args:
         views: Names of all views of the scene, so that a view has one name in every folder.

@@ -15,7 +15,7 @@ REMEDY = "install a software renderer: on Debian or Ubuntu `apt-get install libe
 TIMEOUT = 90
 WIDTH, HEIGHT, VIEW_ANGLE = 1280, 640, 40.0  # [px], [px], vertical [deg]
 OUTSIDE, EDGE = 1.0, 0.15
-"""Margins (`within`) of the points to show, and of the points that must be in the image: whole walls, no far background."""
+"""Margins (see `within`) for the points to show and for the points to frame: they keep walls whole and drop far background."""
 TRAIN_COLOR, TEST_COLOR = "#149696", "#e08a2c"
 
 PROBE = (

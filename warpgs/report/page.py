@@ -78,7 +78,7 @@ class SamplingReport:
     words: str
     """Sentences that explain the images."""
     images: list[tuple[str, bytes]]
-    """Caption and image file of each event that has an image; the first is open, the others open on request."""
+    """Caption and image file of each event that has an image; the page shows the first, and the others on request."""
     table: list[list[str]]
     """Header row, then rows."""
 

@@ -1,4 +1,4 @@
-"""Progress display: the current stage, with a bar; in a terminal in place, elsewhere as plain lines."""
+"""Progress display of the current stage: a line with a bar, rewritten in place, in a terminal; plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PLAIN_INTERVAL = 10.0
 STAGE_INTERVAL = 5.0
 """Seconds between two plain lines on one stage."""
 SMOOTHING = 0.05
-"""Weight of the newest value in the running means shown."""
+"""Weight of the newest value in the running means that are shown."""
 COUNTED = re.compile(r"(?P<done>[\d,]+) of (?P<total>[\d,]+)")
 """Part of a line with the progress of a stage."""
 
@@ -97,13 +97,13 @@ _PANELS: list[Progress] = []
 class Stages:
     """Lines about the current work, such as ``finding depth: view 7 of 24``.
 
-    The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line is
-    written in place, with a bar and the time that the stage has taken, until the end of a ``with`` block or `clear`. Elsewhere
-    the first line of a stage is shown at once, and then one every few seconds; the same line is shown once.
+    The text before the last colon names a stage; numbers after it, such as ``7 of 24``, make a bar. In a terminal one line
+    with the bar and the stage's time is rewritten in place. It goes at `clear` or at the end of a ``with`` block. Elsewhere the
+    first line of a stage is shown at once, and then one every few seconds; a repeated line is skipped.
     """
 
     def __init__(self, show: Callable[[str], object] = say, *, live: bool | None = None):
-        """Print plain lines with ``show``; ``live`` None writes lines in place if ``show`` is the default, in a terminal."""
+        """Print plain lines with ``show``; with ``live`` None, write in place if ``show`` is the default, in a terminal."""
         self.show, self.printed, self.shown = show, {}, set()
         self.live = (show is say and is_live()) if live is None else live
 
@@ -138,7 +138,7 @@ class Stages:
 
 
 def waiting() -> Stages:
-    """Return stages that are shown only in a terminal, for waits that no log needs."""
+    """Return stages that are shown only in a terminal, for waits that a log need not mention."""
     return Stages(lambda line: None, live=is_live())
 
 

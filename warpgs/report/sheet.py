@@ -13,7 +13,7 @@ INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
 BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))
 """Colours of the boxes, and of the frames of their crops."""
 MAX_WIDTH = 2600
-"""Largest width of a figure of many columns [px], while columns are not narrower than `CELL` allows."""
+"""Largest width of a figure of many columns [px]; exceeded if columns would be narrower than `CELL` allows."""
 CELL = (180, 480)
 """Smallest and largest width of a column [px]."""
 GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
@@ -24,7 +24,7 @@ class Cell:
     """One image of a row."""
 
     image: np.ndarray
-    """Colours in [0, 1], [H, W, 3], one size in a row."""
+    """Colours in [0, 1], [H, W, 3]; all images of a row have one size."""
     caption: str
     """Text below the image."""
 
@@ -37,7 +37,7 @@ class Strip:
     """Text above the row."""
     cells: tuple[Cell, ...]
     crops: tuple[tuple[int, int, int, int], ...]
-    """Windows to enlarge: x, y, width, height [px]."""
+    """Crops to enlarge: x, y, width, height [px]."""
 
 
 def _column(count: int, widest: int) -> int:

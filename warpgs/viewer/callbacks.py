@@ -1,4 +1,4 @@
-"""Callbacks of the viewer's controls that report an error in one line; viser would print a traceback."""
+"""Callbacks of the viewer's controls: they report an error in one line, where viser would print a traceback."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
 
 
 def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
-    """Return a pinhole camera from a browser's: camera-to-world rotation, position [u], vertical field of view [rad]."""
+    """Return the pinhole camera of a camera-to-world rotation, position [u] and vertical field of view [rad]."""
     rotation = rotation_matrices(np.asarray(wxyz, np.float64)).T
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, np.asarray(position, np.float64))

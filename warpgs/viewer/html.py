@@ -50,8 +50,8 @@ SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
 )
-"""Script for a page opened from disk. Browsers reject its blobs as module workers; without the worker that sorts them,
-Gaussians are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
+"""Script for a page opened from disk. Browsers reject its blobs as module workers; without the sorting worker, Gaussians
+are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
 address, which works."""
 WHOLE_IMAGE = (
     "<script>{let fov=OWN;const degrees=180/Math.PI,show=()=>{const c=window.__viserMutable?.camera;"
@@ -59,8 +59,8 @@ WHOLE_IMAGE = (
     "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
     "show();addEventListener('resize',show)}</script>"
 )
-"""Script that widens the vertical field of view OWN [rad] in a window narrower than the first camera's image, such as a
-phone's: else the sides would be cut off. WIDE is half the width of the image at distance 1."""
+"""Script that widens the vertical field of view OWN [rad] in a browser window narrower than the first camera's image,
+such as a phone's; otherwise the sides would be cut off. WIDE is half the width of the image at distance 1."""
 
 
 def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
@@ -168,7 +168,7 @@ def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> li
     Args:
         folder: The run folder.
         target: The file to write.
-        filters: Filters of the model; it is cleaned by default.
+        filters: Filters of the model; floaters and needles are removed by default.
 
     Raises:
         DataError: The folder is not a run, or nothing is left of its model.

@@ -1,4 +1,4 @@
-"""Images that the browser cannot draw, rendered here at the browser's camera: all directions, depth, coverage, error."""
+"""Images that the browser cannot draw, rendered here at its camera: view-dependent colours, depth, coverage, error."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ MAPS = {
 }
 """Images by name, with their descriptions."""
 NEAR = 1e-3
-"""Distance from a camera within which a view counts as at the camera, as a fraction of the cameras' extent."""
+"""Distance from a known camera, as a fraction of the cameras' extent, within which a browser's camera counts as there."""
 
 
 class Maps:
     """Renders images of one model; depths of its training views are rendered once, when coverage is first requested."""
 
     def __init__(self, content: Content, extent: float):
-        """Keep the model; ``extent`` is the size of the rig of its cameras [u]."""
+        """Keep the model; ``extent`` is the extent of its cameras [u]."""
         self.content, self.extent = content, extent
         self._depths: list[DepthView] | None = None
 
     def view_at(self, camera: Camera) -> str | None:
-        """Return the name of the model's camera at nearly the same pose as a camera; None without one."""
+        """Return the name of the model's camera at nearly the pose of ``camera``; None if there is no such camera."""
         cameras = self.content.model.scene_cameras.items()
         return next((n for n, c in cameras if stands_at(camera, c, NEAR * self.extent)), None)
 

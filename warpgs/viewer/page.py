@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 NO_PARAMETERS = "URLSearchParams=class extends URLSearchParams{constructor(){super()}set(){}};"
-"""JavaScript before viser's own: parameters such as ``websocket`` and ``playbackPath``, which name servers and files to load,
-have no effect, and none is added."""
+"""JavaScript that runs before viser's own, so that address parameters have no effect and none is added. Some of them, such as
+``websocket`` and ``playbackPath``, name servers and files to load."""
 NO_TEXT_AS_CODE = (
     "{const made=Function,nothing=()=>{},make=args=>args.length>1?made(...args):nothing;"
     "eval=nothing;Function=new Proxy(made,{apply:(f,self,args)=>make(args),construct:(f,args)=>make(args)})}"
 )
-"""JavaScript before viser's own: messages that hold JavaScript do nothing. The content policy cannot do this, since the code
-that sorts Gaussians makes functions from text, too; functions with parameters are still allowed."""
+"""JavaScript that runs before viser's own, so that JavaScript in messages does nothing. The content policy cannot do this,
+since the code that sorts Gaussians makes functions from text, too; functions with parameters are still allowed."""
 _MARK_LOADED = (
     "document.createElement=function(name,...rest){"
     "const made=Document.prototype.createElement.call(this,name,...rest);"

@@ -28,7 +28,7 @@ BOX, GIZMO = "/crop/box", "/crop"
 
 
 class Shown(Protocol):
-    """The window, as the panel uses it."""
+    """Methods of the window that the panel calls."""
 
     def redraw(self) -> None:
         """Send the current image."""
@@ -57,7 +57,7 @@ class Panel:
         degree = content.model.gaussians().sh_degree
         self._degree = gui.add_slider(
             "SH degree", 0, max(degree, 1), 1, degree, disabled=degree == 0, visible=maps,
-            hint="degree of the colours of a render; Gaussians that the browser renders have degree 0",
+            hint="spherical-harmonics degree of a render; Gaussians that the browser draws have degree 0",
         )  # fmt: skip
         self._layer = gui.add_dropdown("layer", (ALL, COARSE, FINE), initial_value=ALL, visible=content.fine is not None)
         self._cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
@@ -116,7 +116,7 @@ class Panel:
                     self.window.step_into(names[chooser.value], event.client)
 
             chooser.on_update(guarded(step))
-        reset = self.server.gui.add_button("Reset", hint="back to where the page started")
+        reset = self.server.gui.add_button("Reset", hint="back to the first camera")
         reset.on_click(guarded(lambda event: self.window.reset(event.client)))
 
     def _add_sampling(self) -> None:

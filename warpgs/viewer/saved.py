@@ -25,7 +25,7 @@ class CropBox:
     center: np.ndarray
     """Centre [u], shape [3]."""
     size: np.ndarray
-    """Lengths of its sides [u], shape [3]."""
+    """Lengths of the box's sides [u], shape [3]."""
     rotation: np.ndarray
     """Rotation from the box's axes to the world's, shape [3, 3]."""
 

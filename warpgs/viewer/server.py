@@ -1,4 +1,4 @@
-"""The viewer's server: viser's, bound to this machine, without tunnels, for clients with its full address."""
+"""The viewer's server: viser's server without tunnels, open only to this machine and only at its full address."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
         label: Title of the panel.
 
     Raises:
-        ResourceError: viser is not installed, or its version does not let requests be checked.
+        ResourceError: viser is not installed, or its version offers no way to check requests.
         UsageError: The port is taken or invalid.
     """
     require_viser()

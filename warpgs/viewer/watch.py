@@ -120,7 +120,7 @@ class LiveView:
         self._thread.start()
 
     def look(self, model: FittedModel) -> None:
-        """Copy a state before the fit's next step overwrites it, at most once per `POLL`; a state not yet shown is dropped."""
+        """Copy a state before the fit's next step overwrites it, at most once per `POLL`; an older unshown one is dropped."""
         if time.monotonic() < self._next:
             return
         copy = {n: t.detach().to("cpu", copy=True) for n, t in model.gaussians().tensors().items()}

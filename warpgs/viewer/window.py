@@ -30,7 +30,7 @@ MAP_SIDE = {"cpu": 480, "cuda": 1280}
 SETTLED = 0.15
 """Time without motion of a browser's camera before an image is rendered for it [s]."""
 HIDDEN = 3.0
-"""Distance from a browser's eye within which cameras are hidden, in sizes of their frusta, since they would hide the scene."""
+"""Cameras nearer than this to a browser's eye, in sizes of their frusta, are hidden, because they would cover the scene."""
 TRAIN_COLOR, TEST_COLOR = (20, 150, 150), (224, 138, 44)
 
 
@@ -167,7 +167,7 @@ class Window:
                 frustum.visible = not frustum.visible
 
     def _eyes(self) -> list[np.ndarray]:
-        """Return the position [3] of each browser's camera: the first view's until the browser sends its own."""
+        """Return the position [3] of each browser's camera; until a browser sends it, the position of the first camera."""
         eyes = []
         for client in self.server.get_clients().values():
             try:

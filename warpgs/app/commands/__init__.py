@@ -1,1 +1,1 @@
-"""Commands, a module each with ``run(arguments, about)``: parse, call, print; no logic."""
+"""Commands: each module has ``run(arguments, about)``, which parses, calls and prints; no logic."""

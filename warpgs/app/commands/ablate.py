@@ -8,7 +8,7 @@ from warpgs.app.own_code import load_own
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 
     base = study_flags()

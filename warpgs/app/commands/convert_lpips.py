@@ -8,7 +8,7 @@ from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
 
     @dataclass(frozen=True)
     class ConvertLpips:

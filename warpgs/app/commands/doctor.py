@@ -11,7 +11,7 @@ from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help.
+    """Run the command; ``about`` describes it in its help.
 
     Raises:
         UsageError: Flags exclude each other, or a value is invalid.

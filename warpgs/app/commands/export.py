@@ -9,7 +9,7 @@ from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     import tyro
 
     from warpgs.app.format_flags import chosen_formats, filters_of, format_flags, format_lines

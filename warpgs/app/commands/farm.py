@@ -16,7 +16,7 @@ SWITCHES = ("help", "help-all")
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     import tyro
 
     from warpgs.pipeline.farm.run import EngineRequest, check_failures, make_engine, run_and_show
@@ -27,13 +27,13 @@ def run(arguments: list[str], about: str) -> int:
     class Farm:
         jobs: tyro.conf.Positional[str]
         """Folder of scenes, a glob in quotes, or a .jsonl file: {"scene": FOLDER, "steps": 500} per line, with any flags of
-        `warpgs fit`. Place it before switches of `warpgs fit`, such as --strict."""
+        `warpgs fit`. Place this argument before switches of `warpgs fit`, such as --strict."""
         out: Path
         """Folder of the results. Repeat the command to continue; start it on several machines to share the work."""
         engine: str = "local"
         """local (processes of this machine), ray or slurm."""
         slots: int | None = None
-        """Number of concurrent jobs. Default: --per-gpu for each GPU; one on a CPU; the capacity of a cluster."""
+        """Number of concurrent jobs. Default: --per-gpu times the number of GPUs; on a CPU, 1; on a cluster, its capacity."""
         per_gpu: int = 1
         """Jobs that share a GPU."""
         threads: int = 1
@@ -77,7 +77,7 @@ def _divided(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _jobs(listed: list[ListedJob], shared: list[str], out: Path) -> list:
-    """Return the jobs, each with the settings of the shared arguments and of its own."""
+    """Return the jobs, each with settings from the shared arguments and from its own arguments."""
     from warpgs.pipeline.farm.job import FarmJob
 
     requests: dict = {}

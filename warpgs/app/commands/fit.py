@@ -215,9 +215,9 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         out: Path
         """Run folder."""
         resume: bool = False
-        """Continue it."""
+        """Continue the run."""
         device: str | None = None
-        """auto, cpu or cuda. Default: that of the run."""
+        """auto, cpu or cuda. Default: the device of the run."""
         threads: int = 0
         """CPU threads; 0 for as many as there are cores."""
         view: bool = False
@@ -225,7 +225,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
         view_port: int = 8080
         """Port of --view; 0 for any free one."""
         lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`, which a run does not store; give it again to measure LPIPS."""
+        """File of `warpgs convert-lpips`; a run does not store the file, so give it again to measure LPIPS."""
 
     a = parse_flags(Continue, arguments, "warpgs fit", about)
     check_range("--threads", a.threads, 0, MAX_THREADS)
@@ -233,7 +233,7 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
     if a.threads:
         set_threads(a.threads)
     request = stored_request(a.out)
-    say(f"continuing as before: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
     device, view_port = a.device or request.device, a.view_port if a.view else None
     return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 
@@ -264,7 +264,7 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     if place()[0] > 0:
         be_quiet()
     request = request_of(arguments, about)

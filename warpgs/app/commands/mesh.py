@@ -8,7 +8,7 @@ from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     import tyro
 
     @dataclass(frozen=True)
@@ -20,7 +20,7 @@ def run(arguments: list[str], about: str) -> int:
         voxel: float | None = None
         """Side of a voxel, in units of the scene's files; smaller voxels show more detail and more noise."""
         resolution: int | None = None
-        """Voxels along the longest side, instead of --voxel. Default: 256, or fewer for small images."""
+        """Voxels along the longest side of the mesh, instead of --voxel. Default: 256, or fewer for small images."""
         max_faces: int = 200_000
         """Largest number of triangles; larger meshes are simplified."""
         depth: str = "median"

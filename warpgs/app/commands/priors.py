@@ -16,7 +16,7 @@ USAGE = (
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help.
+    """Run the command; ``about`` describes it in its help.
 
     Raises:
         UsageError: The first argument is neither show nor export.
@@ -46,7 +46,7 @@ def _show(arguments: list[str]) -> int:
         split: str | None = None
         """Split, as for `warpgs fit`."""
         downscale: int | None = None
-        """Factor by which both image sides shrink; it removes the default limit of --max-side."""
+        """Factor by which both image sides shrink; if given, --max-side has no default limit."""
         max_side: int | None = None
         """Largest image side [px], 0 for no limit. Default: 1600 without --downscale."""
         allow_outside: bool = False

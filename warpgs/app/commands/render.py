@@ -9,7 +9,7 @@ from warpgs.runtime.terminal import say
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help.
+    """Run the command; ``about`` describes it in its help.
 
     Raises:
         UsageError: Cameras, a rule or antialiasing are given for a run.
@@ -25,14 +25,14 @@ def run(arguments: list[str], about: str) -> int:
         rule: str | None = None
         """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
         antialiased: bool = False
-        """Render a file of Gaussians with antialiasing, for antialiased models (gsplat's rasterize_mode antialiased) in files
-        that do not declare this."""
+        """Render a file of Gaussians with antialiasing. Needed for antialiased models (gsplat's rasterize_mode antialiased) if
+        the file does not declare this."""
         path: str = "auto"
         """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
         (every view of the scene), or a .json file of keyframes."""
         out: Path | None = None
-        """Folder for the images and film.mp4; or only a film: .mp4, .webm, .webp or .gif. Existing files are replaced.
-        Default: path-PATH in the run folder, or beside the file."""
+        """Folder for the images and film.mp4; or a file for the film alone: .mp4, .webm, .webp or .gif. Existing files are
+        replaced. Default: path-PATH in the run folder, or beside the file of Gaussians."""
         seconds: float | None = None
         """Duration of the film [s]. Default: chosen by the path."""
         fps: int = 30

@@ -28,8 +28,8 @@ def study_flags() -> type:
         device: str = "auto"
         """auto, cpu or cuda."""
         slots: int | None = None
-        """Number of concurrent runs, each in its own process. Without this and --per-gpu, runs follow each other in one
-        process."""
+        """Number of concurrent runs, each in its own process. If neither --slots nor --per-gpu is given, runs follow each other
+        in one process."""
         per_gpu: int | None = None
         """Runs that share a GPU."""
         lpips_weights: Path | None = None

@@ -7,7 +7,7 @@ from warpgs.app.flags import check_range, parse_flags
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` heads its help."""
+    """Run the command; ``about`` describes it in its help."""
     import tyro
 
     @dataclass(frozen=True)

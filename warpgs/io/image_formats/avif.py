@@ -1,4 +1,4 @@
-"""AVIF, decoded to 8 bits by Pillow's libavif, and its detection: HEIC files are ISO base media files, too.
+"""AVIF: decoding to 8 bits by Pillow's libavif, and detection; HEIC files have the same container (ISO base media file).
 
 libavif rejects a file that ends early. Damage inside the coded pixels is not detected.
 """
@@ -20,9 +20,9 @@ BRANDS = {
 }  # fmt: skip
 """Major brands of ISO base media files (ISO/IEC 14496-12; 23008-12 for HEIC), and the formats that they stand for."""
 HEAD = 12
-"""Bytes that decide: length, ``ftyp`` and the major brand."""
+"""Number of first bytes that determine the format: length, ``ftyp`` and the major brand."""
 BRANDS_END = 32
-"""End of the bytes in which the compatible brands are looked for."""
+"""End of the bytes that are searched for compatible brands."""
 BROKEN = (OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, struct.error)
 """Errors that Pillow raises about malformed files, as fuzzing shows."""
 

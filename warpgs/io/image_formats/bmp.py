@@ -11,7 +11,7 @@ RAW, MASKED = 0, (3, 6)
 
 
 def _header(data: bytes) -> tuple[int, int, int, int, int]:
-    """Return width, height, bits per pixel, the way the pixels are stored, and their first byte."""
+    """Return width, height, bits per pixel, the way the pixels are stored, and the place of their first byte."""
     if len(data) < 54:
         raise ValueError("it ends within its header")
     start, length = struct.unpack_from("<II", data, 10)

@@ -70,8 +70,8 @@ def unpacked_size(pieces: Iterator[memoryview], limit: int) -> int:
 
     Args:
         pieces: The stream, in order.
-        limit: Number of bytes that are wanted. Little more than this is unpacked: enough to reveal damage, but not a
-            decompression bomb.
+        limit: Expected number of bytes. Little more than this is unpacked: enough to reveal damage, too little for a
+            decompression bomb to fill the memory.
 
     Raises:
         ValueError: The stream is damaged or ends early.
