@@ -129,7 +129,7 @@ def test_bad_confidence_is_refused(tmp_path):
     scene, maps = scenes.write_colmap(tmp_path / "scene"), write_maps(tmp_path / "maps")
     for values, reason in (
         (np.full(SHAPE, 2.5, np.float32), "must be in"),
-        (np.ones((2, 2), np.float32), "give a map of that"),
+        (np.ones((2, 2), np.float32), "make both equal in size"),
     ):
         np.save(maps / "photo1.confidence.npy", values)
         with pytest.raises(DataError, match=f"photo1.confidence.npy.*{reason}"):

@@ -222,7 +222,7 @@ def test_broken_poses_in_text(changes, message, tmp_path):
         ("cameras.txt", "1 THIN 16 12 20\n", r"cameras.txt: camera model THIN is not supported"),
         ("cameras.txt", "1\n", r"cameras.txt, line 1: cannot be understood"),
         ("cameras.txt", b"\xff\xfe", r"cameras.txt, line 1: cannot be understood"),
-        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: must list"),
+        ("images.txt", "1 1 0 0 0 0 0 3 1 photo0.png\n2 1 0 0 0 0 0 3 1 photo1.png\n", r"images.txt, line 2: expected"),
         ("images.txt", "", r"has 0 usable views.*at least 2"),
     ],
 )

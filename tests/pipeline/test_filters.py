@@ -135,7 +135,7 @@ def test_boxes_of_files(tmp_path):
     assert box_of(str(path)) == box_of('{"center": [1, 0, 4], "size": [2, 4, 4]}')
     write_gaussians(tmp_path / "a.ply", made, units="file")
     lines = convert(tmp_path / "a.ply", tmp_path / "b.ply", Filters(crop=str(path), rotate="0,0,1,180"))
-    assert f"{int((made.means[:, 0] < 0).sum())} Gaussians are outside" in lines[0]
+    assert f"{int((made.means[:, 0] < 0).sum())} Gaussians outside the box" in lines[0]
     assert float(read_gaussians(tmp_path / "b.ply").means[:, 0].max()) <= 0
     for text, match in (
         ("[1, 2]", "expected a JSON object"),

@@ -14,7 +14,7 @@ def load_own(kind: str, spec: str, load: Callable[[], Loaded]) -> Loaded:
 
     Args:
         kind: Kind of the loaded object, for messages.
-        spec: Name, ``module:NAME`` or ``path/to/file.py:NAME``.
+        spec: Name of the object: ``module:NAME`` or ``path/to/file.py:NAME``.
         load: Function that loads it.
 
     Raises:

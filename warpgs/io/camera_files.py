@@ -69,7 +69,7 @@ def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
             lens = Lens(K, int(width), int(height))
             name = str(row.get("img_name", i))
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as e:
-            raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers. Write it again") from e
+            raise DataError(f"{where}: needs rotation, position, width, height, fx and fy as numbers; correct the entry") from e
         found.add(name, from_camera_to_world(pose, where, opengl=False), lens.checked(where))
     return found
 

@@ -204,8 +204,9 @@ def blend_channels(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
 
-    Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The gradients of
-    position, factor and opacity are added up over passes in a fixed order, so they repeat as those of `blend` do.
+    Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The channels
+    are blended in several passes. The gradients of position, covariance factor and opacity are summed over the passes in a
+    fixed order, so they are as repeatable as those of `blend`.
 
     Args:
         projected: Projected Gaussians of `project`, shape [C, N, 12].

@@ -194,7 +194,7 @@ def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], reg
         result.append((maps, source))
     reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
     if replaced:
-        words = f"semantics: {reason}, so the object's region (by mask or black background) is foreground in {_names(replaced)}"
+        words = f"semantics: {reason}, so the object's mask or its black background gave the foreground of {_names(replaced)}"
         notes.append(Detail(words) if classical else words)
     if empty:
         notes.append(f"semantics: no score for {_names(empty)}, which have hardly any foreground and no object mask")

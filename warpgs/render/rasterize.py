@@ -79,7 +79,7 @@ def _checked_rule(camera: Camera, options: RasterizeOptions) -> Rule:
             f"max_instances={options.max_instances}, capacity={options.capacity}"
         )
     if options.pixels is not None and (options.window or options.contributions or options.capacity is not None):
-        raise UsageError("pixels cannot be combined with window, contributions or capacity: leave them out")
+        raise UsageError("RasterizeOptions.pixels cannot be combined with window, contributions or capacity; leave out pixels")
     if options.capacity is not None and options.capacity > MAX_INSTANCES:
         raise UsageError(f"capacity must be at most {MAX_INSTANCES:,}, not {options.capacity:,}")
     if options.error_bound and options.capacity is not None:

@@ -119,7 +119,7 @@ def write_frame(message: Mapping[str, Any]) -> bytes:
 
 
 def control_value(value: Any, control: Any) -> Any:
-    """Return the value that a control takes, clamped to its limits.
+    """Return a message's value as a value for a control, clamped to the control's limits.
 
     Args:
         value: Value of a message, as `read_frame` returns it.

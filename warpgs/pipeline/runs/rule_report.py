@@ -126,8 +126,9 @@ def _summary(r: dict[str, Any]) -> str:
     else:
         ratio = r["render_ms"] / r["exact_ms"]
         words = (
-            f"rule {r['rule']} differs from rule exact in float64 by {error}; a view took {r['render_ms']:.1f} ms instead of "
-            f"{r['exact_ms']:.1f}, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'}"
+            f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
+            f"{r['render_ms']:.1f} ms, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'} than with rule exact "
+            f"({r['exact_ms']:.1f} ms)"
         )
     if r["half_resolution"] > 0:
         words += f"; {r['half_resolution']:.0%} of the steps used views of half size, with a quarter of the pixels"

@@ -169,7 +169,7 @@ def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[s
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
         f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
         f"smooth_weight {made.loss.smooth_weight:g}": config.loss.smooth_weight,
-        f"{'extrapolated' if made.init.extrapolate else 'no'} points where no view looks": config.init.extrapolate,
+        f"{'' if made.init.extrapolate else 'no '}extrapolated points": config.init.extrapolate,
         "held-out blocks" if made.stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,
         "two layers" if made.method.hier else "one layer": config.method.hier,
         f"half-size images for the first {half:.0%} of the steps": config.half_resolution,

@@ -178,7 +178,7 @@ class SlotSums:
         return slice(self.tree.ranks.rank * each, (self.tree.ranks.rank + 1) * each)
 
     def parts(self, row: int = 0) -> list[torch.Tensor]:
-        """Return the tensors of a sum, as parts of the sum's memory, in their shapes [...]."""
+        """Return the summed tensors of one row, each in its own shape [...]; they share the memory of the row."""
         sized = zip(self.starts, self.shapes, strict=True)
         return [self.rows[row, start : start + torch.Size(s).numel()].view(s) for start, s in sized]
 
