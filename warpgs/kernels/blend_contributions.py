@@ -1,4 +1,4 @@
-"""The kernel in plain Warp that sums the blending weights of each (Gaussian, tile) instance; used on the CPU, and for float64."""
+"""The kernel in plain Warp that sums the blending weights of each (Gaussian, tile) instance; used on CPUs, and for float64."""
 
 import functools
 
