@@ -10,7 +10,7 @@ from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LOSS_TERMS, LossInputs, LossTerm, Target, outputs_of
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossInputs, LossTerm, Target, outputs_of, total
 from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
 from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
 from warpgs.pipeline.train.loss_terms.photometric import Photometric, photometric_loss
@@ -37,6 +37,19 @@ def maps(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, torch.Tensor
     depth = 1 + 4 * depth
     disparity = (0.6 * noise + 0.4 / depth).clamp(0, 1)
     return depth.to(dtype), (0.3 + 0.7 * alpha).to(dtype), disparity.to(dtype), (kept > 0.3).to(dtype)
+
+
+@pytest.mark.parametrize("shape", [(70_001,), (300, 401), (3, 40, 50, 3), (5,)])
+def test_a_total_has_the_same_bits_for_any_number_of_threads(shape):
+    """Of values per Gaussian, and of images."""
+    values, threads, found = torch.rand(shape, generator=torch.Generator().manual_seed(0)), torch.get_num_threads(), []
+    try:
+        for n in (1, 2, 3):
+            torch.set_num_threads(n)
+            found.append(float(total(values)))
+    finally:
+        torch.set_num_threads(threads)
+    assert len(set(found)) == 1 and found[0] == pytest.approx(float(values.double().sum()), rel=1e-6)
 
 
 def test_total_loss_is_the_sum_of_terms_and_of_what_the_strategy_adds():

@@ -11,6 +11,8 @@ from warpgs.pipeline.study.statistics import Difference, Sample
 
 NONE = "-"
 """Sign for a value that was not measured."""
+MAX_DIGITS = 6
+"""Largest number of digits after the point of a difference."""
 NOT_EXERCISED = "not exercised"
 """Text in place of a difference if both variants gave the same files."""
 
@@ -76,6 +78,8 @@ class Table:
         return (max if metric.upwards else min)(means, default=math.nan)
 
 
+SCORES = "Scores of held-out views: mean ± standard deviation over seeds"
+"""Description of the figures of a table."""
 INTERVALS = ("a 95 % t interval", "simultaneous 95 % t intervals per column (Bonferroni)")
 """Description of the intervals of a table with one difference, or with several."""
 
@@ -92,8 +96,11 @@ def interval(d: Difference | None, digits: int) -> str:
     """Return a paired difference, signed, with its interval, as text; a dash if there is none."""
     if d is None or not math.isfinite(d.mean):
         return NONE
-    ends = f" [{d.low:+.{digits}f}, {d.high:+.{digits}f}]" if math.isfinite(d.low) else ""
-    return f"{d.mean:+.{digits}f}{ends}"
+    while d.excludes_zero and digits < MAX_DIGITS and not all(round(x, digits) for x in (d.low, d.high)):
+        digits += 1  # else an interval without 0 would end at 0
+    mean, low, high = (round(x, digits) + 0.0 if math.isfinite(x) else x for x in (d.mean, d.low, d.high))  # not -0.00
+    ends = f" [{low:+.{digits}f}, {high:+.{digits}f}]" if math.isfinite(low) else ""
+    return f"{mean:+.{digits}f}{ends}"
 
 
 def _grid(head: list[str], body: list[list[str]], left: int) -> list[str]:
@@ -128,7 +135,7 @@ def markdown(table: Table) -> str:
          str(max((s.count for s in r.samples.values()), default=0))]
         for r in table.rows
     ]  # fmt: skip
-    lines = [*_grid(head, body, 1 + len(marks)), ""]
+    lines = [f"{SCORES}, the best mean in bold:", "", *_grid(head, body, 1 + len(marks)), ""]
     rows = [r for r in table.rows if r.differences]
     lines += [
         f"Difference to {table.base}, paired by seed, with {INTERVALS[len(rows) > 1]}; \\* marks an interval without 0:",
@@ -195,12 +202,14 @@ def latex(table: Table) -> str:
         text = interval(row.differences.get(first.key), first.digits)
         return "--" if text == NONE else f"${text.replace(' [', space)}$"
 
+    scores, pairs = SCORES.replace("±", "$\\pm$"), sum(bool(r.differences) for r in table.rows)
+    about = f"{scores}. $\\Delta$: difference to {_escape(table.base)}, paired by seed, with {_escape(INTERVALS[pairs > 1])}."
     head = [f"${s}$" for s in table.switches] or ["Method"]
     arrows = {"↑": "$\\uparrow$", "↓": "$\\downarrow$"}
     head += [f"{m.label}{arrows[m.arrow]}" for m in table.metrics] + [f"$\\Delta$ {first.label} [95\\,\\%]"]
     lines = [
         "% needs \\usepackage{booktabs, amssymb}",
-        "\\begin{table}[htbp]", "  \\centering", f"  \\caption{{{_escape(table.caption)}}}",
+        "\\begin{table}[htbp]", "  \\centering", f"  \\caption{{{_escape(table.caption)}. {about}}}",
         f"  \\begin{{tabular}}{{{'c' * len(table.switches) or 'l'}{'c' * len(table.metrics)}r}}", "    \\toprule",
         f"    {' & '.join(head)} \\\\", "    \\midrule",
     ]  # fmt: skip

@@ -131,12 +131,20 @@ def outputs_of(terms: Sequence[LossTerm]) -> tuple[str, ...]:
     return tuple(n for n in OUTPUTS if any(n in t.needs_outputs for t in terms))
 
 
+ROW = 1024
+"""Values in a row, for sums of values that have no rows."""
+
+
 def total(values: torch.Tensor) -> torch.Tensor:
-    """Return the sum of values [H, ...], shape [], with the same bits for any number of CPU threads.
+    """Return the sum of values [N] or [H, ...], shape [], with the same bits for any number of CPU threads.
 
     On a CPU, torch's sum of a whole tensor depends on the number of threads, so rows are summed first.
     """
-    return values.sum() if values.is_cuda else values.flatten(1).sum(1).sum()
+    if values.is_cuda:
+        return values.sum()
+    if values.dim() == 1:
+        values = torch.nn.functional.pad(values, (0, -len(values) % ROW)).view(-1, ROW)
+    return values.flatten(1).sum(1).sum()
 
 
 Part = TypeVar("Part")
