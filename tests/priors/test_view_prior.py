@@ -115,7 +115,7 @@ def test_a_region_stands_in_where_the_network_finds_no_foreground(tmp_path):
         assert not p.foreground.any() and not p.boundary.any() and p.semantics_source.startswith("none")
         check(p, (32, 64))
     text = "\n".join(notes)
-    assert "is foreground in a.png" in text and "no score for c.png, d.png, which have hardly any foreground" in text
+    assert "gave the foreground of a.png" in text and "no score for c.png, d.png, which have hardly any foreground" in text
 
 
 def test_a_region_beats_saliency():
