@@ -58,7 +58,7 @@ def test_named_flags_are_there():
 def test_the_page_on_presets_says_what_the_rule_chooses():
     """The columns of its table are the settings for so many views."""
     text = (ROOT / "docs/presets.md").read_text("utf-8")
-    rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:11]]
+    rows = [[c.strip() for c in line.split("|")[3:-1]] for line in text[text.index("| setting | rule |") :].splitlines()[:12]]
     counts = [int(cell.split()[0]) for cell in rows[0]]
     assert len(counts) >= 5
     for column, views in enumerate(counts):
@@ -67,7 +67,7 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
         chosen = (
             config.steps, config.sh_degree, config.optimizer.scales_lr, config.optimizer.opacities_lr,
             config.optimizer.opacities_decay, config.init.extrapolate, config.loss.smooth_weight, 1 + config.method.hier,
-            config.half_resolution,
+            config.half_resolution, config.optimizer.average_last,
         )  # fmt: skip
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
 

@@ -40,6 +40,9 @@ EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
 of opacities with such points. Fits with more views or fewer steps were not measured
 (docs/decisions/026-extrapolated-points.md)."""
+AVERAGE_LAST, AVERAGED_VIEWS = 0.05, 20
+"""Fraction of the steps over which parameters are averaged at the end, and fewest training views with this mean; with 13 views
+and fewer it does not help (docs/decisions/029-mean-of-the-last-steps.md)."""
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
@@ -109,6 +112,8 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if optimizer.opacities_lr is None:
         lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
         optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
+    if optimizer.average_last is None:
+        optimizer = dataclasses.replace(optimizer, average_last=AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0)
     opaque = all(v.alpha is None for v in train)
     one_layer = views <= ONE_LAYER_VIEWS
     method = config.method
@@ -159,7 +164,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
 
 def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
     """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` is the unlimited number of steps."""
-    optimizer, half = made.optimizer, made.half_resolution
+    optimizer, half, last = made.optimizer, made.half_resolution, made.optimizer.average_last
     each = f" of {config.batch} views" if config.batch > 1 else ""
     chosen = {
         f"at most {wanted:,} steps{each}": config.steps, f"SH degree {made.sh_degree}": config.sh_degree,
@@ -168,6 +173,7 @@ def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[s
         f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
         f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
         f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
+        f"mean of the last {last:.0%} of the steps" if last else "no mean of the last steps": config.optimizer.average_last,
         f"smooth_weight {made.loss.smooth_weight:g}": config.loss.smooth_weight,
         f"{'' if made.init.extrapolate else 'no '}extrapolated points": config.init.extrapolate,
         "held-out blocks" if made.stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,

@@ -51,10 +51,12 @@ class Layout:
     """CUDA graphs that exist at a time, one for each size of view; 0 if steps are not captured."""
     sums: int = 0
     """Number of sums of gradients and statistics that a step of several views keeps (`warpgs.pipeline.train.slots`)."""
+    averaged: bool = False
+    """True if the parameters of the last steps are summed (`warpgs.pipeline.train.parameter_mean`)."""
 
     def held(self, count: int) -> int:
-        """Return the bytes that persist between steps: parameters, two Adam moments, columns, sums over slots, and views."""
-        sums = self.sums * (self.table.row_bytes + SUMMED * FLOAT)
+        """Return the bytes that persist between steps: parameters, their moments and sums, columns, sums over slots, views."""
+        sums = self.sums * (self.table.row_bytes + SUMMED * FLOAT) + self.averaged * self.table.row_bytes
         return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
@@ -162,6 +164,7 @@ class MemoryPlan:
 def layout_of(
     table: Table, views: Sequence[TrainingView], terms: Sequence[LossTerm] = (), strategy: Strategy | None = None,
     modules: Sequence[ViewModule] = (), *, kept: Sequence[TrainingView] = (), captured: bool = False, sums: int = 0,
+    averaged: bool = False,
 ) -> Layout:  # fmt: skip
     """Return the layout of steps of a fit.
 
@@ -174,6 +177,7 @@ def layout_of(
         kept: Other views that are kept on the device.
         captured: True to capture steps as CUDA graphs where the device can.
         sums: Number of sums of gradients that a step of several views keeps.
+        averaged: True if the parameters of the last steps are summed.
     """
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
@@ -183,7 +187,7 @@ def layout_of(
     )  # fmt: skip
     parts = (*(t.bytes for t in terms), *(m.bytes for m in modules), *(() if strategy is None else (strategy.bytes,)))
     graphs = len({v.kind for v in views}) if cuda and captured else 0
-    return Layout(sizes, parts, table, training_views.view_bytes([*views, *kept]), graphs, sums)
+    return Layout(sizes, parts, table, training_views.view_bytes([*views, *kept]), graphs, sums, averaged)
 
 
 @torch.no_grad()

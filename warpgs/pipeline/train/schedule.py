@@ -61,11 +61,16 @@ class OptimizerConfig:
     """Learning rate of the constant colour coefficient. None: 2.5e-3, or more if --cpu-limit shortens the fit."""
     sh_rest_factor: float = 0.05
     """Learning rate of the other colour coefficients, as a fraction of ``sh_lr``."""
+    average_last: float | None = 0.0
+    """Fraction of the steps, the last ones, over which the parameters are averaged; the mean is the result of the fit. 0 for no
+    mean. None: chosen by the number of views."""
 
     def __post_init__(self):
+        if self.average_last is not None and not 0 <= self.average_last <= 1:
+            raise UsageError(f"optimizer: `average-last` must be in [0, 1], not {self.average_last}")
         if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
             raise UsageError(f"optimizer: `opacities-decay` must be between 0 and {MAX_DECAY}, not {self.opacities_decay}")
-        check_lrs("optimizer", **{n: v for n, v in vars(self).items() if n != "opacities_decay"})
+        check_lrs("optimizer", **{n: v for n, v in vars(self).items() if n not in ("opacities_decay", "average_last")})
 
     def lrs(self, progress: float, extent: float, stable_start: float = 0.0) -> dict[str, float]:
         """Return the learning rate of each parameter.

@@ -170,6 +170,11 @@ class Learned:
     cameras: TrainingCameras
     """Training cameras, for limits of sizes."""
 
+    @property
+    def params(self) -> dict[str, torch.Tensor]:
+        """All parameters by name, of any shape [...]: of the Gaussians, and of view modules as ``views.NAME``."""
+        return self.table.params | {f"views.{n}": t for n, t in self.views.table.params.items()}
+
 
 @dataclass(frozen=True)
 class ViewGradients:

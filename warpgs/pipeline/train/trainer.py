@@ -22,6 +22,7 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.context import StrategyContext
 from warpgs.pipeline.train.learned_views import LearnedViews
 from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
+from warpgs.pipeline.train.parameter_mean import ParameterMean
 from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
 from warpgs.pipeline.train.step import Learned, StepBuffers, StepPlan, steps_at_once
@@ -109,7 +110,7 @@ class Trainer:
     def _make_parts(self, train: list[View], start: Start, extent: float) -> None:
         """Make the Gaussians, the strategy, the parameters of view modules, and the `StepTaker`; ``extent`` is in [u]."""
         c, device = self.config, self.device
-        assert c.steps is not None and c.sh_degree is not None  # `settings_by_views` has chosen
+        assert c.steps is not None and c.sh_degree is not None and c.optimizer.average_last is not None  # chosen by now
         first = initial_gaussians(start.cloud, c.init, c.sh_degree, extent, device, start.extrapolated)
         self.table = Table.of_gaussians(first, {})
         self.context = StrategyContext(
@@ -123,6 +124,7 @@ class Trainer:
         self.table.batch = views.table.batch = self.batch
         seed, cameras = c.seed if self.dropout > 0 else None, TrainingCameras.of([v.camera for v in train], device)
         self.learned = Learned(self.table, views, self.strategy, seed, cameras)
+        self.mean = ParameterMean(c.optimizer.average_last)
         self.buffers = StepBuffers(device, 3 * (len(self.table.params) + len(views.table.params)))
         self.taker = StepTaker(self.learned, self.buffers, self.context.render_options(), self.batch, self.ranks)
 
@@ -237,7 +239,7 @@ class Trainer:
         begin, first = time.perf_counter(), self.step + 1
         plan, count = self.plan_of(first), 1
         if self.layout.graphs:
-            most = min(limit, steps_at_once(self.batch), self.steps - self.step)
+            most = min(limit, steps_at_once(self.batch), self.mean.wait(self.step, self.steps))
             while count < most and self.plan_of(first + count) == plan and not self.is_due(first + count - 1):
                 count += 1
         chosen = [self.next_view() for _ in range(count * self.batch)]
@@ -264,6 +266,8 @@ class Trainer:
         counts = [len(self.table)] * done
         if done == count:
             self._update()
+            if self.mean.update(self.step, self.steps, self.learned.params):
+                self.plan_of(self.step).limits.hold(self.table.params, self.learned.cameras)
             counts[-1] = len(self.table)
         seconds = (time.perf_counter() - begin) / max(1, done)
         return [
@@ -315,6 +319,7 @@ class Trainer:
         if not self.is_due(self.step):
             return
         self.taker.clear()
+        self.mean.restart()
         self.show_learned()
         stopping, step = self.stopping, self.step
         for change in stopping.changes(step, self.strategy, self.context, self.degree(step)):
@@ -342,7 +347,7 @@ class Trainer:
         self.context.views = shown[: len(views)]
         layout = layout_of(
             self.table, shown, self.terms, self.strategy, c.view_modules, kept=self.stopping.whole, captured=self.captured,
-            sums=self.taker.sums,
+            sums=self.taker.sums, averaged=self.mean.fraction > 0,
         )  # fmt: skip
         most = most_instances(self.gaussians, [v.camera for v in shown], self.context.render_options())
         self.memory, self.layout = plan(
@@ -361,7 +366,8 @@ class Trainer:
         """Return tensors by name, of any shape [...], and plain values from which the fit continues with the same bits."""
         (tensors, strategy), (errors, stopping) = self.strategy.state(), self.stopping.state()
         views = {f"views.{n}": t for n, t in self.learned.views.table.state().items()}
-        tensors = {**self.table.state(), **views, **tensors, **errors, "generator": self.generator.get_state()}
+        tensors = {**self.table.state(), **views, **self.mean.state(), **tensors, **errors}
+        tensors["generator"] = self.generator.get_state()
         plain = {
             "step": self.step, "order": self.order, "extent": self.context.extent, "notes": self.notes, "strategy": strategy,
             "stopping": stopping, "config": self.config.to_json(), "steps": self.steps,
@@ -385,6 +391,7 @@ class Trainer:
         self.table.load(tensors)
         of_views = {n.removeprefix("views."): t for n, t in tensors.items() if n.startswith("views.")}
         self.learned.views.table.load(of_views)
+        self.mean.load(tensors, self.learned.params)
         self.strategy.load(tensors, plain["strategy"])
         self.stopping.load(tensors, plain["stopping"])
         self.set_views(self.views if self.stopping.ended is None else self.stopping.whole)
