@@ -11,6 +11,7 @@ import torch
 from bench.lib import inputs, ops, pages, peers, performance_page, timing
 from bench.lib.ops import OPS, Bench, run
 from bench.lib.points import Point, growth, points
+from bench.lib.tables import mean_sd
 from warpgs import rasterize
 from warpgs.kernels.ssim import ssim
 
@@ -171,6 +172,12 @@ def test_performance_tables_hold_the_results():
     assert svgs == performance_page.plots(json.loads(json.dumps(dict(reversed(results.items())))))
     assert set(svgs) == {"plots/a_pixels.svg", "plots/a_whole.svg", "plots/b_pixels.svg", "plots/b_whole.svg"}
     assert all(ElementTree.fromstring(svg).tag.endswith("svg") for svg in svgs.values())
+
+
+def test_a_mean_of_missing_values_is_nan():
+    """A table with a figure that one fit lacks is still written."""
+    assert mean_sd([1.0, 2.0]) == "1.50 ± 0.71" and mean_sd([1.0]) == "1.00"
+    assert mean_sd([1.0, math.nan]) == mean_sd([math.nan, math.nan]) == mean_sd([math.nan]) == "nan"
 
 
 def test_generated_parts_of_a_page_are_replaced_by_name():

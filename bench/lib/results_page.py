@@ -141,7 +141,9 @@ def views() -> str:
 def default_now() -> str:
     """Return the table of `default` beside its scores in the table of all presets, which is older."""
     result, source = _result("default_h100")
+    mean, mean_source = _result("average_last_h200")
     old, new = (by_seed(r["rows"]) for r in (_result("presets_h200")[0], result))
+    new |= {key: of for key, of in by_seed(mean["rows"]).items() if key[1] == "default"}
     body = []
     for row, (scene, count) in CAPTURES.items():
         own = new.get((row, "default")) or new.get((row, ONE_LAYER))
@@ -149,7 +151,7 @@ def default_now() -> str:
             before, now = (list(of.values()) for of in (old[row, "default"], own))
             change = statistics.mean(r["psnr"] for r in now) - statistics.mean(r["psnr"] for r in before)
             body.append([f"{scene}, {count}", str(len(now)), _scores(before), _scores(now), f"{change:+.2f}"])
-    return table(["scene, views", "seeds", "before", "`default`", "change in PSNR"], body) + source
+    return table(["scene, views", "seeds", "before", "`default`", "change in PSNR"], body) + source + mean_source
 
 
 def coverage() -> str:

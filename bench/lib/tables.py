@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterable, Sequence
 
@@ -26,7 +27,9 @@ def figure(value: float) -> str:
 
 
 def mean_sd(values: Sequence[float], digits: int = 2, sign: str = "") -> str:
-    """Return the mean, and the standard deviation if there are several values."""
+    """Return the mean, and the standard deviation if there are several values; nan if a value is not finite."""
+    if not all(map(math.isfinite, values)):
+        return "nan"
     deviation = f" ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else ""
     return f"{statistics.mean(values):{sign}.{digits}f}{deviation}"
 
