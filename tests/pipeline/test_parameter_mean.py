@@ -81,6 +81,21 @@ def test_the_result_is_the_mean_of_the_last_steps():
     assert not torch.equal(result["means"], kept[-1]["means"])
 
 
+def test_the_error_of_a_mean_has_a_bound():
+    """n samples in float32: at most n 2^-24 of the largest, for values of any size."""
+    generator = torch.Generator().manual_seed(5)
+    scales = torch.logspace(-30, 30, 4000)
+    samples = [scales * (1 + 0.1 * torch.randn(4000, generator=generator)) for _ in range(2 * SAMPLES - 1)]
+    mean, params = ParameterMean(1.0), {"means": torch.empty(4000)}
+    for step, sample in enumerate(samples, start=1):
+        params["means"].copy_(sample)
+        assert mean.update(step, len(samples), params) == (step == len(samples))
+    doubles = torch.stack(samples).double()
+    error = (params["means"].double() - doubles.mean(0)).abs() / doubles.abs().amax(0)
+    assert len(samples) / 2**28 < float(error.max()) < len(samples) / 2**24
+    assert float(error.mean()) < 2e-7
+
+
 def test_a_continued_fit_has_the_same_bits():
     """Also from a state between two samples, and from one before all samples."""
     whole = finish(trainer())

@@ -41,8 +41,8 @@ EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 of opacities with such points. Fits with more views or fewer steps were not measured
 (docs/decisions/026-extrapolated-points.md)."""
 AVERAGE_LAST, AVERAGED_VIEWS = 0.05, 20
-"""Fraction of the steps over which parameters are averaged at the end, and fewest training views with this mean; with 13 views
-and fewer it does not help (docs/decisions/029-mean-of-the-last-steps.md)."""
+"""Fraction of the steps over which parameters are averaged at the end, and fewest training views with this mean. With 12 views
+the gain is at most 0.04 dB (docs/decisions/029-mean-of-the-last-steps.md)."""
 MIN_GAIN_DB = 0.1
 """Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
 too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
