@@ -365,6 +365,16 @@ def test_documents_that_lie(change, match, tmp_path):
     refused(tmp_path / "a.glb", with_document(change), match)
 
 
+@pytest.mark.parametrize(("change", "match"), [((1, gltf.BINARY_CHUNK), "is truncated"), ((0, 7), "is not binary")])
+def test_chunks_that_lie(change, match, tmp_path):
+    """A size beyond the end of the file, and a second chunk of another kind."""
+    data = bytearray(encoded(".glb"))
+    start = 20 + struct.unpack_from("<I", data, 12)[0]
+    more, kind = change
+    struct.pack_into("<II", data, start, struct.unpack_from("<I", data, start)[0] + more, kind)
+    refused(tmp_path / "a.glb", bytes(data), match)
+
+
 def test_numbers_of_a_gltf_that_are_none(tmp_path):
     document = json.loads(encoded(".gltf"))
     head, _, text = document["buffers"][0]["uri"].partition(",")

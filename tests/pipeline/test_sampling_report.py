@@ -127,7 +127,7 @@ def test_uniform_events_show_no_scores(tmp_path):
     one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * HEAD) + 2 * MARGIN + round(1.25 * TITLE_SIZE) + 18
     assert sheet.shape[0] == one_row  # render, image, gate, pixels, words
     words = sampling_report_of(fit, tmp_path).words
-    assert "uniformly at random" in words and "All scores have weight 0, so none was computed." in words
+    assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
 
 
 def test_figures_add_up(run):

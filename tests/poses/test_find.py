@@ -85,7 +85,7 @@ def noise(path, seed, smooth=0):
 
 @pytest.mark.parametrize(
     ("kind", "count", "message"),
-    [("two", 2, "has 2 photographs; poses need at least 3"), ("apart", 3, "no two of 3 photographs show the same place"),
+    [("two", 2, "has 2 photographs; poses need at least 3"), ("apart", 3, "no two of 3 photographs could be matched"),
      ("blank", 3, "blank wall"), ("broken", 3, r"1\.png: the image cannot be decoded"), ("none", 0, "no supported image")],
 )  # fmt: skip
 def test_photographs_that_cannot_work(sfm, tmp_path, capsys, kind, count, message):

@@ -199,8 +199,10 @@ def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]
         text, rest = data[20 : 20 + size], memoryview(data)[20 + size : total]
         if len(rest) >= 8:
             size, kind = struct.unpack_from("<II", rest)
-            if kind != BINARY_CHUNK or size > len(rest) - 8:
-                raise malformed(path, f"its binary part of {size} bytes is truncated")
+            if kind != BINARY_CHUNK:
+                raise malformed(path, f"its second chunk is not binary: type {kind:#010x}")
+            if size > len(rest) - 8:
+                raise malformed(path, f"its binary chunk of {size} bytes is truncated")
             body = rest[8 : 8 + size]
     else:
         text = data

@@ -33,7 +33,7 @@ def read_rows(path: Path) -> np.ndarray:
         raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); copy it again") from e
     if not isinstance(rows, np.ndarray):
         rows.close()
-        raise DataError(f"{path}: is an archive of arrays, not one array [n, 17]; copy it again")
+        raise DataError(f"{path}: is an archive of arrays, not one array [n, 17]; make it again")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
     if len(rows) > MAX_ROWS:

@@ -272,7 +272,7 @@ def _check_found(source: Path, found: Mapping, photographs: list[Photograph]) ->
             "light"
         )
     elif not largest:
-        why = f"no two of {count} photographs show the same place. Take photographs that overlap by two thirds, in small steps"
+        why = f"no two of {count} photographs could be matched. Take photographs that overlap by two thirds, in small steps"
     else:
         why = (
             f"at most {len(found.views)} of {count} photographs fit together, and {MIN_PHOTOGRAPHS} are needed. Take "

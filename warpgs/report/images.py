@@ -76,7 +76,7 @@ def resized(image: np.ndarray, width: int, height: int):
 
 
 def colored(values: np.ndarray, name: str) -> np.ndarray:
-    """Return colours [H, W, 3] of values in [0, 1], [H, W], by a colour map of OpenCV, such as INFERNO or TURBO."""
+    """Return the colours [H, W, 3] that a colour map of OpenCV, such as INFERNO, gives to values [H, W] between 0 and 1."""
     import cv2
 
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], getattr(cv2, f"COLORMAP_{name}"))[:, 0, ::-1]

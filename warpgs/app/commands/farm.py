@@ -45,7 +45,10 @@ def run(arguments: list[str], about: str) -> int:
         slurm_folder: Path | None = None
         """Folder for slurm's job files, private and visible to all nodes. Default: ~/.cache/warpgs/slurm."""
 
-    more = "Every job takes the flags of `warpgs fit`, such as --preset, --split, --steps and --device."
+    more = (
+        "Every job takes the flags of `warpgs fit`, such as --preset, --split, --steps and --device, but not --resume, --view, "
+        "--view-port and --time-budget."
+    )
     a = parse_flags(Farm, own, "warpgs farm", f"{about}\n\n{more}")
     from warpgs.pipeline.farm.listing import list_jobs
 

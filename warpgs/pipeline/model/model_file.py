@@ -1,4 +1,4 @@
-"""Models: Gaussians with the similarity to the coordinates of their scene's files, in memory and as one safetensors file."""
+"""Models, in memory and as one safetensors file: Gaussians, and the similarity from the coordinates of their scene's files."""
 
 from __future__ import annotations
 

@@ -198,7 +198,7 @@ def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
         f"Each dot is a pixel behind which a fine Gaussian was added at the {method.sampler.depth} depth, while the layer had "
         f"capacity. These pixels are {how} among {gate} (the gate). "
         + ("S_importance is the weighted sum of the three scores; each score is shown below its source."
-           if weighted else "All scores have weight 0, so none was computed.")
+           if weighted else "All scores have weight 0, so no score is shown.")
     )  # fmt: skip
     if events["widened"]:
         words += (

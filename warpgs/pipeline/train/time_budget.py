@@ -71,7 +71,7 @@ def within_budget(config: FitConfig, seconds: float, views: list[View], device: 
         The configuration with its steps, and a note on the choice.
 
     Raises:
-        UsageError: The budget is not a positive number, or too short for the shortest fit.
+        UsageError: The budget is not a positive, finite number, or too short for the shortest fit.
     """
     check_budget(seconds)
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
