@@ -105,7 +105,7 @@ def test_actions_and_images_are_named_by_what_they_contain():
 
 @pytest.mark.parametrize(
     ("reason", "fails"),
-    [("could not import 'viser'", True), ("onnx not installed: pip install warpgs[export]", False), ("no CUDA device", False)],
+    [("could not import 'viser'", True), ("onnx not installed: pip install '.[export]'", False), ("no CUDA device", False)],
 )
 def test_a_skipped_test_fails_where_all_extras_are_said_to_be_installed(monkeypatch, reason, fails):
     """The Makefile says so; who runs pytest without them sees the test skipped."""

@@ -1,4 +1,4 @@
-"""The known name nearest to a mistyped one."""
+"""Suggestions in messages: the known name nearest to a mistyped one, and how to install an extra."""
 
 import difflib
 from collections.abc import Iterable
@@ -12,3 +12,8 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     plain = {name.lstrip("-"): name for name in known}  # dashes would make all short flags alike
     near = difflib.get_close_matches(word.lstrip("-")[:MAX_COMPARED], plain, 1)
     return f"did you mean {plain[near[0]]}?" if near else ""
+
+
+def install_extras(*names: str) -> str:
+    """Return the words on how to install extras. They name no package index, because the name warpgs there is not ours."""
+    return f"`pip install '.[{','.join(names)}]'` in your copy of the repository"

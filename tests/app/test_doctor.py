@@ -50,7 +50,7 @@ def test_missing_extras_are_named_with_what_they_are_for(monkeypatch):
     there -= {"pycolmap", "zstandard"}
     (found,) = doctor._extras()
     assert found.status == NOTE and "view; not installed: poses (photographs without cameras), formats" in found.detail
-    assert found.remedy == "pip install 'warpgs[poses,formats]'"
+    assert found.remedy == "`pip install '.[poses,formats]'` in your copy of the repository"
 
 
 def test_this_machine_can_fit():

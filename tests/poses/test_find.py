@@ -163,7 +163,7 @@ def test_what_is_there_is_not_overwritten(sfm, tmp_path, photographs):
 
 def test_without_pycolmap_a_sentence_says_what_to_install(tmp_path, photographs, monkeypatch):
     monkeypatch.setattr(mapping.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(UsageError, match=r"pip install 'warpgs\[poses\]'"):
+    with pytest.raises(UsageError, match=r"pip install '\.\[poses\]'"):
         find_poses(photographs, tmp_path / "out")
 
 

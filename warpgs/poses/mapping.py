@@ -18,6 +18,7 @@ from warpgs.poses.photographs import MATCHING_SIDE, Photograph
 from warpgs.runtime.disk_space import disk_is_full
 from warpgs.runtime.processor import usable_cores
 from warpgs.runtime.subprocesses import ProcessFailed, python_lines
+from warpgs.suggestion import install_extras
 
 EXHAUSTIVE = 60
 """Largest number of photographs of which all pairs are matched; for more photographs, pairs are chosen."""
@@ -101,7 +102,7 @@ def check_installed() -> None:
         UsageError: pycolmap is not installed.
     """
     if importlib.util.find_spec("pycolmap") is None:
-        raise UsageError("finding poses needs pycolmap, which is not installed; `pip install 'warpgs[poses]'`")
+        raise UsageError(f"finding poses needs pycolmap, which is not installed; {install_extras('poses')}")
 
 
 def camera_groups(photographs: list[Photograph]) -> list[int]:

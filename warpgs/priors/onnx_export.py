@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warpgs.errors import ResourceError
+from warpgs.suggestion import install_extras
 from warpgs.temporary import temporary_folder
 
 if TYPE_CHECKING:
     import torch
 
-REMEDY = "`pip install warpgs[export]`"
+REMEDY = install_extras("export")
 
 
 @contextlib.contextmanager

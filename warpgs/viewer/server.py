@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpgs.errors import ResourceError
 from warpgs.runtime.listening import HOST, loopback_socket
+from warpgs.suggestion import install_extras
 from warpgs.viewer.connections import Rules, guarded_server
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 PORT = 8080
 """Default port."""
-REMEDY = 'install the extra: pip install "warpgs[view]"'
+REMEDY = install_extras("view")
 OTHER_PORT = "choose another port with --port (fit: --view-port), or 0 for any free one"
 
 

@@ -18,6 +18,7 @@ from warpgs.pipeline.farm.job import FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
 from warpgs.runtime.folders import private_folder
 from warpgs.runtime.listening import listeners, say_what_is_open
+from warpgs.suggestion import install_extras
 
 
 class RayEngine:
@@ -46,7 +47,7 @@ class RayEngine:
         try:
             import ray
         except ImportError as e:
-            raise UsageError("--engine ray needs Ray: pip install 'warpgs[ray]'") from e
+            raise UsageError(f"--engine ray needs Ray, which is not installed; {install_extras('ray')}") from e
         self._ray, self._threads = ray, threads
         if not ray.is_initialized():
             _connect(ray, address)
