@@ -72,6 +72,14 @@ def test_the_page_on_presets_says_what_the_rule_chooses():
         assert tuple(float(row[column].replace(",", "")) for row in rows[2:]) == chosen, views
 
 
+def test_the_score_of_the_quickstart_is_that_of_its_file():
+    """Its commands, as `bench.fits.presets` runs them."""
+    rows = json.loads((ROOT / "bench/results/quickstart_cpu2.json").read_text("utf-8"))["rows"]
+    (row,) = (r for r in rows if r["preset"] == "default" and r["row"].endswith("@every:8"))
+    said = re.findall(r"held-out PSNR ([\d.]+) dB, SSIM ([\d.]+),", (ROOT / "docs/quickstart.md").read_text("utf-8"))
+    assert said == [(f"{row['psnr']:.2f}", f"{row['ssim']:.3f}")]
+
+
 BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
     ("evaluation.md", "| key | definition"): "definitions",
