@@ -18,7 +18,9 @@ from warpgs.io.load import detect, load_scene
 
 
 def test_folders_that_hold_no_scene(tmp_path):
-    refused(tmp_path / "gone", "gone: no such folder")
+    refused(tmp_path / "gone", "gone: no such folder; give a folder of photographs")
+    (tmp_path / "photographs").mkdir()
+    refused(tmp_path / "photogaphs", r"photogaphs: no such folder; did you mean photographs\?")
     refused(tmp_path, r"no scene format found. Looked for: sparse/0.*transforms.json.*poses_bounds.npy.*cameras.npz.*_par.txt")
     (tmp_path / "a.txt").write_text("")
     refused(tmp_path / "a.txt", "a.txt: is a file; give a folder")

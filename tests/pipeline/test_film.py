@@ -90,8 +90,17 @@ def test_no_file_of_keyframes(model, tmp_path):
     for name, text in (("none.json", None), ("a.json", "{"), ("b.json", "[" * 100_000)):
         if text is not None:
             (tmp_path / name).write_text(text)
-        with pytest.raises(DataError, match="keyframes"):
+        words = "no such file; give a .json file of keyframes" if text is None else "cannot be read as keyframes"
+        with pytest.raises(DataError, match=words):
             read_keyframes(tmp_path / name, model.cameras()["0.png"], UNITS)
+
+
+def test_a_film_through_photographs_of_one_side_names_the_calmer_path(model, monkeypatch):
+    """Where warpgs chose the path, and only there."""
+    monkeypatch.setattr("warpgs.pipeline.films.plan.path_of", lambda rig: "interpolate")
+    calmer = "; --path turntable is calmer"
+    named = [plan_film(model, path, FilmSettings()).notes[-1].endswith(calmer) for path in ("auto", "interpolate")]
+    assert named == [True, False]
 
 
 def test_what_was_chosen_is_said(model):

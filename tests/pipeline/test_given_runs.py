@@ -75,6 +75,7 @@ def test_maps_decide_whether_a_run_continues(folder, tmp_path, capsys):
     assert main(command(folder, run, "--depths", str(other), "--resume")) == 2
     assert "the scene" in capsys.readouterr().err
     assert main(command(folder, run, *maps, "--resume")) == 0
+    assert f"all {STEPS} steps are taken; only the images, scores and report are made again" in capsys.readouterr().out
 
 
 def test_a_wrong_unit_is_named_before_the_first_step(folder, tmp_path, capsys):

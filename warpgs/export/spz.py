@@ -304,8 +304,8 @@ class SPZ(Format):
     sorted = True
     declares = True
     note = (
-        "SPZ files have y up, as Niantic defines it. SuperSplat, splat-transform 3, gsply and gaussforge expect the axes of "
-        "PLY: use --rotate 1,0,0,180 for files to or from these programs"
+        "SPZ files have y up, as Niantic defines it. SuperSplat, splat-transform 3, gsply and gaussforge take y as down, so "
+        "models appear upside down: for files to or from these programs, pass --rotate 1,0,0,180"
     )
     decode = staticmethod(decode)
 

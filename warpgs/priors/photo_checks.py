@@ -199,8 +199,8 @@ def photo_notes(checks: Sequence[PhotoCheck]) -> list[str]:
     blurred = sorted((c for c in checks if c.blurred), key=lambda c: c.sharpness)
     if blurred:
         notes.append(
-            "blurred, relative to the detail of other photographs: "
-            f"{_listed([f'{c.name} ({c.sharpness:.2f})' for c in blurred])}; remove them, or expect soft regions"
+            "less detail than in other photographs of the same places, probably blur: "
+            f"{_listed([f'{c.name} ({c.sharpness:.2f} x as sharp)' for c in blurred])}; look at them, and remove blurred ones"
         )
     exposed = sorted((c for c in checks if c.exposed_otherwise), key=lambda c: -abs(math.log(c.brightness)))
     if exposed:

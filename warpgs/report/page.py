@@ -231,7 +231,7 @@ def _scores(page: Page) -> list[str]:
         sections.append(_coverage(page.coverage))
     if page.protocol:
         items = "".join(f"<dt>{html.escape(k)}</dt><dd>{html.escape(v)}</dd>" for k, v in page.protocol.items())
-        sections.append(f"<h2>How it was scored</h2><dl>{items}</dl>")
+        sections.append(f"<h2>{'How it was scored' if page.held_out else 'Views'}</h2><dl>{items}</dl>")
     return sections
 
 

@@ -141,6 +141,8 @@ def read_keyframes(path: Path, template: Camera, normalization: Normalization) -
     try:
         values = schema.parse(read_input(path, MAX_BYTES))
         KEYFRAMES(values, "keyframes")
+    except FileNotFoundError as e:
+        raise DataError(f"{path}: no such file; give a .json file of keyframes, as the viewer saves it") from e
     except (OSError, schema.SchemaError) as e:
         why = unread_reason(e) if isinstance(e, OSError) else e
         raise DataError(

@@ -174,6 +174,8 @@ def plan_film(model: FittedModel, path: str, settings: FilmSettings) -> FilmPlan
     kind = path_of(rig) if path == "auto" else path
     if kind == "interpolate":
         cameras, words = _tour(rig, train, settings)
+        if path == "auto" and rig.kind == "forward":
+            words += "; --path turntable is calmer"
         remedy, nearer = EMPTY_VIEW, "--coverage marks these places"
     else:
         cameras = camera_path(kind, rig, train, settings.count(SECONDS))

@@ -233,6 +233,8 @@ def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, 
         if (resumed / TENSORS).is_file():
             state = load_checkpoint(resumed)
             check_checkpoint(state[1], stored, resumed)
+            if state[1]["step"] == state[1].get("steps"):
+                job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
     check_equal(record, None if state is None else state[1].get("step"), job.ranks)
     c = job.config
     with background_warmup(c, job.device) as ready:

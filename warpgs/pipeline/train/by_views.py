@@ -92,8 +92,8 @@ def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
     steps = max(1, int(wanted * most / seconds))
     lost = LOST_DB * math.log2(wanted / steps)
     return steps, (
-        f"on a CPU the default is {steps:,} of {wanted:,} steps, about {most / 60:.1f} min on two cores; "
-        f"--no-cpu-limit takes all steps, about {seconds / 60:.0f} min, and raises PSNR by at least {lost:.1f} dB"
+        f"to save time on a CPU, the fit takes {steps:,} of {wanted:,} steps: about {most / 60:.1f} min on two cores, besides "
+        f"start and report; --no-cpu-limit takes all, about {seconds / 60:.0f} min, and raises PSNR by at least {lost:.1f} dB"
     )
 
 
