@@ -7,8 +7,9 @@ import pytest
 
 from tests.scenes import ring, three_gaussians
 from tests.viewer.chromium import Chromium
+from warpgs.geometry import look_at
 from warpgs.render.rasterize import rasterize
-from warpgs.viewer.html import SORT_FROM_DISK, middle_first, write_html
+from warpgs.viewer.html import MARGIN, SORT_FROM_DISK, middle_first, turning_limits, write_html
 
 pytest.importorskip("viser")
 WIDTH, HEIGHT = 700, 600
@@ -35,6 +36,44 @@ def test_the_middle_of_the_cameras_comes_first():
     """The one nearest to the mean of all centres, then the others in their order."""
     cameras = [moved(x) for x in (4.0, 0.0, 1.5, 1.0)]
     assert [c.center[0] for c in middle_first(cameras)] == [1.5, 4.0, 0.0, 1.0] and middle_first([]) == []
+
+
+def test_a_page_turns_as_far_as_the_photographs():
+    """Around an arc, along a row of parallel cameras and in one place; all round there is no limit, nor with one camera."""
+    up, target = np.array([0.0, -1, 0]), np.zeros(3)
+
+    def looking(azimuth, height=0.0):
+        eye = 4 * np.array([np.sin(azimuth), -height, -np.cos(azimuth)])
+        return dataclasses.replace(ring(1)[0], viewmat=look_at(eye, target, up))
+
+    arc = [looking(np.radians(a), h) for a, h in ((0, 0), (-30, 0), (40, 0), (0, np.tan(np.radians(20))))]
+    np.testing.assert_allclose(turning_limits(arc, target, up), np.radians([40, 20]) + MARGIN, atol=1e-9)
+    row = [moved(0.0), moved(2.0), moved(-1.0)]
+    side, tilt = turning_limits(row, row[0].center + np.array([0, 0, 4.0]), up)
+    assert side == pytest.approx(np.arctan2(2, 4) + MARGIN) and tilt == pytest.approx(MARGIN)
+    ways = [looking(np.radians(a)) for a in range(0, 360, 45)]
+    assert turning_limits(ways, target, up)[0] == np.pi and turning_limits(arc[:1], target, up) == (np.pi, np.pi)
+
+
+@pytest.mark.browser
+def test_a_page_stops_where_the_photographs_end(tmp_path):
+    """To both sides; the key R leads back to the first view."""
+    path, cameras = tmp_path / "scene.html", middle_first(ring(3))
+    write_html(path, crowd(), cameras)
+    browser = Chromium(tmp_path)
+    try:
+        browser.open(path.as_uri())
+        angle = "window.__viserMutable?.cameraControl?.azimuthAngle"
+        browser.wait("Number.isFinite(window.__viserMutable?.cameraControl?.maxAzimuthAngle)")
+        first = browser.value(angle)
+        for way in (1, -1):
+            browser.value(f"void __viserMutable.cameraControl.rotate({way} * 2.5, 0, false)")
+            browser.wait(f"Math.abs({angle} - {first}) > 0.1")
+            assert abs(browser.value(angle) - first) < np.radians(60)
+            browser.value("dispatchEvent(new KeyboardEvent('keydown', {key: 'r', bubbles: true}))")
+            browser.wait(f"Math.abs({angle} - {first}) < 1e-3")
+    finally:
+        browser.close()
 
 
 def moved(x):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -54,13 +55,21 @@ SORT_FROM_DISK = (
 are blended in the order of the file. The script hides the blob, so viser's page starts the worker from a data:
 address, which works."""
 WHOLE_IMAGE = (
-    "<script>{let fov=OWN;const degrees=180/Math.PI,show=()=>{const c=window.__viserMutable?.camera;"
-    "if(!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
+    "<script>{let fov=OWN,first=true;const degrees=180/Math.PI,show=()=>{const m=window.__viserMutable,c=m?.camera,"
+    "t=m?.cameraControl;if(!t||!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
+    "if(first){first=false;const a=t.azimuthAngle,p=t.polarAngle;"
+    "if(SIDE<Math.PI){t.minAzimuthAngle=a-SIDE;t.maxAzimuthAngle=a+SIDE}"
+    "t.minPolarAngle=Math.max(0,p-TILT);t.maxPolarAngle=Math.min(Math.PI,p+TILT)}"
     "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
     "show();addEventListener('resize',show)}</script>"
 )
 """Script that widens the vertical field of view OWN [rad] in a browser window narrower than the first camera's image,
-such as a phone's; otherwise the sides would be cut off. WIDE is half the width of the image at distance 1."""
+such as a phone's; otherwise the sides would be cut off. WIDE is half the width of the image at distance 1. The script also
+limits how far the page turns from its first view: SIDE and TILT are results of `turning_limits`."""
+MARGIN = math.radians(15)
+"""Angle that a page may turn beyond the photographs [rad]."""
+ALL_ROUND = math.radians(150)
+"""Angle to one side above which a page may turn all round [rad]."""
 
 
 def place_first_camera(server: viser.ViserServer, camera: Camera, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
@@ -81,6 +90,31 @@ def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
     centers = np.array([c.center for c in cameras])
     nearest = int(np.argmin(np.linalg.norm(centers - centers.mean(0), axis=1)))
     return [cameras[nearest], *cameras[:nearest], *cameras[nearest + 1 :]]
+
+
+def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[float, float]:
+    """Return how far a page may turn from the first camera around a target, to each side and up or down [rad].
+
+    The page turns as far as the photographs do, plus `MARGIN`: beyond, the model shows places that no photograph saw. With one
+    camera, and where the photographs go all round, there is no limit: pi.
+
+    Args:
+        cameras: Cameras, at least one.
+        target: Point around which the page turns [u], shape [3].
+        up: Upward direction, unit length, shape [3].
+    """
+    if len(cameras) < 2:
+        return math.pi, math.pi
+    # as seen from the target, and by the axis: cameras in a row look in parallel, those in a room outwards
+    ways = np.array([w for c in cameras for w in (c.center - target, -np.asarray(c.viewmat[2, :3]))])
+    ways /= np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+    heights = np.clip((ways * up).sum(1), -1, 1)
+    flat = ways - heights[:, None] * up
+    side = np.cross(up, flat[0])
+    azimuths = np.arctan2((flat * side).sum(1), (flat * flat[0]).sum(1))
+    elevations = np.arcsin(heights)
+    turn, tilt = (float(np.abs(a).max()) + MARGIN for a in (azimuths, elevations - elevations[0]))
+    return math.pi if turn > ALL_ROUND else turn, min(tilt, math.pi)
 
 
 def plain_background(color: Sequence[float]) -> np.ndarray:
@@ -133,7 +167,13 @@ def page_of(
         notes.append(f"{stored.shortened:,} Gaussians are longer than the page can store, and are shown shorter")
     text, end, rest = text.replace("<head>", head, 1).rpartition("</body>")
     wide = 0.5 * cameras[0].width / float(cameras[0].K[0, 0])
-    script = WHOLE_IMAGE.replace("OWN", f"{fov_y(cameras[0]):.8f}").replace("WIDE", f"{wide:.8f}")
+    first, up = cameras[0], up_of(list(cameras), gaussians.means.detach().cpu().double().numpy())
+    target = first.center + distance_ahead(first, gaussians) * np.asarray(first.viewmat[2, :3])
+    limits = zip(("SIDE", "TILT"), turning_limits(cameras, target, up), strict=True)
+    values = {"OWN": fov_y(first), "WIDE": wide, **dict(limits)}
+    script = WHOLE_IMAGE
+    for name, value in values.items():
+        script = script.replace(name, f"{value:.8f}")
     return f"{text}{HELP}{script}{end}{rest}", notes
 
 
