@@ -15,5 +15,5 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def install_extras(*names: str) -> str:
-    """Return the words on how to install extras. They name no package index, because the name warpgs there is not ours."""
+    """Return the words on how to install extras: from the repository, since warpgs is on no package index."""
     return f"`pip install '.[{','.join(names)}]'` in your copy of the repository"
