@@ -18,6 +18,7 @@ from warpgs.pipeline.train.batch import BatchSteps
 from warpgs.pipeline.train.by_views import settings_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.schedule import OptimizerConfig
 from warpgs.pipeline.train.slots import Tree
 from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers, steps_at_once
 from warpgs.pipeline.train.step_graphs import instance_capacity
@@ -172,10 +173,11 @@ def test_ranks_go_on_without_graphs_together():
 
 
 def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
-    """Each updates rows of its own, and a few rows are left over; the set of Gaussians grows meanwhile."""
+    """Each updates its own rows, and a few are left over. The set of Gaussians grows, and the last steps are averaged."""
     monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 4000)
     density = DensityConfig(start=2, every=4, gradient=1e-5, reset_every=8)
-    config = dataclasses.replace(PLAIN, steps=10, batch=5, dropout=0.3, sh_degree=2, density=density)
+    optimizer = OptimizerConfig(average_last=0.5)
+    config = dataclasses.replace(PLAIN, steps=10, batch=5, dropout=0.3, sh_degree=2, density=density, optimizer=optimizer)
     alone = advanced(Trainer(photos(3), seeds(61), config, CPU), 10)
     for count in (2, 3):
         fits = by_threads(lambda ranks: advanced(Trainer(photos(3), seeds(61), config, CPU, ranks=ranks), 10), count)
