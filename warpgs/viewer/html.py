@@ -96,7 +96,7 @@ def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray
     """Return how far a page may turn from the first camera around a target, to each side and up or down [rad].
 
     The page turns as far as the photographs do, plus `MARGIN`: beyond, the model shows places that no photograph saw. With one
-    camera, and where the photographs go all round, there is no limit: pi.
+    camera, and with photographs all round, the result is pi: no limit.
 
     Args:
         cameras: Cameras, at least one.

@@ -72,7 +72,7 @@ class ParameterMean:
         self.sums, self.count = {}, 0
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Return tensors by name, of any shape [...], from which the mean continues; none if there is no sample."""
+        """Return tensors by name, of any shape [...], from which the mean continues; empty without samples."""
         if not self.count:
             return {}
         return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": torch.tensor([self.count])}
