@@ -140,18 +140,16 @@ def views() -> str:
 
 def default_now() -> str:
     """Return the table of `default` beside its scores in the table of all presets, which is older."""
-    result, source = _result("default_h100")
-    mean, mean_source = _result("average_last_h200")
+    result, source = _result("default_h200")
     old, new = (by_seed(r["rows"]) for r in (_result("presets_h200")[0], result))
-    new |= {key: of for key, of in by_seed(mean["rows"]).items() if key[1] == "default"}
     body = []
     for row, (scene, count) in CAPTURES.items():
-        own = new.get((row, "default")) or new.get((row, ONE_LAYER))
+        own = new.get((row, "default"))
         if own:
             before, now = (list(of.values()) for of in (old[row, "default"], own))
             change = statistics.mean(r["psnr"] for r in now) - statistics.mean(r["psnr"] for r in before)
             body.append([f"{scene}, {count}", str(len(now)), _scores(before), _scores(now), f"{change:+.2f}"])
-    return table(["scene, views", "seeds", "before", "`default`", "change in PSNR"], body) + source + mean_source
+    return table(["scene, views", "seeds", "before", "`default`", "change in PSNR"], body) + source
 
 
 def coverage() -> str:
@@ -211,9 +209,10 @@ def objects() -> str:
     two = {r["object"]: r for r in result["rows"] if r["preset"] == "default" and r["object"] in one}
     body = [[words, str(len(of)), *_object_cells(list(of.values()))] for words, of in (("two", two), ("one: `default`", one))]
     layers = table(["layers", "objects", *head], body) + source
-    result, source = _result("objects_h100")
-    seeds = sorted(r["object"] for r in result["rows"])
-    now = [[f"{len(seeds)}, seeds {seeds[0]} to {seeds[-1]}", *_object_cells(result["rows"])]]
+    result, source = _result("importance_objects_h200")
+    own = [r for r in result["rows"] if r["preset"] == "default"]
+    seeds = sorted(r["object"] for r in own)
+    now = [[f"{len(seeds)}, seeds {seeds[0]} to {seeds[-1]}", *_object_cells(own)]]
     return "\n".join((by_format, layers, table(["`default`: objects", *head], now) + source))
 
 
