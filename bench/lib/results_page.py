@@ -12,13 +12,6 @@ from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.statistics import paired_difference
 
-RUNGS = (
-    ("3dgs", "", "`3dgs`, random points"),
-    ("3dgs sweep 8 px", "3dgs", "+ start from the depth sweep"),
-    ("strong-3dgs", "3dgs sweep 8 px", "+ dropout, with the method's learning rates, degree and schedule"),
-    ("paper", "strong-3dgs", "+ placement by importance"),
-)
-"""Presets of the ladder, the preset below each, and words."""
 ABLATED = {
     "no events": "no sampling events: no placement, layers or protection",
     "no agp": "pixels of highest importance, not sampled ones",
@@ -36,30 +29,14 @@ CAPTURES = {
     "fox:8": ("fox", 8), "fox:all": ("fox", 43), "temple:4": ("temple", 4), "temple:12": ("temple", 12),
 }  # fmt: skip
 """Scene and number of training views of each row of the presets' result."""
-ONE_LAYER = "default:method.hier=false,optimizer.opacities_decay=0.001"
-"""`default` with up to 9 views with alpha, as it was measured before it became so."""
 PRESETS = ("default", "quick", "3dgs", "mcmc", "gsplat")
 POSES = {
     "given": "given with the photographs",
     "joint": "found, held-out photographs included",
     "aligned": "found from the training photographs alone",
 }
-MCMC = {
-    "warpgs mcmc": "preset `mcmc`",
-    "gsplat mcmc": "gsplat's MCMC, our scene units",
-    "gsplat mcmc, own units": "gsplat's MCMC, units of its parser",
-    "warpgs 3dgs": "preset `3dgs`, which sets the cap",
-}
 PARITY, REPEATS = "parity_h200", "determinism_h100"
 """Results of the agreement with gsplat, and of the price of repeatable sums."""
-MODES = {
-    "deterministic": "ours, fixed order",
-    "atomic": "ours, atomic",
-    "naive atomic": "naive kernels, atomic",
-    "naive, Warp's run to run": "naive kernels, `RUN_TO_RUN`",
-    "naive, Warp's GPU to GPU": "naive kernels, `GPU_TO_GPU`",
-}
-"""Ways to sum gradients, in words."""
 
 
 def table(head: Sequence[str], rows: list[list[str]]) -> str:
@@ -84,31 +61,6 @@ def _change(own: dict[int, dict], base: dict[int, dict], key: str, digits: int) 
     return f"{d.mean:+.{digits}f} [{d.low:+.{digits}f}, {d.high:+.{digits}f}]"
 
 
-def ladder() -> str:
-    """Return the table of the method's steps from plain 3DGS, each beside the one below it."""
-    result, source = _result("presets_llff3_h200")
-    found: dict[tuple, dict[int, dict]] = defaultdict(dict)
-    for r in result["rows"]:
-        found[r["scene"], r["preset"]][r["seed"]] = r
-    body = []
-    for preset, below, words in RUNGS:
-        body.append([words])
-        for scene in ("fern", "horns"):
-            own, base = found[scene, preset], found[scene, below]
-            body[-1] += [_scores(list(own.values())), _change(own, base, "psnr", 2) if base else ""]
-    return table(["step", "fern", "change in PSNR", "horns", "change in PSNR"], body) + source + "\n" + placement_again()
-
-
-def placement_again() -> str:
-    """Return the last step of the ladder as another run has it."""
-    lines = []
-    for scene in ("fern", "horns"):
-        result, source = _result(f"compare_{scene}_llff3_h200")
-        own, base = ({r["seed"]: r for r in result["rows"] if r["variant"] == name} for name in ("paper", "strong-3dgs"))
-        lines.append(f"Placement on `{scene}` in another run: {_change(own, base, 'psnr', 2)} dB. {source.strip()}\n")
-    return "\n".join(lines)
-
-
 def ablation() -> str:
     """Return the table of the method with one part off: means over both scenes, differences to the full method by seed."""
     result, source = _result("ablation_llff3_h200")
@@ -128,97 +80,45 @@ def ablation() -> str:
 
 
 def views() -> str:
-    """Return the table of held-out scores by scene, number of training views and preset; empty cells were not measured."""
-    result, source = _result("presets_h200")
-    found, body = by_seed(result["rows"]), []
-    for name, (scene, count) in CAPTURES.items():
-        own = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
-        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", *(_scores(rows) if rows else "" for rows in own)])
-    heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {result['versions']['gsplat']}"]
-    return markdown(["scene, views", "split", *heads], body, ["scene, views", "split"]) + source
-
-
-def default_now() -> str:
-    """Return the table of `default` beside its scores in the table of all presets, which is older."""
-    result, source = _result("default_h200")
-    old, new = (by_seed(r["rows"]) for r in (_result("presets_h200")[0], result))
+    """Return the table of held-out scores by scene, training views and preset, `default` of its own run; empty: not measured."""
+    (others, source), (own, own_source) = _result("presets_h200"), _result("default_h200")
+    found = by_seed(others["rows"]) | by_seed(own["rows"])
     body = []
-    for row, (scene, count) in CAPTURES.items():
-        own = new.get((row, "default"))
-        if own:
-            before, now = (list(of.values()) for of in (old[row, "default"], own))
-            change = statistics.mean(r["psnr"] for r in now) - statistics.mean(r["psnr"] for r in before)
-            body.append([f"{scene}, {count}", str(len(now)), _scores(before), _scores(now), f"{change:+.2f}"])
-    return table(["scene, views", "seeds", "before", "`default`", "change in PSNR"], body) + source
+    for name, (scene, count) in CAPTURES.items():
+        cells = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
+        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", f"{len(cells[0])}", *(_scores(r) if r else "" for r in cells)])
+    heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {others['versions']['gsplat']}"]
+    head = ["scene, views", "split", "seeds of `default`", *heads]
+    return markdown(head, body, head[:2]) + own_source + source
 
 
 def coverage() -> str:
-    """Return the tables of pixels and errors by how many training views saw them, and of pixels unseen in both fits."""
+    """Return the table of pixels and errors of `default` by how many training views saw them."""
     result, source = _result("coverage_h200")
-    before, body = result["rows"][0]["preset"], []
+    body = []
     for scene in ("fern:3", "horns:3"):
         for seen, words in (("0", "no view"), ("1", "one"), ("2+", "two or more")):
-            body.append([f"{scene.replace(':', ', ')}: {words}"])
-            for preset in (before, "default"):
-                own = [r["classes"][seen] for r in result["rows"] if (r["row"], r["preset"]) == (scene, preset)]
-                body[-1] += [f"{100 * statistics.mean(c[k] for c in own):.0f} %" for k in ("share_of_pixels", "share_of_error")]
-                body[-1].append(mean_sd([c["psnr"] for c in own]))
-    head = [
-        "scene, views: pixels seen by",
-        "before: pixels",
-        "error",
-        "PSNR",
-        "`default`: pixels",
-        "error",
-        "PSNR",
-    ]
-    unseen = []
-    for scene in ("fern:3", "horns:3"):
-        own = [r for r in result["unseen_in_both"] if r["row"] == scene]
-        share = 100 * statistics.mean(r["share_of_pixels"] for r in own)
-        scores = [mean_sd([r[k] for r in own]) for k in ("before", "after")]
-        unseen.append([scene.replace(":", ", "), f"{share:.0f} %", *scores])
-    both = table(["scene, views: unseen in both fits", "pixels", "before: PSNR", "`default`: PSNR"], unseen)
-    return table(head, body) + "\n" + both + source
-
-
-def mcmc() -> str:
-    """Return the table of MCMC beside gsplat's."""
-    result, source = _result("mcmc_h200")
-    body = []
-    for program, words in MCMC.items():
-        rows = [r for r in result["rows"] if r["program"] == program]
-        body.append([words, _scores(rows), f"{statistics.mean(r['gaussians'] for r in rows):,.0f}"])
-    return table(["program", "PSNR / SSIM", "Gaussians"], body) + source
+            own = [r["classes"][seen] for r in result["rows"] if (r["row"], r["preset"]) == (scene, "default")]
+            shares = (statistics.mean(c[k] for c in own) for k in ("share_of_pixels", "share_of_error"))
+            psnr = mean_sd([c["psnr"] for c in own])
+            body.append([f"{scene.replace(':', ', ')}: {words}", *(f"{100 * share:.0f} %" for share in shares), psnr])
+    return table(["scene, views: pixels seen by", "pixels", "squared error", "PSNR"], body) + source
 
 
 def strategies() -> str:
-    """Return the table of gsplat's strategies on its rasterizer and on ours."""
+    """Return the table of gsplat's strategies on its rasterizer and on ours with rule `exact`."""
     result, source = _result("strategies_fern_h200")
-    return strategy_runs.table(result["rows"]) + source
+    return strategy_runs.table([r for r in result["rows"] if r["rasterizer"] != "gsplat-1.6"]) + source
 
 
 def objects() -> str:
-    """Return the table on objects cut out: by the format of the scene, and with one layer beside two on the same objects."""
-    result, source = _result("objects_h200")
-    body = [[form, *_object_cells([r for r in result["rows"] if r["format"] == form])] for form in ("transforms", "colmap")]
-    head = ["PSNR over white", "alpha in the object", "alpha outside"]
-    by_format = table(["scene format", *head], body) + source
-    result, source = _result("one_layer_objects_h100")
-    one = {r["object"]: r for r in result["rows"] if r["preset"] == ONE_LAYER}
-    two = {r["object"]: r for r in result["rows"] if r["preset"] == "default" and r["object"] in one}
-    body = [[words, str(len(of)), *_object_cells(list(of.values()))] for words, of in (("two", two), ("one: `default`", one))]
-    layers = table(["layers", "objects", *head], body) + source
+    """Return the table on objects cut out."""
     result, source = _result("importance_objects_h200")
     own = [r for r in result["rows"] if r["preset"] == "default"]
     seeds = sorted(r["object"] for r in own)
-    now = [[f"{len(seeds)}, seeds {seeds[0]} to {seeds[-1]}", *_object_cells(own)]]
-    return "\n".join((by_format, layers, table(["`default`: objects", *head], now) + source))
-
-
-def _object_cells(rows: list[dict]) -> list[str]:
-    psnr, alpha, empty = (statistics.mean(r[k] for r in rows) for k in ("psnr_white", "alpha_object", "alpha_empty"))
-    return [f"{psnr:.2f}", f"{alpha:.4f}", f"{empty:.4f}"]
+    psnr, alpha, empty = (statistics.mean(r[k] for r in own) for k in ("psnr_white", "alpha_object", "alpha_empty"))
+    cells = [f"{len(seeds)}, seeds {seeds[0]} to {seeds[-1]}", f"{psnr:.2f}", f"{alpha:.4f}", f"{empty:.4f}"]
+    return table(["objects", "PSNR over white", "alpha in the object", "alpha outside"], [cells]) + source
 
 
 def poses() -> str:
@@ -231,14 +131,15 @@ def poses() -> str:
 
 
 def same_image() -> str:
-    """Return the table of the agreement with gsplat."""
+    """Return the table of the agreement with gsplat on its largest images."""
     result, source = _result(PARITY)
-    body = []
+    width, body = max(r["width"] for r in result["rows"]), []
     for r in result["rows"]:
-        worst = max(g["rel_l2"] for g in r["gradients"].values())
-        size, differences = f"{r['case']}, {r['width']} x {r['height']}", (r["image_mean"], r["image_max"], worst)
-        body.append([size, *(f"{d:.1e}" for d in differences), r["differs"]])
-    head = ["case, image", "mean difference", "largest", "gradients: largest relative L2", "differs by definition"]
+        if r["width"] == width:
+            worst = max(g["rel_l2"] for g in r["gradients"].values())
+            differences = (r["image_mean"], r["image_max"], worst)
+            body.append([r["case"], *(f"{d:.1e}" for d in differences), r["differs"]])
+    head = ["case", "mean difference", "largest", "gradients: largest relative L2", "differs by definition"]
     return table(head, body) + source
 
 
@@ -258,37 +159,19 @@ def antialiasing() -> str:
     return table(["views, filters", "fits", "half size", "size of the photos", "double size"], body) + source
 
 
-def meshes() -> str:
-    """Return the table of the accuracy of meshes."""
-    result, source = _result("mesh_cpu2")
-    body = []
-    for r in sorted((r for r in result["rows"] if r["row"] == "mesh"), key=lambda r: -r["voxel"]):
-        if r["depth"] == "median":
-            cells = [f"{r['voxel']:.2g}", f"{r['triangles']:,}"]
-            body.append(cells + [f"{100 * r[k]:.2f} %" for k in ("accuracy_mean_of_radius", "completeness_mean_of_radius")])
-    return table(["voxel", "triangles", "accuracy", "completeness"], body) + source
-
-
 def repeats() -> str:
-    """Return the table of the price of sums in a fixed order, ours and Warp's, and of the spread of atomic ones."""
+    """Return the table of the price of sums in a fixed order, and of the spread of atomic ones."""
     result, source = _result(REPEATS)
     body = []
     for r in result["rows"]:
-        size = f"{r['gaussians']:,}, {r['width']} x {r['height']}"
-        ulps = max((s["max_ulp"] for s in r["spread"].values()), default=0)
-        for mode, price in r["price"].items():
-            if "reason" in price:
-                body.append([size, MODES[mode], "", price["reason"], ""])
-                continue
-            differ = price["repeats_that_differ"]
-            bits = "same" if differ == 0 else f"{differ} of 9 differ"
-            body.append([size, MODES[mode], f"{price['median_ms']:.2f}", bits, f"{ulps:,}" if mode == "atomic" else ""])
-    return table(["Gaussians, image", "sums", "wall [ms]", "bits of repeats", "largest [ulp]"], body) + source
+        times = [f"{r['price'][mode]['median_ms']:.2f}" for mode in ("deterministic", "atomic")]
+        ulps = max(s["max_ulp"] for s in r["spread"].values())
+        body.append([f"{r['gaussians']:,}, {r['width']} x {r['height']}", *times, f"{ulps:,}"])
+    return table(["Gaussians, image", "fixed order [ms]", "atomic [ms]", "largest difference [ulp]"], body) + source
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ladder, ablation, views, default_now, coverage, mcmc, strategies, objects, poses, same_image, antialiasing,
-    meshes, repeats,
+    ablation, views, coverage, strategies, objects, poses, same_image, antialiasing, repeats,
 )  # fmt: skip
 
 
