@@ -7,7 +7,6 @@ import statistics
 from bench.lib import rasterizers_page, result_file
 from bench.lib.plot import Line, Panel, chart
 from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
-from bench.lib.rasterizers import ATOMIC, GSPLAT_PACKED
 from bench.lib.tables import figure, markdown
 from bench.lib.timing import DISTURBED, OURS
 
@@ -23,8 +22,8 @@ WHOLE = (("render", "forward"), ("render", "both"), ("step", "step"))
 """Ops and directions of that table."""
 FITS = {"fern_cpu2": "fern, 3 photographs of 504 x 378 px", "temple_cpu2": "temple, 12 photographs of 640 x 480 px"}
 """Results of whole commands, and the captures in words."""
-EARLIER = (OURS, ATOMIC, GSPLAT_PACKED)
-"""Programs of the earlier run beside other rasterizers; all but the first are missing in the latest."""
+PEERS = ("gsplat", "gsplat + torch", "numpy", "torch conv2d")
+"""Programs of the table of other programs; results have slower ones, too."""
 
 
 def _sources(kind: str, results: dict[str, dict]) -> str:
@@ -95,17 +94,6 @@ def fits_table(results: dict[str, dict]) -> str:
     return markdown(["capture", "steps", "start [s]", "training [s]", "whole command [s]", "PSNR [dB]"], body, WORDS)
 
 
-def cpu_step_table(result: dict) -> str:
-    """Return processor times of a training step by two versions, the older one first."""
-    medians = {(r["target"], r["threads"], r["gaussians"], r["side"]): r["cpu_median_ms"] for r in result["rows"]}
-    counts = sorted({key[2] for key in medians})
-    body = []
-    for target, threads in dict.fromkeys(key[:2] for key in medians):
-        cells = [", ".join(figure(medians[target, threads, n, side]) for side in ("old", "new")) for n in counts]
-        body.append([{"native": "AVX-512"}.get(target, target), f"{threads}", *cells])
-    return markdown(["target", "threads", *(f"{n:,} Gaussians" for n in counts)], body, ("target",))
-
-
 def _roof(rows: list[dict], op: str, direction: str) -> str:
     """Return the fraction of the roof of one of our tasks, where it was measured at its heaviest."""
     own = [r for r in rows if (r["op"], r["program"], r["direction"]) == (op, OURS, direction) and "roof_ms" in r and _plain(r)]
@@ -137,7 +125,7 @@ def peers_table(results: dict[str, dict]) -> str:
     for result in results.values():
         rows = result["rows"]
         ours = {(r["op"], r["direction"], _key(r)): r for r in rows if r["program"] == OURS}
-        peers = [r for r in rows if r["program"] != OURS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
+        peers = [r for r in rows if r["program"] in PEERS and _plain(r) and (r["op"], r["direction"], _key(r)) in ours]
         for op, program, direction in sorted(tasks(peers), key=lambda t: (t[0], t[2], t[1])):
             r = max((r for r in peers if (r["op"], r["program"], r["direction"]) == (op, program, direction)), key=_key)
             mine = ours[r["op"], r["direction"], _key(r)]
@@ -205,18 +193,14 @@ def parts() -> dict[str, str]:
     """Return the generated parts of docs/performance.md by name."""
     ops, others, steps, turns = (result_file.stored(kind) for kind in ("ops", "rasterizers", "training_steps", "turns"))
     sources, beside = _sources("ops", ops), next(iter(others.values()))
-    earlier, gswarp = (result_file.read(result_file.FOLDER / f"{n}.json") for n in ("older_rasterizers_h100", "gswarp_h200"))
+    gswarp = result_file.read(result_file.FOLDER / "gswarp_h200.json")
     return {
         "sizes": sizes_table(ops) + sources,
         "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
-        "ratios": rasterizers_page.ratios_table(beside),
-        "earlier run": rasterizers_page.times_table(earlier, 3, EARLIER) + "\n" + result_file.source("older_rasterizers_h100"),
-        "gswarp": rasterizers_page.gpu_table(gswarp) + "\n" + result_file.source("gswarp_h200"),
+        "gswarp": rasterizers_page.gpu_table(gswarp, (OURS, "gswarp")) + "\n" + result_file.source("gswarp_h200"),
         "many channels": rasterizers_page.times_table(beside, 32),
         "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
-        "buffers": rasterizers_page.buffers_table(beside),
         "whole fits": fits_table(turns) + _sources("turns", turns),
-        "cpu step": cpu_step_table(result_file.stored("step")["cpu2"]) + "\n" + result_file.source("step_cpu2"),
         "ops": ops_table(ops),
         "other programs": peers_table(ops),
     }
