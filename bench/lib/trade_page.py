@@ -58,18 +58,6 @@ def error_bound() -> str:
     return markdown(head, body, head[:1]) + "\n" + result_file.source("error_bound_cpu2")
 
 
-def selected_rules() -> str:
-    """Return what `select_rule` gives by scene, measure and limit."""
-    body = []
-    for row in result_file.stored("selected_rules")["cpu2"]["summary"]:
-        rules = ", ".join(f"`{rule}` {n}" if rule != "none" else f"none {n}" for rule, n in row["rules"].items())
-        cells = [row["kind"], row["measure"], f"{row['limit']:.0e}", rules]
-        found = [f"{row['time']:.2f}", *(f"{row[k]:.1e}" for k in ("typical", "worst", "pixel"))] if "time" in row else []
-        body.append(cells + (found or ["-"] * 4))
-    head = ["scene", "measure", "limit", "rules", "time", "true error: median", "largest", "worst pixel"]
-    return markdown(head, body, head[:4]) + "\n" + result_file.source("selected_rules_cpu2")
-
-
 def parts() -> dict[str, str]:
     """Return the generated parts of docs/trade.md by name."""
-    return {"error bound": error_bound(), "selected rules": selected_rules(), "rules": rules(), "fits": fits()}
+    return {"error bound": error_bound(), "rules": rules(), "fits": fits()}
