@@ -80,13 +80,14 @@ def ablation() -> str:
 
 
 def views() -> str:
-    """Return the table of held-out scores by scene, training views and preset, `default` of its own run; empty: not measured."""
+    """Return the table of held-out scores by scene and preset, `default` from its own run; empty cells were not measured."""
     (others, source), (own, own_source) = _result("presets_h200"), _result("default_h200")
     found = by_seed(others["rows"]) | by_seed(own["rows"])
     body = []
     for name, (scene, count) in CAPTURES.items():
-        cells = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
-        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", f"{len(cells[0])}", *(_scores(r) if r else "" for r in cells)])
+        rows = [list(found.get((name, preset), {}).values()) for preset in PRESETS]
+        cells = (_scores(r) if r else "" for r in rows)
+        body.append([f"{scene}, {count}", f"`{ROWS[name].split}`", f"{len(rows[0])}", *cells])
     heads = [*(f"`{p}`" for p in PRESETS[:-1]), f"gsplat {others['versions']['gsplat']}"]
     head = ["scene, views", "split", "seeds of `default`", *heads]
     return markdown(head, body, head[:2]) + own_source + source
