@@ -23,7 +23,7 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "formats.md": lambda: {"formats": use_pages.formats()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
     "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
-    "method.md": lambda: {"scores": method_page.scores()},
+    "method.md": lambda: {"placement": method_page.placement(), "scores": method_page.scores()},
     "performance.md": performance_page.parts,
     "results.md": lambda: {
         **results_page.parts(),

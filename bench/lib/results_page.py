@@ -160,6 +160,17 @@ def antialiasing() -> str:
     return table(["views, filters", "fits", "half size", "size of the photos", "double size"], body) + source
 
 
+def meshes() -> str:
+    """Return the table of the accuracy of meshes."""
+    result, source = _result("mesh_cpu2")
+    body = []
+    for r in sorted((r for r in result["rows"] if r["row"] == "mesh"), key=lambda r: -r["voxel"]):
+        if r["depth"] == "median":
+            cells = [f"{r['voxel']:.2g}", f"{r['triangles']:,}"]
+            body.append(cells + [f"{100 * r[k]:.2f} %" for k in ("accuracy_mean_of_radius", "completeness_mean_of_radius")])
+    return table(["voxel", "triangles", "accuracy", "completeness"], body) + source
+
+
 def repeats() -> str:
     """Return the table of the price of sums in a fixed order, and of the spread of atomic ones."""
     result, source = _result(REPEATS)
@@ -172,7 +183,8 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ablation, views, coverage, strategies, objects, poses, same_image, antialiasing, repeats,
+    ablation, views, coverage, strategies, objects, poses, same_image, antialiasing, meshes,
+    repeats,
 )  # fmt: skip
 
 
