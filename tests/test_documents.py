@@ -88,7 +88,6 @@ BY_HAND = {
     ("install.md", "| part | size"): "sizes by du",
     ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
-    ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
     ("scenes.md", "| fault | key"): "limits in the code",
     ("scenes.md", "| input | limit"): "limits in the code",
