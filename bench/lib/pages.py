@@ -22,7 +22,6 @@ PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "farm.md": lambda: {"packing": use_pages.packing(), "captures": use_pages.captures()},
     "formats.md": lambda: {"formats": use_pages.formats()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
-    "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
     "method.md": lambda: {"placement": method_page.placement(), "scores": method_page.scores()},
     "performance.md": performance_page.parts,
     "results.md": lambda: {

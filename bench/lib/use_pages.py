@@ -1,4 +1,4 @@
-"""The generated parts of the pages on use: farms, several GPUs, meshes, formats."""
+"""The generated parts of the pages on use: farms, several GPUs, formats."""
 
 from __future__ import annotations
 
@@ -66,20 +66,6 @@ def ranks() -> str:
                 [name, f"{r['ranks']}", f"{r['step_ms']:.1f} ms", f"{r['collectives_ms']:.1f} ms", f"{r['efficiency']:.2f}"]
             )
     return table(["model", "GPUs", "step", "in collectives", "scaling efficiency"], body) + source
-
-
-def surfaces() -> str:
-    """Return the table of meshes by the depth that is fused, at the default voxel size."""
-    result, source = _result("mesh_cpu2")
-    rows = {r["depth"]: r for r in result["rows"] if r["row"] == "mesh"}  # the default comes last
-    body = []
-    for r in (rows["median"], rows["mean"]):
-        cells = [r["depth"], f"{r['triangles']:,}"]
-        for key in ("accuracy", "completeness"):
-            cells.append(f"{100 * r[f'{key}_mean_of_radius']:.2f} ({100 * r[f'{key}_median_of_radius']:.2f})")
-        body.append([*cells, f"{100 * r['completeness_within_0.01_of_radius']:.0f} %"])
-    head = ["depth", "triangles", "accuracy, mean (median)", "completeness, mean (median)", "observed points within 1 %"]
-    return table(head, body) + source
 
 
 def formats() -> str:
