@@ -91,7 +91,6 @@ BY_HAND = {
     ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
     ("scenes.md", "| fault | key"): "limits in the code",
-    ("scenes.md", "| input | limit"): "limits in the code",
     ("tiles.md", "| bound | margin"): "derived margins",
 }
 """Tables with numbers that no file of results holds: page, first words, reason."""
