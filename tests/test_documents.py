@@ -84,7 +84,6 @@ BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
     ("evaluation.md", "| key | definition"): "definitions",
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
-    ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
     ("install.md", "| part | size"): "sizes by du",
     ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",

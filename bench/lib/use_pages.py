@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import statistics
-
 from bench.lib import result_file
 from bench.lib.results_page import table
 from bench.lib.tables import markdown
 
-SCENES = {"fern:3": 3, "fern:9": 9, "horns:54": 54}
-"""Rows of the presets' result that the page on farms shows, and their training views."""
 MODELS = {
     "horns": "horns, 54 views of 504 x 378 px, {:,} Gaussians",
     "garden": "garden, 1920 x 1080 px, {:,} Gaussians",
@@ -38,20 +34,6 @@ def packing() -> str:
         gpus = "" if r["gpus"] == 1 else f" on each of {r['gpus']} H200"
         body.append([f"{r['per_gpu']}{gpus}", f"{r['fits_per_hour']:,.0f}", f"{r['mean_seconds_of_a_fit']:.1f} s"])
     return table(["`--per-gpu`", "fits per hour", "time per fit"], body) + source
-
-
-def captures() -> str:
-    """Return the table of time and size by the number of views, many fits at a time."""
-    result, source = _result("presets_h200")
-    body = []
-    for name, views in SCENES.items():
-        rows = [r for r in result["rows"] if r["row"] == name and r["preset"] == "default" and "error" not in r]
-        seconds = statistics.mean(r["setup"] + r["training"] for r in rows)
-        size = statistics.mean(r["bytes"] for r in rows)
-        hourly = rows[0]["jobs"] * views * 3600 / seconds
-        body.append([f"{views}", f"{seconds:.0f} s", f"{hourly:,.0f}", f"{1e6 / hourly:.0f}", f"{size / 1e6:.1f} MB"])
-    head = ["views per scene", "time per fit", "images per hour", "GPU hours per million images", "PLY file"]
-    return table(head, body) + source
 
 
 def ranks() -> str:
