@@ -89,7 +89,6 @@ BY_HAND = {
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
-    ("scenes.md", "| fault | key"): "limits in the code",
     ("tiles.md", "| bound | margin"): "derived margins",
 }
 """Tables with numbers that no file of results holds: page, first words, reason."""
