@@ -84,12 +84,9 @@ BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
     ("evaluation.md", "| key | definition"): "definitions",
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
-    ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
     ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
-    ("scenes.md", "| fault | key"): "limits in the code",
-    ("scenes.md", "| input | limit"): "limits in the code",
     ("tiles.md", "| bound | margin"): "derived margins",
 }
 """Tables with numbers that no file of results holds: page, first words, reason."""
