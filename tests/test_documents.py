@@ -82,6 +82,7 @@ def test_the_score_of_the_quickstart_is_that_of_its_file():
 
 BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
+    ("dependencies.md", "| needed for"): "versions in names of licences",
     ("evaluation.md", "| key | definition"): "definitions",
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
     ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
