@@ -82,6 +82,7 @@ def test_the_score_of_the_quickstart_is_that_of_its_file():
 
 BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
+    ("dependencies.md", "| needed for"): "versions in names of licences",
     ("evaluation.md", "| key | definition"): "definitions",
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
     ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
@@ -177,7 +178,7 @@ def test_the_way_of_one_photograph_names_functions_that_exist():
     """Each row of its table names a file of the package and a function in it; no function comes twice."""
     text = (ROOT / "docs/architecture.md").read_text("utf-8")
     hops = re.findall(r"^\| `([\w/]+\.py)` \| `([\w.]+)` \|", text[text.index("## The way of one photograph") :], re.M)
-    assert len(hops) == len(set(hops)) > 25
+    assert len(hops) == len(set(hops)) > 20
     for file, function in hops:
         found = ast.parse((ROOT / "warpgs" / file).read_text("utf-8")).body
         for name in function.split("."):
