@@ -82,16 +82,12 @@ def test_the_score_of_the_quickstart_is_that_of_its_file():
 
 BY_HAND = {
     ("conventions.md", "| | `exact`"): "constants of other programs, each with its source",
+    ("dependencies.md", "| needed for"): "versions in names of licences",
     ("evaluation.md", "| key | definition"): "definitions",
     ("extremes.md", "| device | poisoned"): "counts of a fuzzer, which prints them and keeps no file",
-    ("farm.md", "| at about | bottleneck"): "estimates by the table above it",
-    ("install.md", "| part | size"): "sizes by du",
     ("mutation.md", "| sample | mutants run"): "counts that tools/mutation prints",
     ("presets.md", "| setting | rule"): "compared with the rule itself, below",
-    ("project.md", "| longest axis"): "errors of a float32 formula that is not in the kernels",
     ("results.md", "| method | `fern`"): "published scores, each with its source",
-    ("scenes.md", "| fault | key"): "limits in the code",
-    ("scenes.md", "| input | limit"): "limits in the code",
     ("tiles.md", "| bound | margin"): "derived margins",
 }
 """Tables with numbers that no file of results holds: page, first words, reason."""
@@ -182,7 +178,7 @@ def test_the_way_of_one_photograph_names_functions_that_exist():
     """Each row of its table names a file of the package and a function in it; no function comes twice."""
     text = (ROOT / "docs/architecture.md").read_text("utf-8")
     hops = re.findall(r"^\| `([\w/]+\.py)` \| `([\w.]+)` \|", text[text.index("## The way of one photograph") :], re.M)
-    assert len(hops) == len(set(hops)) > 25
+    assert len(hops) == len(set(hops)) > 20
     for file, function in hops:
         found = ast.parse((ROOT / "warpgs" / file).read_text("utf-8")).body
         for name in function.split("."):

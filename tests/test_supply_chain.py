@@ -47,8 +47,8 @@ def locked() -> dict[str, list[str]]:
 def table() -> dict[str, tuple[str, str]]:
     """Licence and use by name in docs/dependencies.md."""
     _, _, text = (ROOT / "docs" / "dependencies.md").read_text("utf-8").partition("|---|---|---|")
-    rows = re.findall(r"^\| ([a-z0-9-]+) \| ([^|]+) \| ([^|]+) \|$", text, re.MULTILINE)
-    return {name: (licence.strip(), use.strip()) for name, licence, use in rows}
+    rows = re.findall(r"^\| (\w+) \| ([^|]+) \| ([a-z0-9, -]+) \|$", text, re.MULTILINE)
+    return {name: (licence, use) for use, licence, names in rows for name in names.split(", ")}
 
 
 def test_the_lock_is_of_this_project():
@@ -65,9 +65,8 @@ def test_the_lock_is_of_this_project():
 
 def test_every_package_stands_in_the_table_with_its_use():
     wanted = {n: "indirect" for n in locked() if not n.startswith(NVIDIA)}
-    for extra in PROJECT["optional-dependencies"].keys() - {"dev"}:
+    for extra in PROJECT["optional-dependencies"]:
         wanted |= {plain(r): extra for r in PROJECT["optional-dependencies"][extra]}
-    wanted |= {plain(r): "tests and documents" for r in PROJECT["optional-dependencies"]["dev"]}
     wanted |= {plain(r): "fit" for r in PROJECT["dependencies"]}
     assert {n: use for n, (_, use) in table().items()} == wanted
 

@@ -57,7 +57,7 @@ quaternion is divided by its length."""
 
 COVARIANCE_TOLERANCE = 1e-5
 """Largest magnitude of a negative eigenvalue that counts as 0, as a fraction of the covariance's largest variance: 80 roundings
-of float32. A Gaussian with a lower eigenvalue is culled."""
+of float32. The eigenvalue is that of the remainder S in docs/project.md, section 9; if it is lower, the Gaussian is culled."""
 
 LARGEST_COEFFICIENT = 1e6
 """Largest magnitude of a spherical-harmonics coefficient that is read."""

@@ -19,10 +19,9 @@ from bench.lib import (
 DOCS = result_file.ROOT / "docs"
 PARTS: dict[str, Callable[[], dict[str, str]]] = {
     "accuracy.md": accuracy_page.parts,
-    "farm.md": lambda: {"packing": use_pages.packing(), "captures": use_pages.captures()},
+    "farm.md": lambda: {"packing": use_pages.packing()},
     "formats.md": lambda: {"formats": use_pages.formats()},
     "many-gpus.md": lambda: {"ranks": use_pages.ranks()},
-    "mesh.md": lambda: {"surfaces": use_pages.surfaces()},
     "method.md": lambda: {"placement": method_page.placement(), "scores": method_page.scores()},
     "performance.md": performance_page.parts,
     "results.md": lambda: {

@@ -1,15 +1,11 @@
-"""The generated parts of the pages on use: farms, several GPUs, meshes, formats."""
+"""The generated parts of the pages on use: farms, several GPUs, formats."""
 
 from __future__ import annotations
-
-import statistics
 
 from bench.lib import result_file
 from bench.lib.results_page import table
 from bench.lib.tables import markdown
 
-SCENES = {"fern:3": 3, "fern:9": 9, "horns:54": 54}
-"""Rows of the presets' result that the page on farms shows, and their training views."""
 MODELS = {
     "horns": "horns, 54 views of 504 x 378 px, {:,} Gaussians",
     "garden": "garden, 1920 x 1080 px, {:,} Gaussians",
@@ -40,20 +36,6 @@ def packing() -> str:
     return table(["`--per-gpu`", "fits per hour", "time per fit"], body) + source
 
 
-def captures() -> str:
-    """Return the table of time and size by the number of views, many fits at a time."""
-    result, source = _result("presets_h200")
-    body = []
-    for name, views in SCENES.items():
-        rows = [r for r in result["rows"] if r["row"] == name and r["preset"] == "default" and "error" not in r]
-        seconds = statistics.mean(r["setup"] + r["training"] for r in rows)
-        size = statistics.mean(r["bytes"] for r in rows)
-        hourly = rows[0]["jobs"] * views * 3600 / seconds
-        body.append([f"{views}", f"{seconds:.0f} s", f"{hourly:,.0f}", f"{1e6 / hourly:.0f}", f"{size / 1e6:.1f} MB"])
-    head = ["views per scene", "time per fit", "images per hour", "GPU hours per million images", "PLY file"]
-    return table(head, body) + source
-
-
 def ranks() -> str:
     """Return the table of steps by the number of GPUs."""
     result, source = _result("ranks_h200")
@@ -66,20 +48,6 @@ def ranks() -> str:
                 [name, f"{r['ranks']}", f"{r['step_ms']:.1f} ms", f"{r['collectives_ms']:.1f} ms", f"{r['efficiency']:.2f}"]
             )
     return table(["model", "GPUs", "step", "in collectives", "scaling efficiency"], body) + source
-
-
-def surfaces() -> str:
-    """Return the table of meshes by the depth that is fused, at the default voxel size."""
-    result, source = _result("mesh_cpu2")
-    rows = {r["depth"]: r for r in result["rows"] if r["row"] == "mesh"}  # the default comes last
-    body = []
-    for r in (rows["median"], rows["mean"]):
-        cells = [r["depth"], f"{r['triangles']:,}"]
-        for key in ("accuracy", "completeness"):
-            cells.append(f"{100 * r[f'{key}_mean_of_radius']:.2f} ({100 * r[f'{key}_median_of_radius']:.2f})")
-        body.append([*cells, f"{100 * r['completeness_within_0.01_of_radius']:.0f} %"])
-    head = ["depth", "triangles", "accuracy, mean (median)", "completeness, mean (median)", "observed points within 1 %"]
-    return table(head, body) + source
 
 
 def formats() -> str:

@@ -84,14 +84,20 @@ def moved(x):
 
 @pytest.mark.browser
 def test_a_page_tells_how_to_move_and_returns(tmp_path):
-    """The line of help stands there, no scene tree does, and the key R and the button lead back to the first view."""
+    """The line of help stands there, no scene tree does, and the key R and the button lead back to the first view.
+
+    The page says that it loads, until the scene is there.
+    """
     path = tmp_path / "scene.html"
     write_html(path, crowd(), [ring(3)[1]], title="my <scene>")
+    body = path.read_text("utf-8").partition("<body>")[2]
+    assert body.startswith('<div id="warpgs-loading"') and "Loading the scene" in body[:300]
     browser = Chromium(tmp_path)
     try:
         browser.open(path.as_uri())
         browser.wait("window.__viserMutable?.resetCameraPose && document.querySelector('canvas') !== null")
         browser.wait("document.querySelector('[aria-label$=\"scene tree\"]') !== null")
+        browser.wait("document.querySelector('#warpgs-loading') === null")
         assert browser.value("document.title") == "my <scene>" and "Drag to turn" in browser.value("document.body.innerText")
         assert browser.value("document.querySelector('[aria-label$=\"scene tree\"]').checkVisibility()") is False
         place = "JSON.stringify(__viserMutable.camera.position.toArray().map(x => Math.round(1e3 * x)))"

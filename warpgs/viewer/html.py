@@ -47,6 +47,11 @@ HELP = (
     "addEventListener('keydown',e=>{if(e.key.toLowerCase()==='r'&&!e.ctrlKey&&!e.metaKey&&!e.altKey)back()})}</script>"
 )
 """Line of help, with a button that returns to the first view; without viser's reset function, the page is reloaded."""
+LOADING = (
+    '<div id="warpgs-loading" style="position:fixed;inset:0;z-index:1;display:grid;place-items:center;pointer-events:none;'
+    'font:16px sans-serif;color:#888">Loading the scene ...</div>'
+)
+"""Text in the empty page, until `WHOLE_IMAGE` finds the first camera."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
@@ -57,7 +62,7 @@ address, which works."""
 WHOLE_IMAGE = (
     "<script>{let fov=OWN,first=true;const degrees=180/Math.PI,show=()=>{const m=window.__viserMutable,c=m?.camera,"
     "t=m?.cameraControl;if(!t||!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
-    "if(first){first=false;const a=t.azimuthAngle,p=t.polarAngle;"
+    "if(first){first=false;document.querySelector('#warpgs-loading')?.remove();const a=t.azimuthAngle,p=t.polarAngle;"
     "if(SIDE<Math.PI){t.minAzimuthAngle=a-SIDE;t.maxAzimuthAngle=a+SIDE}"
     "t.minPolarAngle=Math.max(0,p-TILT);t.maxPolarAngle=Math.min(Math.PI,p+TILT)}"
     "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
@@ -165,7 +170,7 @@ def page_of(
         notes.clear()
     if stored.shortened:
         notes.append(f"{stored.shortened:,} Gaussians are longer than the page can store, and are shown shorter")
-    text, end, rest = text.replace("<head>", head, 1).rpartition("</body>")
+    text, end, rest = text.replace("<head>", head, 1).replace("<body>", f"<body>{LOADING}", 1).rpartition("</body>")
     wide = 0.5 * cameras[0].width / float(cameras[0].K[0, 0])
     first, up = cameras[0], up_of(list(cameras), gaussians.means.detach().cpu().double().numpy())
     target = first.center + distance_ahead(first, gaussians) * np.asarray(first.viewmat[2, :3])

@@ -259,7 +259,7 @@ def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str
             trainer.load(*state)
         except DataError as e:
             raise DataError(f"{job.out}/{TENSORS}: {e}") from e
-        job.notes.append(f"continued from step {trainer.step}")
+        job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
     shared = batched_notes(job.config, job.ranks)
     job.announce([*photo_notes(job.photographs), *trainer.notes, *shared, trainer.memory.summary()])
     setup = time.perf_counter() - job.began
