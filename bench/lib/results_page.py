@@ -112,16 +112,6 @@ def strategies() -> str:
     return strategy_runs.table([r for r in result["rows"] if r["rasterizer"] != "gsplat-1.6"]) + source
 
 
-def objects() -> str:
-    """Return the table on objects cut out."""
-    result, source = _result("importance_objects_h200")
-    own = [r for r in result["rows"] if r["preset"] == "default"]
-    seeds = sorted(r["object"] for r in own)
-    psnr, alpha, empty = (statistics.mean(r[k] for r in own) for k in ("psnr_white", "alpha_object", "alpha_empty"))
-    cells = [f"{len(seeds)}, seeds {seeds[0]} to {seeds[-1]}", f"{psnr:.2f}", f"{alpha:.4f}", f"{empty:.4f}"]
-    return table(["objects", "PSNR over white", "alpha in the object", "alpha outside"], [cells]) + source
-
-
 def poses() -> str:
     """Return the table of the cost of found poses."""
     result, source = _result("found_poses_fern_cpu2")
@@ -183,8 +173,7 @@ def repeats() -> str:
 
 
 PARTS: tuple[Callable[[], str], ...] = (
-    ablation, views, coverage, strategies, objects, poses, same_image, antialiasing, meshes,
-    repeats,
+    ablation, views, coverage, strategies, poses, same_image, antialiasing, meshes, repeats,
 )  # fmt: skip
 
 
