@@ -94,7 +94,7 @@ def views() -> str:
 
 
 def coverage() -> str:
-    """Return the table of pixels and errors of `default` by how many training views saw them."""
+    """Return the tables of pixels and errors by how many training views saw them, and of pixels unseen before and now."""
     result, source = _result("coverage_h200")
     body = []
     for scene in ("fern:3", "horns:3"):
@@ -103,7 +103,13 @@ def coverage() -> str:
             shares = (statistics.mean(c[k] for c in own) for k in ("share_of_pixels", "share_of_error"))
             psnr = mean_sd([c["psnr"] for c in own])
             body.append([f"{scene.replace(':', ', ')}: {words}", *(f"{100 * share:.0f} %" for share in shares), psnr])
-    return table(["scene, views: pixels seen by", "pixels", "squared error", "PSNR"], body) + source
+    both = []
+    for scene in ("fern:3", "horns:3"):
+        own = [r for r in result["unseen_in_both"] if r["row"] == scene]
+        share = f"{100 * statistics.mean(r['share_of_pixels'] for r in own):.0f} %"
+        both.append([scene.replace(":", ", "), share, *(mean_sd([r[k] for r in own]) for k in ("before", "after"))])
+    seen = table(["scene, views: pixels seen by", "pixels", "squared error", "PSNR"], body)
+    return f"{seen}\n{table(['unseen in both fits', 'pixels', 'earlier `default`: PSNR', '`default`: PSNR'], both)}{source}"
 
 
 def strategies() -> str:
@@ -117,8 +123,9 @@ def poses() -> str:
     result, source = _result("found_poses_fern_cpu2")
     rows = {(r["poses"], r["train"]): r for r in result["rows"]}
     counts = sorted({r["train"] for r in result["rows"]})
-    body = [[words, *(mean_sd(rows[kind, n]["psnr"]) for n in counts)] for kind, words in POSES.items()]
-    return table(["poses", *(f"{n} training photographs" for n in counts)], body) + source
+    keys = {"psnr": "", "psnr_cameras_refined": ", cameras refined"}
+    body = [[words, *(mean_sd(rows[kind, n][key]) for n in counts for key in keys)] for kind, words in POSES.items()]
+    return table(["poses", *(f"{n} training photographs{more}" for n in counts for more in keys.values())], body) + source
 
 
 def same_image() -> str:
@@ -152,7 +159,7 @@ def antialiasing() -> str:
 
 def meshes() -> str:
     """Return the table of the accuracy of meshes."""
-    result, source = _result("mesh_cpu2")
+    result, source = _result("demo_mesh_cpu2")
     body = []
     for r in sorted((r for r in result["rows"] if r["row"] == "mesh"), key=lambda r: -r["voxel"]):
         if r["depth"] == "median":
