@@ -199,7 +199,7 @@ def test_strips_that_hold_too_little(tmp_path):
     pixels = bytes(range(64)) * 2
     (tmp_path / "a.tif").write_bytes(tiff(16, 8, [(0, 64), (64, 64)], pixels, rows=4))
     assert decode(tmp_path / "a.tif")[0].shape == (8, 16, 3)
-    refused(tmp_path, tiff(2000, 2000, [(0, 100)], bytes(100)), "shorter than their pixels")  # 222 bytes
+    refused(tmp_path, tiff(2000, 2000, [(0, 100)], bytes(100)), "holds too few pixels")  # 222 bytes
     refused(tmp_path, tiff(16, 8, [(0, 64), (64, 65)], pixels, rows=4), "lie outside of the file")
     refused(tmp_path, tiff(16, 8, [(0, 64), (32, 64)], pixels, rows=4), "overlap")
     refused(tmp_path, tiff(16, 8, [(0, 64)], pixels, rows=4), "has 1 strips or tiles and needs 2")

@@ -69,7 +69,8 @@ def fractional_bits(means: np.ndarray) -> int:
         bits -= 1
     if bits < 0:
         raise DataError(
-            f"SPZ coordinates must be at most 8388607, and one is {largest:.0f}; move the scene to the origin, or write .ply"
+            f"SPZ coordinates must be at most 8388607 in absolute value, and one has {largest:.0f}; move the scene to the "
+            "origin, or write .ply"
         )
     return bits
 

@@ -78,7 +78,7 @@ class _Image:
         channels, planes = self.one(CHANNELS, 1), self.one(PLANES, 1)
         depths = self.tags.get(BITS, (1,))
         if len(set(depths)) != 1 or planes not in (1, 2):
-            raise ValueError("its channels differ in depth or layout; save it as PNG")
+            raise ValueError("its channels differ in bit depth, or their layout is unknown; save it as PNG")
         bits, copies = depths[0] * (channels if planes == 1 else 1), channels if planes == 2 else 1
         if TILE_OFFSETS in self.tags:
             across, down = self.one(TILE_WIDTH), self.one(TILE_HEIGHT)
@@ -145,7 +145,7 @@ def check(data: bytes) -> None:
         if image.one(PHOTOMETRIC, 0) == YCBCR:
             raise ValueError("its colours are YCbCr; save it as PNG")
         if any(count < unpacked for _, count, unpacked in pieces):
-            raise ValueError("its strips or tiles are shorter than their pixels")
+            raise ValueError("a strip or tile holds too few pixels")
     elif compression in DEFLATE:
         _check_deflate(data, pieces)
     else:
