@@ -65,4 +65,4 @@ def scores() -> str:
         body.append([words, d.count, *means, f"{mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"])
     head = ["scene", "fits", "sampled uniformly", "sampled by all three scores", "difference"]
     files = ", ".join(f"`{file}.json`" for file in dict.fromkeys(file for file, _ in SCORED.values()))
-    return markdown(head, body, head[:1]) + f"\nSources: {files}; held-out PSNR [dB].\n"
+    return markdown(head, body, head[:1]) + f"\nSources: {files}; held-out PSNR [dB]; objects: over white.\n"
