@@ -45,7 +45,7 @@ def test_a_fit_launches_nothing_else(device, strategy, recorded, monkeypatch):
         events=True, hier=True, pm=False, sampler=SamplerConfig(fraction=0.01, min_alpha=0.05, max_fraction=0.05)
     )
     config = FitConfig(
-        steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points"),
+        steps=20, dropout=0.2, cuda_graph=recorded, init=InitConfig(source="points" if strategy == "mcmc" else "sweep"),
         optimizer=OptimizerConfig(opacities_decay=0.001),
         strategy=strategy, method=method,
         loss_terms=(DepthCorrelation(0.1, 0.5),),

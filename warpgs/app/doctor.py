@@ -179,12 +179,10 @@ def _cuda() -> Iterable[Finding]:
         return
     if not torch.cuda.is_available():
         driver = "no NVIDIA driver was found" if shutil.which("nvidia-smi") is None else "torch cannot use the driver"
+        remedy = f"install a driver that supports CUDA {torch.version.cuda}"
         if os.environ.get("CUDA_VISIBLE_DEVICES") in ("", "-1"):
-            driver = "CUDA_VISIBLE_DEVICES hides every device"
-        yield Finding(
-            "CUDA", NOTE, f"none: {driver}; {slower}",
-            f"with an NVIDIA GPU: unset CUDA_VISIBLE_DEVICES, or install a driver that supports CUDA {torch.version.cuda}",
-        )  # fmt: skip
+            driver, remedy = "CUDA_VISIBLE_DEVICES hides every device", "unset CUDA_VISIBLE_DEVICES"
+        yield Finding("CUDA", NOTE, f"none: {driver}; {slower}", f"with an NVIDIA GPU: {remedy}")
         return
     for i in range(torch.cuda.device_count()):
         p = torch.cuda.get_device_properties(i)

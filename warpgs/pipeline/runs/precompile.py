@@ -23,10 +23,13 @@ from warpgs.kernels import (
     dropout,
     knn,
     opacity_decay,
+    plane_costs,
+    plane_depths,
     project_cpu,
     project_cpu_backward,
     project_cuda,
     scanlines,
+    scanlines_cpu,
     sh,
     ssim_cpu,
     ssim_cuda,
@@ -76,6 +79,7 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
             blending.forward, blending.backward, without_depth.backward, blending.contributions,
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
             step_buffers.make_errors(),
+            plane_costs.make_kernel(), plane_depths.make_kernels().best, scanlines_cpu.make_kernel(),
             *(k for s in scoring for k in (s.forward, s.backward)), *updates,
         ]  # fmt: skip
         return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
