@@ -56,11 +56,12 @@ def test_the_page_pairs_each_method_with_its_base():
 
 
 def test_the_page_lists_scores_with_steps_that_were_not_chosen():
-    """Those on held-out views alone: the chosen number stands in the other table."""
+    """Those on held-out views alone, beside the first arm: the chosen number stands in the other table."""
     arms = (Arm("a", "default"), Arm("b", "3dgs", (10, 20)))
     rows = results("fern:3", "3dgs:steps=10", [21.0, 21.4]) + results("fern:3", "3dgs:steps=20", [20.0])
+    rows += results("fern:3", "default", [22.0, 22.0, 25.0])
     rows += [{"row": "fern:3", "preset": f"3dgs:steps={n}", "seed": 0, "left_out": "x", "psnr": float(n)} for n in (10, 20)]
-    assert other_steps_table(arms, rows, ["fern:3"]).splitlines()[2:] == ["| fern | b | 10 | 21.20 ± 0.28 (2 seeds) |"]
+    assert other_steps_table(arms, rows, ["fern:3"]).splitlines()[2:] == ["| fern | b | 10 | 21.20 ± 0.28 (2 seeds) | -0.80 |"]
 
 
 def test_every_arm_names_its_steps_once():

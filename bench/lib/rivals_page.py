@@ -85,6 +85,7 @@ def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str
     """Return held-out PSNR of the arms with numbers of steps that were not chosen; arguments are those of `arms_table`."""
     found, body = by_seed([r for r in rows if not r.get("left_out")]), []
     for name in names:
+        first = found.get((name, preset_in(rows, name, arms[0]) or ""), {})
         for arm in arms:
             for preset in (arm.with_steps(n) for n in arm.steps):
                 own = found.get((name, preset))
@@ -93,7 +94,10 @@ def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str
                     body.append(
                         [name.split(":")[0], arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"]
                     )
-    return markdown(["scene", "method", "steps", "PSNR"], body, ["scene", "method"])
+                    seeds = sorted(own.keys() & first.keys())
+                    body[-1].append(f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else "")
+    head = ["scene", "method", "steps", "PSNR", f"difference to {arms[0].words}"]
+    return markdown(head, body, ["scene", "method"])
 
 
 def other_steps() -> str:
