@@ -95,7 +95,9 @@ def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str
                         [name.split(":")[0], arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"]
                     )
                     seeds = sorted(own.keys() & first.keys())
-                    body[-1].append(f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else "")
+                    body[-1].append(
+                        f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else ""
+                    )
     head = ["scene", "method", "steps", "PSNR", f"difference to {arms[0].words}"]
     return markdown(head, body, ["scene", "method"])
 
