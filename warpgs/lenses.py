@@ -78,9 +78,10 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
 
 
 def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
-    """Return the positions in the camera [..., 3] at points in the image plane [..., 2] and depth 1; NaN if not on the lens.
+    """Return the positions at depth 1 (`depth_of`) that project to points of the image plane; NaN for points off the lens.
 
-    For an orthographic camera the result is (u, v, 1); positions (u, v, z) of all other depths share that point.
+    Shapes are [..., 2] for points and [..., 3] for positions. For an orthographic camera the result is (u, v, 1); positions
+    (u, v, z) of all other depths share that point.
 
     Raises:
         UsageError: The model is unknown here.

@@ -1,4 +1,4 @@
-"""Files below a folder, with links followed."""
+"""Checks that a path lies below a folder once its links are resolved."""
 
 from __future__ import annotations
 

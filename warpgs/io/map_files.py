@@ -204,7 +204,7 @@ def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) ->
 def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
-    Integers are divided by the largest value of their type; maps with only the levels 0, 1 and 2 are divided by 2.
+    uint8 and uint16 maps are divided by 2 if they hold only the levels 0, 1 and 2, else by the largest value of their type.
 
     Raises:
         DataError: The file is not a map, of another shape, or not in [0, 1].

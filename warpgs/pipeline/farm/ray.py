@@ -1,4 +1,4 @@
-"""The engine for clusters that Ray runs: a task for each job, with a fraction of a GPU. Extra `ray`.
+"""The engine for clusters that Ray runs: a task for each job, with a GPU or a part of one. Extra `ray`.
 
 Ray sends functions and results as pickles, so every process that its ports accept can run code as the user. A cluster that this
 module starts listens at the loopback address and accepts only processes with its token. For other clusters, the owner chooses
