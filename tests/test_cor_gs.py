@@ -1,6 +1,7 @@
 """The baseline of docs/add-a-baseline.md: two models, pruned and regularised where they disagree."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from warpgs import rasterize
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.presets import preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
@@ -26,6 +29,25 @@ def registry_as_it_was(monkeypatch):
     """What a test registers is gone after it."""
     STRATEGIES.names()
     monkeypatch.setattr(STRATEGIES, "_classes", dict(STRATEGIES._classes))
+
+
+def test_the_files_of_the_page_are_a_preset(tmp_path, monkeypatch):
+    """A loss term and a strategy in one preset, each with a setting; the fit takes a step in which the strategy acts."""
+    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
+    monkeypatch.chdir(tmp_path)
+    page = (FILE.parent.parent / "docs" / "add-a-baseline.md").read_text("utf-8")
+    for kind, name in (("toml", "rule.toml"), ("python", "my.py")):
+        (code,) = re.findall(rf"^```{kind}\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+        Path(name).write_text(code, "utf-8")
+    config, _ = preset_settings("my.py:mine")
+    (term,) = config.loss_terms
+    assert (config.init.source, config.strategy_config.every, term.weight) == ("sweep", 50, 0.02)
+    own = dataclasses.replace(config.strategy_config, every=2, min_opacity=0.09)
+    init = InitConfig(source="points")
+    config = dataclasses.replace(config, steps=4, init=init, sh_degree=0, background="black", strategy_config=own)
+    trainer = Trainer(photos(3), seeds(), config, CPU)
+    count = len(trainer.gaussians)
+    assert 0 < len(advanced(trainer, 4).gaussians) < count
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from warpgs.pipeline.runs.folder import check_same
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
-from warpgs.plugins import Registry
+from warpgs.plugins import Registry, load_object
 from warpgs.synthetic.demo import split_spec, write_demo
 
 OWN = """
@@ -106,6 +106,50 @@ def test_a_file_that_fails_is_not_half_loaded(registry, own):
         registry.load(f"{own}:Own")
     own.write_text(OWN)
     assert registry.load(f"{own}:Own").__name__ == "Own"
+
+
+def test_a_file_that_cannot_import_its_neighbour_is_told_how(registry, own):
+    """Another module that is missing keeps the usual advice."""
+    (own.parent / "neighbour_probe.py").write_text("import own_neighbour\n")
+    with pytest.raises(UsageError, match=r"give path/to/file\.py:Own"):
+        registry.load(f"{own.parent}/neighbour_probe.py:Own")
+    folder = own.parent / "sub"
+    folder.mkdir()
+    for name, text in (("own_neighbour", ""), ("probe", "import own_neighbour\n")):
+        (folder / f"{name}.py").write_text(text)
+    with pytest.raises(UsageError) as e:
+        registry.load(f"{folder / 'probe.py'}:Own")
+    assert "(No module named 'own_neighbour');" in str(e.value)
+    assert str(e.value).endswith(f"set PYTHONPATH={folder} and give probe:Own, or use one file")
+
+
+TERM = """
+from dataclasses import dataclass
+from warpgs.pipeline.train.loss import LossTerm, register
+@register("own_twice")
+@dataclass(frozen=True)
+class Twice(LossTerm):
+    pass
+"""
+
+
+@pytest.mark.parametrize("by_path_first", [True, False])
+def test_a_file_that_is_loaded_twice_is_named(tmp_path, monkeypatch, by_path_first):
+    """By its path and by an import: two classes have one name, and the message says so."""
+    LOSS_TERMS.names()
+    monkeypatch.setattr(LOSS_TERMS, "_classes", dict(LOSS_TERMS._classes))
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_twice.py").write_text(TERM)
+    (tmp_path / "own_probe.py").write_text("from own_twice import Twice\n")
+    specs = [f"{tmp_path}/own_twice.py:Twice", f"{tmp_path}/own_probe.py:Twice"]
+    first, _ = (load_object("preset", s) for s in (specs if by_path_first else specs[::-1]))
+    with pytest.raises(UsageError) as e:
+        FitConfig(loss_terms=(first(),))
+    twice = f"({tmp_path / 'own_twice.py'}, and the module own_twice)"
+    assert f"the file of the loss term Twice was loaded twice {twice}" in str(e.value)
+    assert "give own_twice:NAME instead of own_twice.py:NAME" in str(e.value)
+    for name in [n for n in sys.modules if "own_twice" in n or "own_probe" in n]:
+        del sys.modules[name]
 
 
 def test_an_unknown_name_lists_those_there_are(registry):

@@ -100,6 +100,23 @@ class Registry(Generic[T]):
         """Return whether a class itself, not only a base of it, is registered by its ``name``."""
         return self._classes.get(getattr(cls, "name", "")) is cls
 
+    def unnamed(self, cls: type) -> str:
+        """Return the message on a class that is not registered by its ``name``."""
+        other = self._classes.get(getattr(cls, "name", ""))
+        same = other is not None and other.__qualname__ == cls.__qualname__
+        modules = {k.__module__: getattr(sys.modules.get(k.__module__), "__file__", None) for k in (cls, other) if k and same}
+        files = {os.path.realpath(file) for file in modules.values() if file}
+        if len(modules) == 2 and len(files) == 1:
+            (file,), module = files, min(modules, key=lambda name: name.startswith(_PREFIX))
+            return (
+                f"the file of the {self.kind} {cls.__qualname__} was loaded twice ({file}, and the module {module}); "
+                f"give {module}:NAME instead of {Path(file).name}:NAME, or use one file"
+            )
+        return (
+            f"the {self.kind} {cls.__qualname__} has no registered name; register it "
+            f'with @register("name") of {self.base.__module__} above the class, or name it as module:Class'
+        )
+
     def find(self, name: str | type[T]) -> type[T]:
         """Return the class of a name, or the class itself.
 
@@ -158,7 +175,12 @@ def load_object(kind: str, spec: str) -> object:
     try:
         module = module_of(where)
     except (ImportError, OSError) as e:
-        raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); give path/to/file.py:{name or 'NAME'}") from e
+        advice = f"give path/to/file.py:{name or 'NAME'}"
+        if where.endswith(".py") and isinstance(e, ModuleNotFoundError) and e.name:
+            path = Path(where).absolute()
+            if path.with_name(f"{e.name}.py").is_file():
+                advice = f"set PYTHONPATH={path.parent} and give {path.stem}:{name or 'NAME'}, or use one file"
+        raise UsageError(f"the {kind} {spec!r} cannot be imported ({e}); {advice}") from e
     if not hasattr(module, name):
         raise UsageError(f"the {kind} {spec!r} does not exist: {where} does not define {name}; give a name that it defines")
     LOADED.add(module.__name__)

@@ -90,7 +90,8 @@ def test_table_is_of_these_runs(finished):
     assert [r[0] for r in figures[2:]] == ["a", "b b"]
     for row in figures[2:]:
         values = psnr[row[0]]
-        assert row[1].strip("*") == f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f}" and row[3:] == ["-", "2"]
+        count = f"{np.mean([metrics_of(request, row[0], s)['gaussians'] for s in (0, 1)]):,.0f}"
+        assert row[1].strip("*") == f"{np.mean(values):.2f} ± {np.std(values, ddof=1):.2f}" and row[3:] == ["-", count, "2"]
     d = paired_difference(psnr["b b"], psnr["a"])
     assert gaps[2][1].removesuffix(" \\*") == f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]"
     assert "LPIPS was not measured" in text and "images as stored" in text and "48 x 36 px" in text

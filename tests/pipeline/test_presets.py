@@ -77,6 +77,8 @@ def test_a_file_has_settings_of_the_strategy_and_of_loss_terms(tmp_path):
         ("stpes = 3", "my.toml: unknown setting 'stpes'; did you mean steps?"),
         ("[init]\nopacty = 3", "unknown setting 'init.opacty'; did you mean init.opacity?"),
         ("opacity = 0.1", "unknown setting 'opacity'; did you mean init.opacity?"),
+        ('strategy = "mcmc"\n[top-split]\nevery = 3', "unknown setting 'top_split.every'; did you mean mcmc.every?"),
+        ('strategy = "mcmc"\n[densty]\nevery = 3', "unknown setting 'densty.every'; did you mean density.every?"),
         ('steps = "many"', "my.toml: steps must be a whole number of 64 bits, not 'many'"),
         ("steps = 3.5", "steps must be a whole number of 64 bits, not 3.5"),
         ("steps = true", "steps must be a whole number of 64 bits, not True"),

@@ -51,6 +51,14 @@ def test_markdown_holds_means_deviations_and_differences():
     assert len({len(r) for r in figures}) == len({len(r) for r in gaps}) == 1
 
 
+def test_markdown_holds_the_number_of_gaussians():
+    """The mean over seeds, without a best one; a row without a result has none."""
+    rows = (Row("a", {"psnr": sample(BASE), "gaussians": sample([12000, 12001, 12005])}, {}), Row("b", {}, {}))
+    figures, _ = cells(markdown(table(rows=rows, base="a", metrics=(PSNR,))))
+    assert figures[0] == ["method", "PSNR ↑", "Gaussians", "seeds"]
+    assert figures[2] == ["a", "**20.10 ± 0.10**", "12,002", "3"] and figures[3] == ["b", "-", "-", "0"]
+
+
 def test_ablation_has_check_marks_in_every_notation():
     """The columns of the paper's second table."""
     t = table(switches=("Hier", "S_{rend}"))

@@ -22,7 +22,7 @@ from warpgs.pipeline.runs.results import LABELS
 from warpgs.pipeline.study.plots import Line, Panel, forest
 from warpgs.pipeline.study.qualitative import strips
 from warpgs.pipeline.study.statistics import family_confidence, paired_difference, sample
-from warpgs.pipeline.study.table import Metric, Row, Table, csv_text, latex, markdown
+from warpgs.pipeline.study.table import GAUSSIANS, Metric, Row, Table, csv_text, latex, markdown
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.report.sheet import sheet
 from warpgs.scene import View
@@ -108,8 +108,9 @@ def run_folder(request: StudyRequest, scene: str, variant: str, seed: int) -> Pa
 
 
 def _value(outcome: Outcome, key: str) -> float:
-    """Return a mean score of a run; NaN if it was not measured."""
-    value = (outcome.metrics or {}).get("test", {}).get(key)
+    """Return a mean score of a run, or its number of Gaussians; NaN if it was not measured."""
+    metrics = outcome.metrics or {}
+    value = (metrics if key == GAUSSIANS else metrics.get("test", {})).get(key)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
@@ -154,6 +155,8 @@ def _table(request: StudyRequest, runs: Runs, scenes: list[str], metrics: tuple[
             common = sorted(ours.keys() & theirs.keys())
             if name != base:
                 differences[m.key] = paired_difference([ours[s] for s in common], [theirs[s] for s in common], confidence)
+        if counts := _by_seed(runs, scenes, name, GAUSSIANS, request.seeds):
+            samples[GAUSSIANS] = sample(list(counts.values()))
         exercised = name == base or not _same_files(request, runs, scenes, name, base)
         rows.append(Row(name, samples, differences, request.marks.get(name, ()), exercised))
     return Table(caption, base, metrics, tuple(rows), tuple(SWITCHES.values()) if request.marks else ())

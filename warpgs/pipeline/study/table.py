@@ -9,6 +9,8 @@ from dataclasses import dataclass
 
 from warpgs.pipeline.study.statistics import Difference, Sample
 
+GAUSSIANS = "gaussians"
+"""Name of the number of Gaussians in `Row.samples` and in result files."""
 NONE = "-"
 """Sign for a value that was not measured."""
 MAX_DIGITS = 6
@@ -43,7 +45,7 @@ class Row:
     name: str
     """Name of the variant."""
     samples: dict[str, Sample]
-    """Mean and deviation by metric; a metric that is missing was not measured."""
+    """Mean and deviation by metric, and of the number of Gaussians; one that is missing was not measured."""
     differences: dict[str, Difference]
     """Paired difference to the table's base by metric; empty for the base itself."""
     marks: tuple[bool, ...] = ()
@@ -128,10 +130,14 @@ def markdown(table: Table) -> str:
         text = figure(s, m.digits)
         return f"**{text}**" if s is not None and round(s.mean, m.digits) == table.best(m) else text
 
+    def count(row: Row) -> str:
+        return f"{row.samples[GAUSSIANS].mean:,.0f}" if GAUSSIANS in row.samples else NONE
+
     marks = [_plain(s) for s in table.switches]
-    head = ["row" if marks else "method", *marks, *(f"{m.label} {m.arrow}" for m in table.metrics), "seeds"]
+    counts = ["Gaussians"] if any(GAUSSIANS in r.samples for r in table.rows) else []
+    head = ["row" if marks else "method", *marks, *(f"{m.label} {m.arrow}" for m in table.metrics), *counts, "seeds"]
     body = [
-        [r.name, *("✓" if m else "✗" for m in r.marks), *(cell(r, m) for m in table.metrics),
+        [r.name, *("✓" if m else "✗" for m in r.marks), *(cell(r, m) for m in table.metrics), *(count(r) for _ in counts),
          str(max((s.count for s in r.samples.values()), default=0))]
         for r in table.rows
     ]  # fmt: skip

@@ -161,10 +161,7 @@ def check_terms(terms: Sequence[LossTerm]) -> None:
         if not isinstance(term, LossTerm):
             raise UsageError(f"{term!r} is not a loss term: give an instance of a class that derives from warpgs.LossTerm")
         if not LOSS_TERMS.has(kind):
-            raise UsageError(
-                f"the loss term {kind.__qualname__} has no registered name; register it "
-                'with @register("name") of warpgs.pipeline.train.loss above the class, or name it as module:Class'
-            )
+            raise UsageError(LOSS_TERMS.unnamed(kind))
         unknown = [n for n in term.needs_outputs if n not in OUTPUTS]
         if unknown:
             raise UsageError(

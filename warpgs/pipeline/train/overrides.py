@@ -212,11 +212,14 @@ def _typed(value: Any, hint: Any, name: str) -> Any:
 def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
     """Return the message on an unknown setting, with the most similar name in the user's spelling."""
     known = {keyword(n) if keywords else n: n for n in setting_names(config)}
-    last = [k for k, n in known.items() if n.rpartition(".")[2] == name]  # as in `opacity` for `init.opacity`
     groups = {n.partition(".")[0] for n in known.values() if "." in n}
     if name in groups:
         return (
             f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
         )
+    last = [k for k, n in known.items() if n.rpartition(".")[2] == name.rpartition(".")[2]]  # `opacity` for `init.opacity`
+    if "." in name:  # `other.every` for `mcmc.every`, but only if `other` is not similar to a group
+        own = {n for n, (path, _) in _leaves(config).items() if path[0] in ("strategy_config", *PARTS)}
+        last = [k for k in last if known[k] in own and not did_you_mean(name.partition(".")[0], groups)]
     hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
     return f"{place}: unknown setting {name[:60]!r}; {hint}"

@@ -157,9 +157,6 @@ def check_modules(modules: Sequence[ViewModule]) -> None:
                 f"{module!r} is not a view module: give an instance of a class that derives from warpgs.ViewModule"
             )
         if not VIEW_MODULES.has(kind):
-            raise UsageError(
-                f"the view module {kind.__qualname__} has no registered name; register it "
-                'with @register("name") of warpgs.pipeline.train.view_modules.base above the class, or name it as module:Class'
-            )
+            raise UsageError(VIEW_MODULES.unnamed(kind))
         if any(type(m) is kind for m in modules[:i]):
             raise UsageError(f"the view module {module.name!r} is given twice; remove one")
