@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     Array = np.ndarray | torch.Tensor
 
 
+@document_fields
 @dataclass(frozen=True)
 class Camera:
     """One camera, or a batch of C cameras that share an image size and a camera model.
@@ -38,16 +39,14 @@ class Camera:
     model: str = "pinhole"
     """Name of the camera model: pinhole, orthographic, opencv, fisheye (docs/rasterizer.md), or one of your own."""
     distortion: Array | None = None
-    """Coefficients of the model, shape [P] (shared by all cameras) or [C, P]; None for models without coefficients. An opencv
-    camera has k1 k2 p1 p2 k3 k4 k5 k6, a fisheye k1 to k4; zeros mean an ideal lens. Coefficients get no gradients: a
-    tensor that requires gradients is an error."""
+    """Coefficients, shape [P] (shared by all cameras) or [C, P]; None for models without coefficients. opencv has k1 k2 p1 p2
+    k3 k4 k5 k6, fisheye k1 to k4; zeros mean an ideal lens. A tensor that requires gradients is an error."""
 
     @property
     def center(self) -> np.ndarray:
         """Camera centre in the world [u], shape [..., 3] (numpy cameras only)."""
         R, t = self.viewmat[..., :3, :3], self.viewmat[..., :3, 3]
-        center: np.ndarray = -np.einsum("...ij,...i->...j", R, t)
-        return center
+        return np.asarray(-np.einsum("...ij,...i->...j", R, t))
 
 
 DEPTH_KINDS = ("metric", "relative", "disparity")
@@ -66,6 +65,7 @@ class GivenDepth:
     """Confidence in each value, in [0, 1], float32, shape [H, W]; None for 1 everywhere."""
 
 
+@document_fields
 @dataclass(frozen=True)
 class View:
     """An image with its camera."""
@@ -81,8 +81,7 @@ class View:
     score_mask: np.ndarray | None = None
     """True where a render is scored, bool, shape [H, W]; the fit does not use it. None to score by ``mask``."""
     alpha: np.ndarray | None = None
-    """Opacity of the subject, in [0, 1], float32, shape [H, W]; ``image`` shows it over the scene's background. None if the
-    image is opaque."""
+    """Opacity of the subject, which ``image`` shows over the background; [0, 1], float32, shape [H, W]. None if opaque."""
     alpha_estimated: bool = False
     """True if ``alpha`` was estimated from a black background: it then selects the pixels that start Gaussians and are scored.
     The loss does not use it, because dark parts of the object may count as background."""
@@ -127,6 +126,7 @@ class Normalization:
     """Scene units per file unit."""
 
 
+@document_fields
 @dataclass(frozen=True)
 class Scene:
     """A scene: views, points and notes, in the conventions of docs/conventions.md."""
@@ -224,6 +224,7 @@ class ViewDepth:
         return float(self.valid.mean())
 
 
+@document_fields
 @dataclass(frozen=True)
 class Gaussians:
     """A set of N Gaussians with the parameters that a fit optimises; the kernels apply exp, sigmoid and normalisation."""
@@ -257,6 +258,7 @@ class Gaussians:
         return Gaussians(**{name: t.to(device) for name, t in self.tensors().items()})
 
 
+@document_fields
 @dataclass(frozen=True)
 class ActivatedGaussians:
     """A set of N Gaussians given by scales and opacities, for `rasterize`; fits and files use `Gaussians`.
@@ -291,14 +293,12 @@ class ActivatedGaussians:
         return {"means": self.means, "quats": self.quats, "scales": self.scales, "opacities": self.opacities, "sh": sh}
 
     def stored(self) -> Gaussians:
-        """Return the same N Gaussians by log scales and logits.
-
-        Scale 0 becomes -inf and opacity 1 becomes inf; no file format stores these.
-        """
+        """Return the same N Gaussians by log scales and logits: scale 0 becomes -inf, opacity 1 inf, which no file stores."""
         means, quats, scales, opacities, sh = self.tensors().values()
         return Gaussians(means, quats, scales.log(), opacities.logit(), sh)
 
 
+@document_fields
 @dataclass(frozen=True)
 class CovarianceGaussians:
     """A set of N Gaussians given by covariances and opacities, for `rasterize`; fits and files use `Gaussians`."""

@@ -75,7 +75,7 @@ def test_coefficients_of_another_number_are_refused():
     for wrong in (None, cam.K.new_zeros(3)):
         with pytest.raises(UsageError, match=f"'{NAME}' takes 4 coefficients of distortion, found {0 if wrong is None else 3}"):
             rasterize(cloud(3), dataclasses.replace(cam, distortion=wrong))
-    with pytest.raises(UsageError, match="'pinhole' takes 0 coefficients of distortion, found 4"):
+    with pytest.raises(UsageError, match=r"'pinhole' takes no distortion, found 4 coefficients.* model=.fisheye. \(4\)"):
         rasterize(cloud(3), dataclasses.replace(cam, model="pinhole"))
     learned = dataclasses.replace(cam, distortion=cam.K.new_zeros(4).requires_grad_())
     with pytest.raises(UsageError, match="gradients of distortion coefficients are not supported"):

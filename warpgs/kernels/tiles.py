@@ -14,6 +14,7 @@ from warpgs.kernels.tiles_emit import EACH, make_emit, make_find_ranges
 from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries, sums_fit
 from warpgs.runtime import interop
 from warpgs.runtime.allocator import TORCH, Allocator
+from warpgs.runtime.byte_units import format_bytes
 from warpgs.runtime.device_memory import available_bytes, installed_bytes
 from warpgs.runtime.sorting import sort_pairs
 from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
@@ -137,10 +138,10 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
     budget = available_bytes(device) * 4 // 5 if budget_bytes is None else budget_bytes
     if countable and needed <= budget:
         return
-    limit = f"{budget / 2**30:.2f} GiB" if countable else f"{MAX_INSTANCES:,} instances"
+    limit = format_bytes(budget) if countable else f"{MAX_INSTANCES:,} instances"
     raise ResourceError(
         f"{visible:,} visible Gaussians touch {total / max(visible, 1):.0f} of {tiles} tiles on average; their {total:,} "
-        f"(Gaussian, tile) instances need {needed / 2**30:.2f} GiB, and the limit is {limit}. Many Gaussians are probably far "
+        f"(Gaussian, tile) instances need {format_bytes(needed)}, and the limit is {limit}. Many Gaussians are probably far "
         "too large: check their scales, or render smaller images, fewer cameras at once, or raise the memory budget."
     )
 
