@@ -48,10 +48,13 @@ HELP = (
 )
 """Line of help, with a button that returns to the first view; without viser's reset function, the page is reloaded."""
 LOADING = (
-    '<div id="warpgs-loading" style="position:fixed;inset:0;z-index:1;display:grid;place-items:center;pointer-events:none;'
+    '<div id="warpgs-loading" style="position:fixed;inset:0;z-index:2;display:grid;place-items:center;pointer-events:none;'
     'font:16px sans-serif;color:#888">Loading the scene ...</div>'
+    "<script>{let tries=600;const text=document.querySelector('#warpgs-loading'),wait=()=>{let shown=0;"
+    "window.__viserMutable?.scene?.traverse(o=>{shown=Math.max(shown,o.material?.uniforms?.transitionInState?.value??0)});"
+    "if(shown>0.5||!--tries)text.remove();else setTimeout(wait,100)};wait()}</script>"
 )
-"""Text in the empty page, until `WHOLE_IMAGE` finds the first camera."""
+"""Text in the empty page until viser fades the Gaussians in, at most for a minute of trying."""
 SORT_FROM_DISK = (
     "<script>{const make=URL.createObjectURL;URL.createObjectURL="
     "b=>b instanceof Blob&&b.type.startsWith('text/javascript')?'':make.call(URL,b)}</script>"
@@ -62,7 +65,7 @@ address, which works."""
 WHOLE_IMAGE = (
     "<script>{let fov=OWN,first=true;const degrees=180/Math.PI,show=()=>{const m=window.__viserMutable,c=m?.camera,"
     "t=m?.cameraControl;if(!t||!c||Math.abs(c.fov-fov*degrees)>1e-3)return requestAnimationFrame(show);"
-    "if(first){first=false;document.querySelector('#warpgs-loading')?.remove();const a=t.azimuthAngle,p=t.polarAngle;"
+    "if(first){first=false;const a=t.azimuthAngle,p=t.polarAngle;"
     "if(SIDE<Math.PI){t.minAzimuthAngle=a-SIDE;t.maxAzimuthAngle=a+SIDE}"
     "t.minPolarAngle=Math.max(0,p-TILT);t.maxPolarAngle=Math.min(Math.PI,p+TILT)}"
     "fov=2*Math.atan(Math.max(Math.tan(OWN/2),WIDE*innerHeight/innerWidth));c.fov=fov*degrees;c.updateProjectionMatrix()};"
