@@ -111,13 +111,14 @@ def table(rows: list[dict]) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Measure, keep a row for each fit and print the table; return 1 if a fit failed."""
     a = parse(
-        __doc__, arguments, need=("out",), objects=10, first=100, formats=list(FORMATS), presets=["default"], seeds=1, views=24,
-        size=400, jobs=1, seconds=math.inf, device="auto", out=Path,
+        __doc__, arguments, need=("out",), objects=10, first=100, formats=list(FORMATS), presets=["default"], seeds=1,
+        first_seed=0, views=24, size=400, jobs=1, seconds=math.inf, device="auto", out=Path,
     )  # fmt: skip
     device = choose_device(a.device)[0]
     tasks = [
         Task(a.first + i, form, preset, seed, a.views, a.size, str(device))
-        for seed in range(a.seeds) for i in range(a.objects) for form in a.formats for preset in a.presets
+        for seed in range(a.first_seed, a.first_seed + a.seeds)
+        for i in range(a.objects) for form in a.formats for preset in a.presets
     ]  # fmt: skip
     rows = measure_all(measure, tasks, functools.partial(compile_all, tuple(a.presets), str(device)), a, WHAT, device, line)
     print(table(rows))

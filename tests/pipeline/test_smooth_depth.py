@@ -14,7 +14,7 @@ from tests.scenes import photos, seeds, view_stub
 from warpgs.errors import UsageError
 from warpgs.pipeline.model.init import InitConfig
 from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.by_views import FEW, SMOOTH_STEPS, SMOOTH_VIEWS, settings_by_views, steps_by_views
+from warpgs.pipeline.train.by_views import FEW, SMOOTH_STEPS, settings_by_views, steps_by_views
 from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
 from warpgs.pipeline.train.loss_terms.smooth_depth import BOUND, CONFIRMED, EDGE, SmoothDepth, depth_roughness
@@ -76,7 +76,7 @@ def test_confirmed_pixels_count_less():
 
 @pytest.mark.parametrize(
     ("views", "alpha", "weight"),
-    [(3, None, 1.0), (SMOOTH_VIEWS, None, 1.0), (SMOOTH_VIEWS + 1, None, 0.0), (3, 1.0, 0.5), (SMOOTH_VIEWS + 1, 1.0, 0.0)],
+    [(3, None, 1.0), (4, None, 1.0), (5, None, 0.0), (3, 1.0, 1.0), (8, 1.0, 1.0), (9, 1.0, 0.0)],
 )
 def test_few_views_have_the_term(views, alpha, weight):
     """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""

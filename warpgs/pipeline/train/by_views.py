@@ -32,9 +32,9 @@ photographs cannot distinguish a view-dependent colour from an error of the shap
 OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
 """Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
 were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
-SMOOTH_WEIGHT, ALPHA_SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 0.5, 4, 3000
-"""Weights of the roughness of rendered depth, for opaque views and for views with alpha; and the largest number of views and
-the least number of steps with this term. The term lowers PSNR with 9 views, and does not help in 480 steps
+SMOOTH_WEIGHT, SMOOTH_VIEWS, ALPHA_SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 8, 3000
+"""Weight of the roughness of rendered depth; the largest numbers of opaque views and of views with alpha, and the least number
+of steps with this term. The term lowers PSNR with 9 opaque views, and does not help in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
@@ -150,9 +150,8 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
             sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
     loss = config.loss
     if loss.smooth_weight is None:
-        smooth = views <= SMOOTH_VIEWS and steps >= SMOOTH_STEPS
-        weight = SMOOTH_WEIGHT if opaque else ALPHA_SMOOTH_WEIGHT
-        loss = dataclasses.replace(loss, smooth_weight=weight if smooth else 0.0)
+        smooth = views <= (SMOOTH_VIEWS if opaque else ALPHA_SMOOTH_VIEWS) and steps >= SMOOTH_STEPS
+        loss = dataclasses.replace(loss, smooth_weight=SMOOTH_WEIGHT if smooth else 0.0)
     made = dataclasses.replace(
         config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init, optimizer=optimizer,
         method=method, loss=loss, stopping=stopping,
