@@ -76,7 +76,7 @@ def test_confirmed_pixels_count_less():
 
 @pytest.mark.parametrize(
     ("views", "alpha", "weight"),
-    [(3, None, 1.0), (4, None, 1.0), (5, None, 0.0), (3, 1.0, 1.0), (8, 1.0, 1.0), (9, 1.0, 0.0)],
+    [(3, None, 1.0), (4, None, 1.0), (5, None, 0.0), (3, 1.0, 0.5), (8, 1.0, 0.5), (9, 1.0, 0.0)],
 )
 def test_few_views_have_the_term(views, alpha, weight):
     """In fits of at least 3000 steps, so not where a CPU limits them; what is given holds, and other presets have none."""

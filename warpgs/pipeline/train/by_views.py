@@ -10,7 +10,7 @@ import math
 
 from warpgs.pipeline.model.init import extrapolates
 from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
 from warpgs.runtime.terminal import Detail
 from warpgs.scene import View
 
@@ -32,10 +32,12 @@ photographs cannot distinguish a view-dependent colour from an error of the shap
 OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
 """Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
 were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
-SMOOTH_WEIGHT, SMOOTH_VIEWS, ALPHA_SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 8, 3000
-"""Weight of the roughness of rendered depth; the largest numbers of opaque views and of views with alpha, and the least number
-of steps with this term. The term lowers PSNR with 9 opaque views, and does not help in 480 steps
+SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
+"""Weight of the roughness of rendered depth for opaque views, and the largest number of such views and the least number of
+steps with this term. The term lowers PSNR with 9 views, and does not help in 480 steps
 (docs/decisions/024-smooth-depth.md)."""
+ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS = 0.5, 8
+"""Weight of the roughness for views with alpha, and the largest number of such views with this term."""
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
 of opacities with such points. Fits with more views or fewer steps were not measured
@@ -105,15 +107,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
         train: Training views.
         device: Kind of device, cpu or cuda: on a CPU the steps are limited to a time, unless ``cpu_limit`` is off.
     """
-    views, optimizer = len(train), config.optimizer
-    if optimizer.scales_lr is None:
-        lr = SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER
-        optimizer = dataclasses.replace(optimizer, scales_lr=float(f"{lr:.3g}"))
-    if optimizer.opacities_lr is None:
-        lr = min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3))
-        optimizer = dataclasses.replace(optimizer, opacities_lr=float(f"{lr:.3g}"))
-    if optimizer.average_last is None:
-        optimizer = dataclasses.replace(optimizer, average_last=AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0)
+    views = len(train)
     opaque = all(v.alpha is None for v in train)
     one_layer = views <= ONE_LAYER_VIEWS
     method = config.method
@@ -132,10 +126,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     if config.steps is None and config.cpu_limit and device == "cpu":
         pixels = config.batch * max(v.camera.width * v.camera.height for v in train)
         steps, limit = steps_on_cpu(wanted, views, pixels_of_steps(wanted, half, pixels) * (1.0 if method.hier else ONE_LAYER))
-    rates = {"means_lr": MEANS_LR, "sh_lr": SH_LR}
-    if limit and views > CPU_RATES_VIEWS:
-        rates = {n: float(f"{CPU_RATES * rate:.3g}") for n, rate in rates.items()}
-    optimizer = dataclasses.replace(optimizer, **{n: rate for n, rate in rates.items() if getattr(optimizer, n) is None})
+    optimizer = _rates_by_views(config.optimizer, views, bool(limit))
     init = config.init
     if init.extrapolate is None:
         init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
@@ -150,8 +141,7 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
             sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
     loss = config.loss
     if loss.smooth_weight is None:
-        smooth = views <= (SMOOTH_VIEWS if opaque else ALPHA_SMOOTH_VIEWS) and steps >= SMOOTH_STEPS
-        loss = dataclasses.replace(loss, smooth_weight=SMOOTH_WEIGHT if smooth else 0.0)
+        loss = dataclasses.replace(loss, smooth_weight=_smooth_weight_by_views(views, opaque, steps))
     made = dataclasses.replace(
         config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init, optimizer=optimizer,
         method=method, loss=loss, stopping=stopping,
@@ -159,6 +149,31 @@ def settings_by_views(config: FitConfig, train: list[View], device: str) -> tupl
     words = _words_of_choices(config, made, wanted)
     named = Detail(f"settings for {views} views: {', '.join(words)}") if words else ""
     return made, [note for note in (named, limit) if note]
+
+
+def _rates_by_views(optimizer: OptimizerConfig, views: int, limited: bool) -> OptimizerConfig:
+    """Return the settings with the automatic learning rates and the fraction of averaged steps chosen.
+
+    Args:
+        optimizer: Settings.
+        views: Number of training views.
+        limited: Whether the time limit on a CPU shortens the fit.
+    """
+    factor = CPU_RATES if limited and views > CPU_RATES_VIEWS else 1.0
+    chosen = {
+        "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
+        "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
+        "means_lr": factor * MEANS_LR,
+        "sh_lr": factor * SH_LR,
+        "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
+    }
+    return dataclasses.replace(optimizer, **{n: float(f"{v:.3g}") for n, v in chosen.items() if getattr(optimizer, n) is None})
+
+
+def _smooth_weight_by_views(views: int, opaque: bool, steps: int) -> float:
+    """Return the weight of the roughness of rendered depth."""
+    weight, most = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
+    return weight if views <= most and steps >= SMOOTH_STEPS else 0.0
 
 
 def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
