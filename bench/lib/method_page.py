@@ -9,16 +9,15 @@ from bench.lib.arms import SCORES
 from bench.lib.tables import markdown, mean_sd
 from warpgs.pipeline.study.statistics import family_confidence, paired_difference
 
-RESULT = "importance_h100"
+RESULT = "importance_h200"
 ARMS = {
-    "uniform/default:method.sampler.max_fraction=2,method.ra=false": "none",
-    "uniform+log/default:method.sampler.max_fraction=2": "at pixels with consistent depth, sampled uniformly",
-    "warped/default:method.sampler.max_fraction=2": "the same number, sampled by the gain in the training photographs",
-    "oracle gain/default:method.sampler.max_fraction=2": (
-        "the same number, sampled by the gain in the third photograph itself (an oracle)"
-    ),
+    "own/default:method.events=false": "none",
+    "uniform+log/default": "at pixels with consistent depth, sampled uniformly",
+    "residual/default": "the same, sampled by the residual",
+    "warped/default": "the same, sampled by the gain in the training photographs",
+    "oracle gain/default": "the same, sampled by the gain in the third photograph itself (an oracle)",
 }
-"""Arms of the study in words. In that of the first, the score was taken for constant, so that it placed nothing."""
+"""Arms of the study in words."""
 SCENES = ("fern", "horns")
 
 
@@ -40,7 +39,7 @@ SCORED = {
     "`horns`, 3": ("ladder_h200", "horns:3"),
     "`fox`, 8": ("importance_scores_h200", "fox:8"),
     "`temple`, 4": ("importance_scores_h200", "temple:4"),
-    "synthetic objects, 8": ("importance_objects_h200", None),
+    "synthetic objects, 8, without smooth depth": ("importance_objects_h200", None),
 }
 """Result file and row of each scene; the fits of objects differ in the object instead of the seed."""
 
