@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 MAX_COMPARED = 60
 """Letters of a mistyped name that are compared."""
@@ -12,6 +13,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     plain = {name.lstrip("-"): name for name in known}  # dashes would make all short flags alike
     near = difflib.get_close_matches(word.lstrip("-")[:MAX_COMPARED], plain, 1)
     return f"did you mean {plain[near[0]]}?" if near else ""
+
+
+def similar_folder(path: Path) -> str:
+    """Return `did_you_mean` for the name of a missing folder among the folders beside it."""
+    return did_you_mean(path.name, [p.name for p in path.parent.glob("*") if p.is_dir()])
 
 
 def install_extras(*names: str) -> str:

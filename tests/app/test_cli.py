@@ -234,7 +234,11 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     assert "not understood" in failure(capsys, 2, "fit", str(scene), "--out", str(tmp_path / "d"), "--split", "third:3")
     assert "holds no run" in failure(capsys, 3, "eval", str(tmp_path))
     assert "no such folder" in failure(capsys, 3, "eval", str(tmp_path / "nowhere"))
-    assert "no such file or folder" in failure(capsys, 3, "view", str(tmp_path / "nowhere"))
+    assert "no such file or folder; give a run" in failure(capsys, 3, "view", str(tmp_path / "nowhere"))
+    (tmp_path / "my-run").mkdir()
+    for command, *others in (("fit", "--out", out), ("eval",), ("view",)):
+        said = failure(capsys, 3, command, str(tmp_path / "my-ran"), *others)
+        assert "my-ran: no such f" in said and said.endswith("; did you mean my-run?")
     nowhere = tmp_path / "nowhere.safetensors"
     assert "cannot be read (No such file or directory); give" in failure(capsys, 3, "doctor", "--repeat", str(nowhere))
     said = failure(capsys, 2, "convert", str(run), "a b.ply")

@@ -23,7 +23,7 @@ from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader, ima
 from warpgs.io.score_masks import FOLDER, add_score_masks
 from warpgs.io.unread_formats import unread_note
 from warpgs.scene import Normalization, Scene, View
-from warpgs.suggestion import did_you_mean
+from warpgs.suggestion import similar_folder
 
 
 def load_scene(
@@ -148,8 +148,7 @@ def _check_folder(root: Path) -> None:
     if root.is_file():
         raise DataError(f"{root}: is a file; give a folder of photographs, or of images with their cameras")
     if not root.is_dir():
-        beside = [p.name for p in root.parent.glob("*") if p.is_dir()]
-        hint = did_you_mean(root.name, beside) or "give a folder of photographs, or of images with their cameras"
+        hint = similar_folder(root) or "give a folder of photographs, or of images with their cameras"
         raise DataError(f"{root}: no such folder; {hint}")
 
 

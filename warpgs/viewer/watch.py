@@ -20,6 +20,7 @@ from warpgs.pipeline.runs.request import choose_device
 from warpgs.report.progress import waiting
 from warpgs.runtime.terminal import say
 from warpgs.scene import Gaussians
+from warpgs.suggestion import similar_folder
 from warpgs.viewer.content import Content, content_of_file, content_of_run, modified, views_of
 from warpgs.viewer.server import PORT, address, open_server, require_viser, stop_server
 from warpgs.viewer.window import Window
@@ -53,7 +54,8 @@ def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None 
     elif not path.name.lower().endswith(tuple(suffixes())) or not path.is_file():
         known = ", ".join(suffixes())
         what = f"is neither a run folder ({CONFIG} in it) nor a file of Gaussians ({known})"
-        remedy = "give a run folder or a file of Gaussians" if not path.exists() else "give one of these"
+        near = similar_folder(path) or "give a run folder or a file of Gaussians"
+        remedy = "give one of these" if path.exists() else near
         raise DataError(f"{path}: {what if path.exists() else 'no such file or folder'}; {remedy}")
     require_viser()
     with contextlib.suppress(KeyboardInterrupt):

@@ -30,6 +30,7 @@ from warpgs.pipeline.train.config import FitConfig
 from warpgs.poses.record import JSON as POSES
 from warpgs.runtime.folder_lock import check_free, hold_folder
 from warpgs.scene import Camera, Gaussians, Normalization, Scene
+from warpgs.suggestion import similar_folder
 from warpgs.version import __version__
 
 CONFIG = "config.json"
@@ -135,7 +136,8 @@ def read_record(folder: Path) -> dict[str, Any]:
         record = schema.read(path, folder)
     except FileNotFoundError as e:
         lack = f"holds no run ({CONFIG} is missing)" if folder.is_dir() else "no such folder"
-        raise DataError(f"{folder}: {lack}; give a folder that `warpgs fit --out` filled") from e
+        near = "" if folder.is_dir() else similar_folder(folder)
+        raise DataError(f"{folder}: {lack}; {near or 'give a folder that `warpgs fit --out` filled'}") from e
     except NotADirectoryError as e:
         raise DataError(f"{folder}: is a file, not the folder of a run; give a folder that `warpgs fit --out` filled") from e
     except (OSError, schema.SchemaError) as e:
