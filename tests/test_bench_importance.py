@@ -25,6 +25,8 @@ def test_ranks_and_lift():
     assert spearman(torch.ones(4), values) == 0
     truth = torch.tensor([0.0, 0.0, 1.0, 3.0])
     assert lift(truth, truth, 0.25) == 3 and lift(-truth, truth, 0.25) == 0
+    assert lift(torch.ones(4), truth, 0.25) == 1
+    assert lift(torch.tensor([5.0, 1.0, 1.0, 1.0]), truth, 0.5) == pytest.approx(2 / 3)
 
 
 def test_slopes_are_those_of_the_squared_error():

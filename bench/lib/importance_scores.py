@@ -264,8 +264,10 @@ def spearman(score: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 def lift(score: torch.Tensor, truth: torch.Tensor, fraction: float) -> float:
-    """Return the ratio of the mean truth of the candidates with the highest scores [K] to that of all; ties are shuffled."""
-    order = torch.argsort(score + 1e-9 * score.abs().max() * torch.rand(len(score)).to(score), descending=True)
-    top = order[: max(1, round(fraction * len(score)))]
+    """Return the mean truth of the candidates with the highest scores [K], divided by that of all; equal scores share it."""
+    count = max(1, round(fraction * len(score)))
+    least = score.topk(count).values[-1]
+    above, equal = score > least, score == least
+    top = float(truth[above].sum()) + (count - int(above.sum())) * float(truth[equal].mean())
     mean = float(truth.mean())
-    return float(truth[top].mean()) / mean if mean else math.nan
+    return top / count / mean if mean else math.nan

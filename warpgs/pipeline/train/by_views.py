@@ -32,12 +32,12 @@ photographs cannot distinguish a view-dependent colour from an error of the shap
 OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
 """Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
 were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
-SMOOTH_WEIGHT, SMOOTH_VIEWS, SMOOTH_STEPS = 1.0, 4, 3000
-"""Weight of the roughness of rendered depth for opaque views, and the largest number of such views and the least number of
-steps with this term. The term lowers PSNR with 9 views, and does not help in 480 steps
+SMOOTH_STEPS, SMOOTH_WEIGHT, SMOOTH_VIEWS = 3000, 1.0, 4
+"""Fewest planned steps of a fit with the roughness of rendered depth in its loss; the weight of this term for opaque
+views; and the largest number of such views. The term does not help in 480 steps, and lowers PSNR with 9 opaque views
 (docs/decisions/024-smooth-depth.md)."""
 ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS = 0.5, 8
-"""Weight of the roughness for views with alpha, and the largest number of such views with this term."""
+"""Weight of the roughness for views with alpha, and the largest number of such views (docs/decisions/024-smooth-depth.md)."""
 EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
 """Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
 of opacities with such points. Fits with more views or fewer steps were not measured
@@ -171,7 +171,13 @@ def _rates_by_views(optimizer: OptimizerConfig, views: int, limited: bool) -> Op
 
 
 def _smooth_weight_by_views(views: int, opaque: bool, steps: int) -> float:
-    """Return the weight of the roughness of rendered depth."""
+    """Return the weight of the roughness of rendered depth.
+
+    Args:
+        views: Number of training views.
+        opaque: Whether no view has an alpha channel.
+        steps: Planned steps of the fit.
+    """
     weight, most = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
     return weight if views <= most and steps >= SMOOTH_STEPS else 0.0
 
