@@ -1,6 +1,7 @@
 """Suggestions in messages: the known name nearest to a mistyped one, and how to install an extra."""
 
 import difflib
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -17,7 +18,11 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 def similar_folder(path: Path) -> str:
     """Return `did_you_mean` for the name of a missing folder among the folders beside it."""
-    return did_you_mean(path.name, [p.name for p in path.parent.glob("*") if p.is_dir()])
+    try:
+        with os.scandir(path.parent) as entries:
+            return did_you_mean(path.name, [e.name for e in entries if e.is_dir()])
+    except OSError:  # without the folder around it there is nothing to suggest
+        return ""
 
 
 def install_extras(*names: str) -> str:
