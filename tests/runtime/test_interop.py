@@ -1,5 +1,6 @@
 """Launches are cut into ranges that cover every item once; arguments are checked by name."""
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 import warp as wp
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
@@ -23,7 +25,9 @@ from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.step_buffers import Setting
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
+from warpgs.render.rasterize import rasterize
 from warpgs.runtime import interop, sorting
+from warpgs.scene import Gaussians
 
 
 @wp.kernel(enable_backward=False)
@@ -258,7 +262,7 @@ def test_a_thread_launches_with_its_own_arguments(monkeypatch):
 
 
 FORKED = """
-import os, signal, threading
+import os, signal, sys
 from tests.gaussians import camera, cloud
 from warpgs.render.rasterize import rasterize
 import torch
@@ -269,7 +273,7 @@ child = os.fork()
 if child == 0:
     signal.alarm(20)
     os._exit(0 if torch.equal(rasterize(g, cam).rgb, image) else 3)
-print(threading.active_count() > 1, os.waitpid(child, 0)[1])
+print(len(sys._current_frames()) > 1, os.waitpid(child, 0)[1])
 """
 
 
@@ -280,38 +284,168 @@ def test_a_forked_process_launches_in_threads_of_its_own():
     assert found.stdout.split() == ["True", "0"], found.stderr
 
 
-def test_an_interrupt_waits_for_the_threads(monkeypatch):
-    """Else they would go on in memory that the caller frees, with arguments that the next launch writes."""
-    begun, working = threading.Event(), []
+def interrupted_at(number: int, call) -> bool:
+    """Run ``call`` with a Ctrl-C where Python looks for one for the n-th time; return whether it came that far.
 
-    class Interrupted:
-        def __init__(self, work):
-            self.work = work
+    Python looks at the begin of a function and after a call into C.
+    """
+    left = number
 
-        def result(self):
-            begun.set()
+    def profile(frame, event, _):
+        nonlocal left
+        left -= event in ("call", "c_return")
+        if left == 0:
+            sys.setprofile(None)
             raise KeyboardInterrupt
 
-        def __getattr__(self, name):
-            return getattr(self.work, name)
+    sys.setprofile(profile)
+    try:
+        call()
+    except KeyboardInterrupt:
+        return True
+    finally:
+        sys.setprofile(None)
+    return False
 
-    def submit(run):
-        def late():
-            begun.wait(10)
-            run()
-            threading.Event().wait(0.1)  # the ranges are done: the caller works on them, too
 
-        working.append(pool.submit(late))
-        return Interrupted(working[-1])
+def test_an_interrupt_at_any_time_leaves_no_thread_at_work(monkeypatch):
+    """The caller frees the memory that the threads use, and the next launch writes their arguments anew."""
+    torch.set_num_threads(2)
+    pool, handed = interop._Pool(1), []
+
+    def submit(work):
+        handed.append(work)
+        pool.submit(work)
+
+    monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
+
+    def launched():
+        visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
+        handed.clear()
+        try:
+            interop.launch(mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+        finally:
+            shared = interop._OF_THREAD.shared
+            assert shared is None or not handed or (shared.ended and not shared.open and not shared.working)
+        return visits
+
+    launched()
+    number = 0
+    while interrupted_at(number := number + 1, launched):
+        assert bool((launched() == 1).all())  # the launch after it is whole
+    assert number > 50
+
+
+def test_queued_work_that_begins_late_touches_nothing(monkeypatch):
+    """An interrupt between the queue and its thread: the range is processed by nobody, and not in freed memory."""
+    queued = []
+
+    def submit(work):
+        queued.append(work)
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(interop, "_pool", lambda *_: SimpleNamespace(submit=submit))
     torch.set_num_threads(2)
     visits, firsts = torch.zeros(2, 30_000, dtype=torch.int32).unbind()
-    with ThreadPoolExecutor(2) as pool, pytest.raises(KeyboardInterrupt):
-        try:
-            interop.launch(mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
-        finally:
-            assert len(working) == 1 and all(work.done() for work in working)
+    with pytest.raises(KeyboardInterrupt):
+        interop.launch(mark, 30_000, [interop.view(t, wp.int32) for t in (visits, firsts)], torch.device("cpu"))
+    (late,) = queued
+    late()
+    assert not visits.any()
+
+
+def test_a_second_interrupt_waits_too(monkeypatch):
+    """It comes while the first one waits for a thread, which is still at work."""
+    begun, ended, finish, finished = threading.Event(), threading.Event(), interop._SharedLaunch.finish, []
+
+    def work(shared):
+        if threading.current_thread() is threading.main_thread():
+            begun.wait(10)
+            raise KeyboardInterrupt("first")
+        begun.set()
+        ended.wait(10)
+
+    def interrupted(shared):
+        if not finished:
+            finished.append("interrupted")
+            raise KeyboardInterrupt("second")
+        ended.set()
+        finish(shared)
+        finished.append(shared.working)
+
+    monkeypatch.setattr(interop._SharedLaunch, "work", work)
+    monkeypatch.setattr(interop._SharedLaunch, "finish", interrupted)
+    monkeypatch.setattr(interop, "_OF_THREAD", interop._OfThread())
+    torch.set_num_threads(2)
+    arguments = [interop.view(torch.zeros(30_000, dtype=torch.int32), wp.int32) for _ in range(2)]
+    with pytest.raises(KeyboardInterrupt, match="second"):
+        interop.launch(mark, 30_000, arguments, torch.device("cpu"))
+    assert finished == ["interrupted", 0]
+
+
+def test_an_error_of_another_thread_is_raised(monkeypatch):
+    """A launch that failed there is not taken for a whole one."""
+    work, failed = interop._SharedLaunch.work, threading.Event()
+
+    def fails(shared):
+        if threading.current_thread() is not threading.main_thread():
+            failed.set()
+            raise MemoryError
+        failed.wait(10)
+        work(shared)
+
+    monkeypatch.setattr(interop._SharedLaunch, "work", fails)
+    torch.set_num_threads(2)
+    arguments = [interop.view(torch.zeros(30_000, dtype=torch.int32), wp.int32) for _ in range(2)]
+    with pytest.raises(MemoryError):
+        interop.launch(mark, 30_000, arguments, torch.device("cpu"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (torch.zeros(3, dtype=torch.float64), "visits must be torch.int32 on cpu, not torch.float64 on cpu"),
+        (torch.zeros(3, dtype=torch.int32, device="meta"), "visits must be torch.int32 on cpu, not torch.int32 on meta"),
+    ],
+)
+def test_a_recorded_launch_checks_type_and_device(wrong, message):
+    """Kernels would read other numbers, or no memory."""
+    rest = interop.view(torch.zeros(3, dtype=torch.int32), wp.int32)
+    interop.launch(mark, 3, [interop.view(torch.zeros(3, dtype=torch.int32), wp.int32), rest], torch.device("cpu"))
+    with pytest.raises(TypeError, match=message):
+        interop.launch(mark, 3, [interop.view(wrong, wp.int32), rest], torch.device("cpu"))
+
+
+def test_another_type_at_the_same_address_is_seen():
+    """A tensor of 32-bit integers read as floats: same address, same shape."""
+    numbers, rest = torch.zeros(3, dtype=torch.int32), interop.view(torch.zeros(3, dtype=torch.int32), wp.int32)
+    interop.launch(mark, 3, [interop.view(numbers, wp.int32), rest], torch.device("cpu"))
+    with pytest.raises(TypeError, match=r"not torch.float32 on cpu"):
+        interop.launch(mark, 3, [interop.view(numbers.view(torch.float32), wp.int32), rest], torch.device("cpu"))
+
+
+def test_devices_without_kernels_are_refused_by_name():
+    """Before a launch is looked up: meta stands for mps, xpu and the others."""
+    g, cam = cloud(30), camera(dtype=torch.float32)
+    rasterize(g, cam)
+    with pytest.raises(ValueError, match=r"means is on meta, but the kernels run on cpu and cuda only"):
+        rasterize(g.to("meta"), cam)
+    with pytest.raises(ValueError, match=r"camera.K is on meta, but the kernels"):
+        rasterize(g, dataclasses.replace(cam, K=cam.K.to("meta")))
+    with pytest.raises(ValueError, match="mark: the kernels run on cpu and cuda only, not on meta"):
+        interop.launch(mark, 3, [], torch.device("meta"))
+
+
+@pytest.mark.filterwarnings("ignore:Accessing the data pointer of FakeTensor")
+def test_fake_tensors_are_refused():
+    """They have a device and no memory; under their mode every new tensor is one."""
+    g, cam = cloud(30), camera(dtype=torch.float32)
+    rasterize(g, cam)
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        with pytest.raises(ValueError, match="means is a fake tensor, without memory"):
+            rasterize(Gaussians(**{n: mode.from_tensor(t) for n, t in g.tensors().items()}), cam)
+        with pytest.raises(TypeError, match="not a FakeTensor without memory"):
+            rasterize(g, cam)
 
 
 def test_a_launch_that_failed_is_recorded_anew(monkeypatch):

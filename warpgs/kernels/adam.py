@@ -220,7 +220,7 @@ def adam_step(
     if param.is_cuda and param.dtype == torch.float32:
         # one kernel for this and for captured steps, so that both give the same bits
         skip = torch.zeros(1, dtype=torch.int32, device=param.device)
-        on_device = torch.tensor(lrs, device=param.device)
+        on_device = torch.tensor(lrs, device=param.device, dtype=torch.float32)
         adam_scheduled(param, grad, exp_avg, exp_avg_sq, on_device, skip, betas=betas, eps=eps, head=head)
         return
     _update(param, grad, exp_avg, exp_avg_sq, lrs, head, betas, eps)

@@ -297,10 +297,10 @@ def plane_costs(
     shapes = np.array([(s, g.shape[1], g.shape[0]) for s, g in zip(starts, others)], np.int32)
     blocks = padded // PLANES
     tasks = -(-height // ROWS) * blocks
-    ring = torch.empty(tasks * (window * pitch + 3 * (pitch + 2 * radius)), dtype=torch.int32)
-    totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32)
-    found = torch.empty(tasks * ROWS * PLANES * pitch, dtype=torch.int16)
-    costs = torch.empty(height, width, padded, dtype=torch.int16)
+    ring = torch.empty(tasks * (window * pitch + 3 * (pitch + 2 * radius)), dtype=torch.int32, device="cpu")
+    totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32, device="cpu")
+    found = torch.empty(tasks * ROWS * PLANES * pitch, dtype=torch.int16, device="cpu")
+    costs = torch.empty(height, width, padded, dtype=torch.int16, device="cpu")
     h = torch.from_numpy(homographies.astype(np.float32).ravel())
     view = interop.view
     inputs = [

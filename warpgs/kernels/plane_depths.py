@@ -104,7 +104,7 @@ def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
         inverses: Inverse depths of the D planes, evenly spaced, at least three, shape [D].
     """
     height, width, padded = costs.shape
-    found = torch.empty(height, width, dtype=torch.float64)
+    found = torch.empty(height, width, dtype=torch.float64, device="cpu")
     inputs = [
         interop.view(costs.reshape(-1, padded), wp.int16), len(inverses), float(inverses[0]),
         float(inverses[1] - inverses[0]), interop.view(found.view(-1), wp.float64),
@@ -139,7 +139,7 @@ def check_round_trip(
     Returns:
         Mask, bool, shape [H, W].
     """
-    agrees = torch.empty(own.shape, dtype=torch.uint8)
+    agrees = torch.empty(own.shape, dtype=torch.uint8, device="cpu")
     rotation, translation = geometry.relative_pose(first, second)
     center = -geometry.matmul(rotation.T, translation[:, None])[:, 0]
     maps = [interop.view(torch.from_numpy(np.ascontiguousarray(a)), wp.float64) for a in (own, found, sensitivity)]

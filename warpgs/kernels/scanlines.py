@@ -116,7 +116,7 @@ def _on_cpu(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small
     total, padded = torch.empty_like(costs, memory_format=torch.contiguous_format), planes + more
     flat = [interop.view(t.contiguous().view(-1), wp.int16) for t in (costs, total)]
     for fresh, (lines, length, steps, bounds, edges) in zip((1, 0), _ways(height, width, down, across)):
-        path = torch.empty(lines * 2 * (padded + 2 * scanlines_cpu.LANES), dtype=torch.int16)
+        path = torch.empty(lines * 2 * (padded + 2 * scanlines_cpu.LANES), dtype=torch.int16, device="cpu")
         inputs = [
             flat[0], interop.view(bounds.contiguous().view(-1), wp.int32), small, padded, *steps, length, *edges, fresh,
             interop.view(path, wp.int16), flat[1],

@@ -214,7 +214,8 @@ def export_network(request: ExportRequest, out: Path) -> list[str]:
         raise DataError(
             f"{request.model}: {weight / 2**30:.1f} GiB of weights do not fit into one ONNX file; choose a smaller network"
         )
-    image = torch.rand(1, 3, request.size, request.size, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    generator = torch.Generator().manual_seed(0)
+    image = torch.rand(1, 3, request.size, request.size, generator=generator, dtype=torch.float32, device="cpu") * 2 - 1
     output = "disparity" if request.model == "dpt" else "scores"
     with torch.no_grad():
         wanted = network(image).numpy()

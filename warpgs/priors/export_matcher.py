@@ -113,7 +113,7 @@ def build_matcher() -> torch.nn.Module:
             highest = (heat == max_pool2d(heat, WINDOW, 1, WINDOW // 2)) & (heat > THRESHOLD)
             scores, at = torch.topk(torch.where(highest, heat * reliable, torch.zeros_like(heat)).flatten(), KEYPOINTS)
             zeros = torch.zeros_like(heat[0, 0])
-            columns, rows = zeros + torch.arange(width), zeros + torch.arange(height)[:, None]
+            columns, rows = zeros + torch.arange(width, device="cpu"), zeros + torch.arange(height, device="cpu")[:, None]
             places = torch.stack([columns.flatten()[at], rows.flatten()[at]], 1) + 0.5
             on_grid = torch.stack([places[:, 0] / width, places[:, 1] / height], 1) * 2 - 1
             found = grid_sample(normalize(features, dim=1), on_grid[None, None], mode="bicubic", align_corners=False)
@@ -146,7 +146,7 @@ def export_matcher(out: Path) -> list[str]:
     from torch.export import Dim
 
     network = build_matcher()
-    image = torch.rand(1, 3, *TRIAL, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(1, 3, *TRIAL, generator=torch.Generator().manual_seed(0), dtype=torch.float32, device="cpu")
     sizes = {2: 32 * Dim("rows", min=3, max=LARGEST), 3: 32 * Dim("columns", min=3, max=LARGEST)}
     with torch.no_grad():
         wanted = [t.numpy() for t in network(image)]

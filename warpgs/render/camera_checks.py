@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE
+from warpgs.runtime import interop
 from warpgs.scene import Camera
 
 
@@ -46,13 +47,15 @@ def check_arrays(camera: Camera) -> None:
 
 
 def _check_type(name: str, array: Any) -> None:
-    """Raise TypeError where a value is not a dense array of real numbers."""
+    """Raise TypeError where a value is not a dense array of real numbers, and ValueError for a device without kernels."""
     if not isinstance(array, (np.ndarray, torch.Tensor)):
         raise TypeError(
             f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"
         )
-    if isinstance(array, torch.Tensor) and array.layout != torch.strided:
-        raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
+    if isinstance(array, torch.Tensor):
+        interop.check_device(f"camera.{name}", array)
+        if array.layout != torch.strided:
+            raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
     if str(array.dtype).removeprefix("torch.") in ("float16", "bfloat16"):
         raise TypeError(f"camera.{name} must be float32 or float64, not {array.dtype}: its rounding would shift the image")
     real = not array.is_complex() if isinstance(array, torch.Tensor) else array.dtype.kind in "fiub"

@@ -117,9 +117,10 @@ def _check_arguments(gaussians: RasterizedGaussians, camera: Camera, options: Ra
 
 
 def _check_tensor(name: str, value: Any) -> None:
-    """Raise TypeError where a value is not a tensor."""
+    """Raise TypeError where a value is not a tensor, and ValueError for a device without kernels."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{name} must be a tensor, not {type(value).__name__}; torch.as_tensor makes one")
+    interop.check_device(name, value)
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
@@ -180,6 +181,11 @@ class _Layer(NamedTuple):
     """Values behind the scene, shape [C, D]."""
 
 
+def _as_tensor(values: Any) -> torch.Tensor:
+    """Return numbers as a tensor, where they are or on the CPU, whatever torch's default device."""
+    return torch.as_tensor(values, device=getattr(values, "device", "cpu"))
+
+
 def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: ProjectInputs) -> _Layer:
     """Return channels [..., D] with their background (one, a batch, or None for zeros); ``name`` is the background's option.
 
@@ -191,7 +197,7 @@ def _layer(name: str, background: Any, colors: torch.Tensor | None, inputs: Proj
     if background is None:  # outside of the try block: a full GPU is not a wrong background
         background = like.new_zeros(channels)
     try:
-        values = torch.as_tensor(background)
+        values = _as_tensor(background)
     except (RuntimeError, TypeError, ValueError) as e:
         raise TypeError(f"{name} must be numbers, shape [{channels}] or [C, {channels}], not {background!r}") from e
     if values.is_complex():
@@ -322,7 +328,7 @@ def _error_bound(rgb: torch.Tensor, gaussians: RasterizedGaussians, camera: Came
     reference = RasterizeOptions(**doubled(options) | only_rgb | {"rule": "exact", "error_bound": False, "record": False})
     found = rasterize(type(gaussians)(**doubled(gaussians)), Camera(**doubled(camera)), reference)
     colors = found.projected[..., 6:9] if reference.colors is None else reference.colors
-    background = found.rgb.new_zeros(1) if reference.background is None else torch.as_tensor(reference.background).to(found.rgb)
+    background = found.rgb.new_zeros(1) if reference.background is None else _as_tensor(reference.background).to(found.rgb)
     largest = torch.cat([colors.reshape(-1), background.reshape(-1)]).abs().amax()
     bound = (rgb - found.rgb).abs().amax(-1) + BOUND_ROUNDING * largest
     return torch.nextafter(bound.to(rgb.dtype), torch.full_like(bound, torch.inf, dtype=rgb.dtype))

@@ -144,7 +144,7 @@ class GraphPool:
             with torch.no_grad():
                 # holds the shared memory, which torch would not reuse once the last graph is gone
                 if self._keeper is None:
-                    self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device), self._aside)
+                    self._keeper = CapturedGraph(lambda: torch.zeros(1, device=self.device, dtype=torch.float32), self._aside)
                 return CapturedGraph(work, self._aside, self._keeper.pool())
         finally:
             here.wait_stream(self._aside)

@@ -26,21 +26,28 @@ class _NotTwice(torch.autograd.Function):
 def keep(ctx: Any, *tensors: torch.Tensor | None) -> None:
     """Save tensors of any shape [...] for the backward pass, in which `kept` returns them."""
     ctx.save_for_backward(*tensors)
-    ctx.shapes = [None if t is None else t.shape for t in tensors]
+    hooked = torch._C._autograd._top_saved_tensors_default_hooks(True) is not None  # may return copies
+    ctx.places = [None if t is None else (t.shape, t.dtype, t.device, None if hooked else t.data_ptr()) for t in tensors]
 
 
 def kept(ctx: Any) -> tuple[Any, ...]:
     """Return the tensors [...] that `keep` saved.
 
     Raises:
-        RuntimeError: A tensor has another shape now. The kernels would read and write out of bounds.
+        RuntimeError: The ``.data`` of a tensor was replaced, which autograd does not track. The gradient would be wrong, and
+            with another shape or type the kernels would read and write out of bounds.
     """
     tensors = ctx.saved_tensors
-    for tensor, shape in zip(tensors, ctx.shapes, strict=True):
-        if tensor is not None and tensor.shape != shape:  # through `.data`, which autograd does not track
+    for tensor, place in zip(tensors, ctx.places, strict=True):
+        if tensor is None:
+            continue
+        shape, dtype, device, address = place
+        now = tensor.shape, tensor.dtype, tensor.device
+        if now != (shape, dtype, device) or (address is not None and tensor.data_ptr() != address):
+            before, after = (f"{list(s)} {t} on {d}" for s, t, d in ((shape, dtype, device), now))
             raise RuntimeError(
-                f"a tensor had the shape {list(shape)} in the forward pass, and now has {list(tensor.shape)}: replace .data "
-                "after the backward pass, or render again"
+                f"the .data of a tensor was replaced between the forward and the backward pass ({before}, now {after}): "
+                "replace it after the backward pass, or render again"
             )
     return tuple(tensors)
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import ctypes
 import functools
 import os
 import threading
-from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
 from typing import NamedTuple
 
 import torch
 import warp as wp
+from torch._subclasses.fake_tensor import FakeTensor
 
 from warpgs.errors import ResourceError
 from warpgs.runtime.kernel_cache import prepare_kernel_cache
@@ -60,6 +62,14 @@ def _check_size(size: int) -> None:
         )
 
 
+def check_device(name: str, tensor: torch.Tensor) -> None:
+    """Raise ValueError unless kernels can read the memory of a tensor [...]: on a CPU or a CUDA device, and allocated."""
+    if not (tensor.is_cpu or tensor.is_cuda):
+        raise ValueError(f"{name} is on {tensor.device}, but the kernels run on cpu and cuda only; .to('cpu') moves it")
+    if type(tensor) is not torch.Tensor and isinstance(tensor, FakeTensor):
+        raise ValueError(f"{name} is a fake tensor, without memory; leave FakeTensorMode before the call")
+
+
 def real_of(tensor: torch.Tensor) -> type:
     """Return the Warp scalar type of a tensor, float32 or float64.
 
@@ -76,9 +86,29 @@ def set_threads(count: int) -> None:
     torch.set_num_threads(count)
 
 
+class _Pool:
+    """Threads that make the calls of a queue.
+
+    The locks of `concurrent.futures` and of `threading.Thread.start` can stay locked after an interrupt; the queue's cannot.
+    """
+
+    def __init__(self, count: int):
+        self.calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        for _ in range(count):
+            _thread.start_new_thread(self._serve, ())
+
+    def submit(self, call: Callable[[], None]) -> None:
+        """Let the next free thread make a call, which must not raise."""
+        self.calls.put(call)
+
+    def _serve(self) -> None:
+        while True:
+            self.calls.get()()
+
+
 @functools.cache
-def _pool(count: int, process: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="warpgs")
+def _pool(count: int, process: int) -> _Pool:
+    return _Pool(count)
 
 
 class View(NamedTuple):
@@ -220,7 +250,7 @@ class _Recorded:
 
     def __init__(self, kernel, device: torch.device, block_dim: int):
         self.kernel, self.device, self.block_dim = kernel, warp_device(device), block_dim
-        self.command, self.known = None, []
+        self.command, self.known, self.dtypes = None, [], []
         self.lock = threading.Lock()  # autograd launches from a thread of its own
 
     def launch(self, count: int, inputs: Sequence, stream: wp.Stream) -> None:
@@ -231,6 +261,10 @@ class _Recorded:
         """Return the recorded launch with these arguments; the first call records it."""
         if self.command is None:
             load_module(self.kernel.module, self.device, self.block_dim)
+            self.dtypes = [a.tensor.dtype if isinstance(a, View) else None for a in inputs]
+            for i, a in enumerate(inputs):
+                if isinstance(a, View):
+                    self._check(i, a.tensor)
             own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
             where = {"device": self.device, "block_dim": self.block_dim}
             command = wp.launch(self.kernel, count, inputs=[0, *own], record_cmd=True, **where)
@@ -249,10 +283,17 @@ class _Recorded:
             # In a loop most arguments are those of the call before, memory addresses included.
             if type(value) is View:
                 tensor = value.tensor
-                address, shape, before = tensor.data_ptr(), tensor.shape, known[i]
+                address, shape, dtype, before = tensor.data_ptr(), tensor.shape, tensor.dtype, known[i]
                 strided = value.axes in (0, 2) and value.row_stride()  # others are contiguous
-                if before is not None and before[0] == address and before[1] == shape and before[2] == strided:
+                if (
+                    before is not None
+                    and before[0] == address
+                    and before[1] == shape
+                    and before[2] == strided
+                    and before[3] is dtype
+                ):
                     continue
+                self._check(i, tensor)
                 packed = command.params[i + 2]  # after the bounds and ``begin``
                 seen = value.shape()
                 for size in seen[: packed.ndim]:
@@ -263,7 +304,7 @@ class _Recorded:
                     packed.shape[axis] = seen[axis]
                 if packed.ndim == 2:
                     packed.strides[0] = (strided or tensor.stride(0)) * tensor.element_size()
-                known[i] = (address, shape, strided)
+                known[i] = (address, shape, strided, dtype)
             elif known[i] != value:
                 if _is_struct(value):
                     ctypes.pointer(command.params[i + 2])[0] = value.__ctype__()  # copies its numbers
@@ -272,6 +313,16 @@ class _Recorded:
                 else:  # vectors and matrices
                     command.set_param_at_index(i + 1, value)
                 known[i] = value
+
+    def _check(self, i: int, tensor: torch.Tensor) -> None:
+        """Raise TypeError unless argument i, a tensor [...], has the recorded scalar type, and memory on the device."""
+        kind, dtype = "cuda" if self.device.is_cuda else "cpu", tensor.dtype
+        if dtype is self.dtypes[i] and tensor.device.type == kind and (tensor.data_ptr() or not tensor.numel()):
+            return
+        label = self.kernel.adj.args[i + 1].label  # after ``begin``
+        fake = isinstance(tensor, FakeTensor)
+        found = "a FakeTensor without memory" if fake else f"{dtype} on {tensor.device}"
+        raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
 
 
 @functools.cache
@@ -284,9 +335,84 @@ class _OfThread(threading.local):
 
     def __init__(self):
         self.recorded: dict[object, _Recorded] = {}
+        self.shared: _SharedLaunch | None = None  # the last launch, if an interrupt may have left threads at work
 
 
 _OF_THREAD = _OfThread()
+
+
+class _SharedLaunch:
+    """A recorded CPU launch whose ranges several threads process.
+
+    The threads work in raw memory of the caller, so `run` leaves none at work, on whatever way it ends. A thread that starts
+    after the end finds ``open`` False and touches nothing.
+    """
+
+    def __init__(self, kernel, recorded: wp.Launch, count: int, chunks: int, inputs: Sequence):
+        self.kernel, self.recorded, self.count, self.chunks = kernel, recorded, count, chunks
+        self.inputs = inputs  # keeps their memory
+        self.left = iter(range(chunks))  # each thread processes the next range after finishing one
+        self.open, self.ended, self.working, self.error = True, False, 0, None
+        # Only `with` statements of raw locks are safe from interrupts: Condition and Event may stay locked.
+        self.lock = threading.Lock()
+        self.busy = threading.Lock()  # held while other threads work
+
+    def run(self, pool: _Pool, helpers: int) -> None:
+        """Process all ranges on this thread and at most ``helpers`` others."""
+        try:
+            for _ in range(helpers):
+                pool.submit(self.help)
+            self.work()  # here, too: each hand-over costs processor time
+        finally:
+            interrupt = None
+            while not self.ended:
+                try:  # around the call, since an interrupt may come before its first line
+                    self.finish()
+                except BaseException as error:  # a second Ctrl-C
+                    interrupt = error
+            if interrupt is not None:
+                raise interrupt
+        if self.error is not None:
+            raise self.error
+
+    def help(self) -> None:
+        """Process ranges on another thread, unless the launch has ended."""
+        with self.lock:
+            if not self.open:
+                return
+            self.working += 1
+            if self.working == 1:
+                self.busy.acquire()
+        try:
+            self.work()
+        except BaseException as error:
+            self.error = error
+        finally:
+            with self.lock:
+                self.working -= 1
+                if self.working == 0:
+                    self.busy.release()
+
+    def work(self) -> None:
+        """Process ranges until none is left."""
+        first, count, chunks = self.recorded, self.count, self.chunks
+        # a recorded launch of its own for each thread, which shares the packed arrays
+        bounds, begin = type(first.bounds)((count,)), type(first.params[1])(0)
+        params = [bounds, begin, *first.params[2:]]
+        command = wp.Launch(self.kernel, first.device, hooks=first.hooks, params=params, bounds=bounds)
+        for i in self.left:
+            begin.value, end = count * i // chunks, count * (i + 1) // chunks
+            bounds.shape[0] = bounds.size = end - begin.value
+            command.launch()
+
+    def finish(self) -> None:
+        """Let no thread begin another range, and wait for those at work."""
+        for _ in self.left:  # some are left after an error or an interrupt
+            pass
+        with self.lock:
+            self.open = False
+        with self.busy:
+            self.ended = True
 
 
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
@@ -312,6 +438,11 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
         with _current(device):
             _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
         return
+    if device.type != "cpu":
+        raise ValueError(f"{kernel.key}: the kernels run on cpu and cuda only, not on {device}")
+    if _OF_THREAD.shared is not None:
+        _OF_THREAD.shared.finish()
+        _OF_THREAD.shared = None
     # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
     if wp.config.mode == "debug":
         with _LOADING:
@@ -334,27 +465,9 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     warn_if_spinning()
     each = CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2
     chunks = min(count, threads * each, max(threads, 2 * count * cost // SERIAL_WORK))
-    left = iter(range(chunks))  # each thread processes the next range after finishing one
-
-    def run() -> None:
-        # a recorded launch of its own for each thread, which shares the packed arrays
-        bounds, begin = type(first.bounds)((count,)), type(first.params[1])(0)
-        command = wp.Launch(kernel, first.device, hooks=first.hooks, params=[bounds, begin, *first.params[2:]], bounds=bounds)
-        for i in left:
-            begin.value, end = count * i // chunks, count * (i + 1) // chunks
-            bounds.shape[0] = bounds.size = end - begin.value
-            command.launch()
-
-    working: list[Future[None]] = []
-    try:
-        for _ in range(min(threads, chunks) - 1):
-            working.append(_pool(threads - 1, os.getpid()).submit(run))
-        run()  # here, too: each hand-over costs processor time
-        for work in working:
-            work.result()
-    except BaseException:  # on an interrupt, too, since the caller frees memory that the threads use
-        wait(working)
-        raise
+    _OF_THREAD.shared = _SharedLaunch(kernel, first, count, chunks, inputs)
+    _OF_THREAD.shared.run(_pool(threads - 1, os.getpid()), min(threads, chunks) - 1)
+    _OF_THREAD.shared = None
 
 
 @functools.cache
@@ -383,6 +496,7 @@ def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
             raise TypeError(f"{name} must be dense, not {tensor.layout}; {name}.to_dense() converts it")
         if first is None:
             first_name, first = name, tensor
+            check_device(name, tensor)
             if tensor.dtype not in REALS:
                 raise TypeError(f"{name} must be float32 or float64, not {tensor.dtype}; {name}.float() converts it")
         if tensor.dtype != first.dtype:

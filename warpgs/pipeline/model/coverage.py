@@ -71,7 +71,7 @@ def fisher(gaussians: Gaussians, cameras: list[Camera], options: RasterizeOption
     for camera in cameras:
         rgb = rasterize(Gaussians(**leaves), camera, options).rgb
         for probe in range(PROBES):
-            signs = (2 * torch.randint(2, rgb.shape, generator=generator) - 1).to(rgb)
+            signs = (2 * torch.randint(2, rgb.shape, generator=generator, device="cpu") - 1).to(rgb)
             wanted = [leaves["means"], leaves["log_scales"]]
             v_means, v_scales = torch.autograd.grad(rgb, wanted, signs, retain_graph=probe + 1 < PROBES)
             total += ((v_means * width).square().sum(1) + v_scales.square().sum(1)) / PROBES

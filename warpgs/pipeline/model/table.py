@@ -39,7 +39,7 @@ class DensityUpdate:
     """Indices of the surviving rows in ascending order, int64, shape [S]."""
     added: Mapping[str, torch.Tensor] = field(default_factory=dict)
     """New rows of each parameter, shape [A, ...]; their moments start at zero. Empty if no row is added."""
-    parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    parents: torch.Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64, device="cpu"))
     """Index, before the change, of the parent of each new row, -1 without a parent, int64, shape [A]."""
     columns: Mapping[str, float] = field(default_factory=dict)
     """Initial values by column, by default the column's ``fill``. New rows take them if they have no parent, or if the column

@@ -56,7 +56,7 @@ def filtered(
         UsageError: A filter is invalid, or needs the cameras of a run.
     """
     rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
-    keep, lines = torch.ones(len(gaussians), dtype=torch.bool), []
+    keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
     if filters.crop is not None:
         keep = inside(gaussians, box_of(filters.crop))
         lines.append(f"{int((~keep).sum()):,} Gaussians outside the box are left out")

@@ -105,11 +105,12 @@ def repeated(bundle: Bundle) -> tuple[StepPlan, Forward]:
     def group(name: str) -> dict[str, torch.Tensor]:
         return {n.removeprefix(f"{name}."): t for n, t in tensors.items() if n.startswith(f"{name}.")}
 
+    number = torch.tensor(plain["number"], dtype=torch.int64, device=device)
     mask, alpha = (None if n not in tensors else tensors[n][None] for n in ("mask", "alpha"))
     distortions = tensors["distortion"][None] if "distortion" in tensors else K.new_empty(1, 0)
     views = ViewStack(
         tensors["viewmat"][None], K, distortions, plain["camera_model"], tensors["image"][None], mask,
-        {n: t[None] for n, t in group("maps").items()}, torch.tensor([plain["number"]], device=device), alpha,
+        {n: t[None] for n, t in group("maps").items()}, number[None], alpha,
     )  # fmt: skip
     given = {n: f"maps.given_{n}" in tensors for n in ("depth", "normals")}
     terms = tuple(t for t in terms_of(config, plain["cutout"], **given) if t.active(plain["step"], config.steps))

@@ -51,7 +51,8 @@ def given_figures(
             rows["depth"].append(_row(view.name, at, off))
         if NORMALS in maps:
             given = maps[NORMALS]
-            camera = replace(view.camera, viewmat=torch.eye(4), K=torch.as_tensor(view.camera.K, dtype=torch.float32))
+            K = torch.from_numpy(view.camera.K).float()
+            camera = replace(view.camera, viewmat=torch.eye(4, dtype=torch.float32, device="cpu"), K=K)
             found = depth_normals(camera, torch.as_tensor(np.where(shown, depth, 0), dtype=torch.float32)).numpy()
             at = given.any(-1)
             both = at & found.any(-1)

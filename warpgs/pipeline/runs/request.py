@@ -128,6 +128,8 @@ def choose_device(name: str | torch.device) -> tuple[torch.device, str]:
         device = torch.device("cuda" if name == "auto" and torch.cuda.is_available() else name.replace("auto", "cpu"))
     if device.type == "cpu":
         return device, f"on the CPU, {torch.get_num_threads()} thread{'s' if torch.get_num_threads() > 1 else ''}"
+    if device.type != "cuda":
+        raise UsageError(f"device {device} has no kernels: give auto, cpu, cuda or cuda:N")
     if not torch.cuda.is_available():
         raise ResourceError(
             "--device cuda: torch finds no CUDA device; run `warpgs doctor` for the reason, or use --device cpu"

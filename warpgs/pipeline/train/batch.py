@@ -129,7 +129,7 @@ class BatchSteps:
         self.learned, self.buffers, self.tree, self.options = learned, buffers, tree, options
         self.slots = StepBuffers(buffers.device, 1, steps_at_once(tree.batch) * len(tree.slots))
         """Settings and results of this process's slots, step by step."""
-        self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device)
+        self.said = torch.zeros(FLAGS + tree.batch, device=buffers.device, dtype=torch.float32)
         """Sums of the slots' losses, errors and flags in the last step, or in the step that a slot stopped."""
         self.told_to_stop = False
         """True if this process was asked to stop; the next step tells all other processes."""

@@ -43,7 +43,7 @@ class Blocks:
 
     def pixels(self, device: torch.device) -> tuple[torch.Tensor, torch.Tensor]:
         """Return rows and columns of all pixels, int64, each of shape [B, side, side] once broadcast."""
-        along = torch.arange(self.side)
+        along = torch.arange(self.side, device="cpu")
         rows, columns = (self.corners[:, i, None] + along for i in range(2))
         return rows[:, :, None].to(device), columns[:, None, :].to(device)
 
@@ -59,14 +59,15 @@ def sample_blocks(views: list[TrainingView], fraction: float, seed: int) -> list
         height, width = view.image.shape[:2]
         short = min(height, width)
         side = max(1, min(max(SIDES[0], min(SIDES[1], round(short / 16))), short // 8))
-        first = torch.stack([torch.randint(n % side + 1, (), generator=generator) for n in (height, width)])
-        cells = torch.cartesian_prod(torch.arange(height // side), torch.arange(width // side)) * side + first
+        first = torch.stack([torch.randint(n % side + 1, (), generator=generator, device="cpu") for n in (height, width)])
+        rows, columns = (torch.arange(n // side, device="cpu") for n in (height, width))
+        cells = torch.cartesian_prod(rows, columns) * side + first
         if view.mask is not None:
             rows, columns = Blocks(side, cells).pixels(view.mask.device)
             cells = cells[(view.mask[rows, columns].mean((1, 2)) > 0.5).cpu()]
         least = min(math.ceil(MIN_BLOCKS / len(views)), int(MAX_FRACTION * len(cells)))
         wanted = min(len(cells), max(1, least, round(fraction * len(cells))))
-        chosen = torch.randperm(len(cells), generator=generator)[:wanted].sort().values
+        chosen = torch.randperm(len(cells), generator=generator, device="cpu")[:wanted].sort().values
         found.append(Blocks(side, cells[chosen]))
     return found
 
@@ -110,7 +111,7 @@ def block_errors(
         where = held.pixels(difference.device)
         weights = torch.ones_like(difference) if view.mask is None else view.mask
         errors.append(((difference * weights)[where].sum((1, 2)) / weights[where].sum((1, 2))).double().cpu())
-    return torch.cat(errors) if errors else torch.zeros(0, dtype=torch.float64)
+    return torch.cat(errors) if errors else torch.zeros(0, dtype=torch.float64, device="cpu")
 
 
 def decibels(errors: torch.Tensor) -> float:

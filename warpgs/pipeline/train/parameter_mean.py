@@ -75,7 +75,8 @@ class ParameterMean:
         """Return tensors by name, of any shape [...], from which the mean continues; empty without samples."""
         if not self.count:
             return {}
-        return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": torch.tensor([self.count])}
+        count = torch.tensor([self.count], dtype=torch.int64, device="cpu")
+        return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": count}
 
     def load(self, tensors: Mapping[str, torch.Tensor], params: Mapping[str, torch.Tensor]) -> None:
         """Load what `state` returned.

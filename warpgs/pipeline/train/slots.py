@@ -166,7 +166,7 @@ class SlotSums:
         if large is not None and tree.ranks.count > 1 and FLOAT_BYTES * counts[large] >= DIVIDED_BYTES:
             rows = self.shapes[large][0]
             self.divided, self._width = rows // unit * unit, counts[large] // rows
-        self.rows = torch.zeros(tree.rows, -(-ends[-1] // unit) * unit, device=device)
+        self.rows = torch.zeros(tree.rows, -(-ends[-1] // unit) * unit, device=device, dtype=torch.float32)
         """The sums, shape [R, L]."""
         self.means = [(self.starts[k], self.starts[k] + counts[k]) for k in range(means)]
         """Ranges of a sum that become means: for each tensor, the first entry and the one after the last."""

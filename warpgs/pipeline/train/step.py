@@ -71,26 +71,26 @@ class StepBuffers:
             rows = MAX_STEPS if device.type == "cuda" else 1
         self.view_rows = torch.zeros(rows, dtype=torch.int64, device=device)
         """Row of each step's view in its stack."""
-        self.lr_rows = torch.ones(rows, lrs, device=device)
+        self.lr_rows = torch.ones(rows, lrs, device=device, dtype=torch.float32)
         """Learning rates of each step (`Table.lr_row` of all tables)."""
-        self.setting_rows = torch.zeros(rows, len(Setting), device=device)
+        self.setting_rows = torch.zeros(rows, len(Setting), device=device, dtype=torch.float32)
         """Settings of each step, by `Setting`."""
         self.counter = torch.zeros(1, dtype=torch.int64, device=device)
         """Number of the current step in its series. After a step stops, neither this number nor any Gaussian changes."""
         self.stop = torch.zeros(1, dtype=torch.int32, device=device)
         """0 while steps continue, else the reason why they stopped."""
-        self.history = torch.zeros(rows, 2, device=device)
+        self.history = torch.zeros(rows, 2, device=device, dtype=torch.float32)
         """Loss and mean squared error of each step."""
-        self.one = torch.ones((), device=device)
+        self.one = torch.ones((), device=device, dtype=torch.float32)
         """Gradient of the loss."""
 
     def load(self, rows: list[int], lrs: list[list[float]], settings: list[tuple[float, ...]]) -> None:
         """Upload view rows, learning rates and settings (7 each) of the next steps, at most as many as were allocated."""
         self.counter.zero_()
         self.stop.zero_()
-        self.view_rows[: len(rows)] = torch.tensor(rows).to(self.device)
-        self.lr_rows[: len(lrs)] = torch.tensor(lrs, dtype=torch.float32).to(self.device)
-        self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32).to(self.device)
+        self.view_rows[: len(rows)] = torch.tensor(rows, dtype=torch.int64, device="cpu").to(self.device)
+        self.lr_rows[: len(lrs)] = torch.tensor(lrs, dtype=torch.float32, device="cpu").to(self.device)
+        self.setting_rows[: len(settings)] = torch.tensor(settings, dtype=torch.float32, device="cpu").to(self.device)
 
     def result(self) -> tuple[int, int, list[list[float]]]:
         """Return the number of steps taken, the stop flag, and the losses and errors of these steps and of the next one."""

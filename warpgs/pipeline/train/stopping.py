@@ -225,7 +225,7 @@ class Stopping:
             DataError: The errors do not belong to these blocks.
         """
         shape = (len(plain["measured"]), sum(map(len, self.blocks)) if self.active else 0)
-        measured = tensors.get("stopping.measured", torch.zeros(0, shape[1]))
+        measured = tensors.get("stopping.measured", torch.zeros(0, shape[1], dtype=torch.float32, device="cpu"))
         if measured.shape != shape:
             raise DataError(
                 f"the stored errors of the left-out blocks have shape {list(measured.shape)}, not {list(shape)}; fit again"

@@ -34,18 +34,20 @@ def probe_seconds(width: int, height: int, device: torch.device) -> float:
     Returns the median of `REPEATS`; takes some hundred milliseconds.
     """
     count = max(1, width * height // PIXELS_PER_GAUSSIAN)
-    g = torch.Generator().manual_seed(0)
-    depth = 2 + 4 * torch.rand(count, 1, generator=g)
-    across = torch.rand(count, 2, generator=g) - 0.5
-    means = torch.cat([across * depth * torch.tensor([1.0, height / width]), depth], 1)
+    real = {"dtype": torch.float32, "device": "cpu"}
+    sampled = real | {"generator": torch.Generator().manual_seed(0)}
+    depth = 2 + 4 * torch.rand(count, 1, **sampled)
+    across = torch.rand(count, 2, **sampled) - 0.5
+    means = torch.cat([across * depth * torch.tensor([1.0, height / width], **real), depth], 1)
     tensors = {
-        "means": means, "quats": torch.randn(count, 4, generator=g),
-        "log_scales": torch.log(depth / width * (1 + 2 * torch.rand(count, 3, generator=g))),
-        "logit_opacities": torch.randn(count, generator=g), "sh": 0.3 * torch.randn(count, 4, 3, generator=g),
+        "means": means, "quats": torch.randn(count, 4, **sampled),
+        "log_scales": torch.log(depth / width * (1 + 2 * torch.rand(count, 3, **sampled))),
+        "logit_opacities": torch.randn(count, **sampled), "sh": 0.3 * torch.randn(count, 4, 3, **sampled),
     }  # fmt: skip
     gaussians = Gaussians(**{n: t.to(device).requires_grad_() for n, t in tensors.items()})
-    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]], device=device)
-    camera, target = Camera(torch.eye(4, device=device), K, width, height), torch.rand(height, width, 3, generator=g).to(device)
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]], **real)
+    camera = Camera(torch.eye(4, **real).to(device), K.to(device), width, height)
+    target = torch.rand(height, width, 3, **sampled).to(device)
     seconds = []
     for _ in range(REPEATS + 1):
         began = time.perf_counter()

@@ -179,7 +179,7 @@ class Trainer:
     def next_view(self) -> int:
         """Return the index of the next view. The order is random; each view comes once before any view comes again."""
         if not self.order:
-            self.order = torch.randperm(len(self.views), generator=self.generator).tolist()
+            self.order = torch.randperm(len(self.views), generator=self.generator, device="cpu").tolist()
         return self.order.pop()
 
     def advance(self, limit: int = 1) -> list[StepReport]:

@@ -236,7 +236,7 @@ def stack_views(
             torch.stack([_coefficients(v.given) for v in same]), kind[3],
             stacked([v.image for v in same]), stacked([v.mask for v in same]) if kind[2] else None,
             {n: stacked([v.maps[n] for v in same]) for n in same[0].maps},
-            torch.tensor([i % count for i in numbers], device=device),
+            torch.tensor([i % count for i in numbers], device=device, dtype=torch.int64),
             None if same[0].alpha is None else stacked([v.alpha for v in same]),
         )  # fmt: skip
         for row, i in enumerate(numbers):

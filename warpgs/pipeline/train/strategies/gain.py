@@ -61,7 +61,7 @@ def gains(points: torch.Tensor, colors: torch.Tensor, residuals: Sequence[Residu
     total = torch.zeros_like(points[:, 0])
     for camera, blurred, depth in residuals:
         pixels, away = project_tensors(camera, points)
-        size = torch.tensor([camera.width, camera.height]).to(pixels)
+        size = torch.tensor([camera.width, camera.height], dtype=torch.int64, device="cpu").to(pixels)
         inside = (away > 0) & (pixels >= 0).all(1) & (pixels < size).all(1)
         columns, rows = torch.where(inside[:, None], pixels, 0).long().unbind(1)
         seen = inside & (away < HIDDEN * depth[rows, columns])

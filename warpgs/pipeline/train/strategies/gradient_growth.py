@@ -79,7 +79,8 @@ def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: tor
     """Return two children of each Gaussian, sampled from its own distribution and 1.6 times smaller (Kerbl et al. 2023)."""
     pair = ids.repeat(2)
     rows = {n: t[pair] for n, t in gaussians.items()}
-    noise = torch.randn(len(pair), 3, generator=generator).to(ids.device) * _exp(rows["log_scales"])
+    noise = torch.randn(len(pair), 3, generator=generator, dtype=torch.float32, device="cpu")
+    noise = noise.to(ids.device) * _exp(rows["log_scales"])
     w, *vector = (rows["quats"] / rows["quats"].norm(dim=1, keepdim=True)).unbind(1)
     axis = torch.stack(vector, 1)
     cross = 2 * torch.linalg.cross(axis, noise)

@@ -112,7 +112,7 @@ def sample_pixels(
     allowed = gate & (score > 0)
     count = min(count, int(allowed.sum()))
     if random:
-        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator).to(score.device)
+        uniform = torch.rand(score.shape, dtype=torch.float64, generator=generator, device="cpu").to(score.device)
         key = score.double() / -torch.log1p(-uniform)
     else:
         key = score.double()

@@ -230,7 +230,7 @@ def least_contributing(
 
     The sums are over at most `MAX_WEIGHED` views, evenly spaced, at half size, which suffices to rank the Gaussians.
     """
-    total = torch.zeros(len(gaussians), device=gaussians.means.device)
+    total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
     for view in views[:: -(-len(views) // MAX_WEIGHED)]:
         total += rasterize(gaussians, half_size_camera(view.camera), options).weight_sums[0]
     total = torch.where(candidates, total, torch.inf)
@@ -244,7 +244,7 @@ def keep_contributors(gaussians: Gaussians, count: int, views: list[TrainingView
     At most `MAX_WEIGHED` views are rendered, evenly spaced.
     """
     weigh = dataclasses.replace(options, contributions=True)
-    total = torch.zeros(len(gaussians), device=gaussians.means.device)
+    total = torch.zeros(len(gaussians), device=gaussians.means.device, dtype=torch.float32)
     for view in views[:: -(-len(views) // MAX_WEIGHED)]:
         total += rasterize(gaussians, view.camera, weigh).weight_sums[0]
     ids = torch.topk(total, min(count, len(gaussians))).indices.sort().values
@@ -257,7 +257,7 @@ def _sampled(
     """Return the Gaussians sampled in the views, as tensors by name, and the maps used."""
     numbers = list(range(len(views)))
     if len(views) > MAX_VIEWS:
-        numbers = sorted(torch.randperm(len(views), generator=generator)[:MAX_VIEWS].tolist())
+        numbers = sorted(torch.randperm(len(views), generator=generator, device="cpu")[:MAX_VIEWS].tolist())
     before = [render_before(gaussians, views[i], config, options) for i in numbers]
     residuals: list[Residual] = []
     if config.importance.residual == "gain" and config.weights()[0] > 0:
@@ -315,7 +315,8 @@ def sampling_event(
         keep[ids] = False
         evicted = len(ids)
         if over > evicted:  # spread over the views, as they were sampled
-            left = torch.randperm(count, generator=generator)[: max(0, count - (over - evicted))].sort().values.to(fine.device)
+            order = torch.randperm(count, generator=generator, device="cpu")
+            left = order[: max(0, count - (over - evicted))].sort().values.to(fine.device)
             added = {name: t[left] for name, t in added.items()}
             count = len(left)
     parents = torch.full((count,), -1, dtype=torch.int64, device=fine.device)

@@ -104,7 +104,7 @@ class Exposure(ViewModule):
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
         """Return zeros, shape [V, 12]."""
-        return {EXPOSURE: torch.zeros(len(views), CHANNELS * (CHANNELS + 1))}
+        return {EXPOSURE: torch.zeros(len(views), CHANNELS * (CHANNELS + 1), dtype=torch.float32, device="cpu")}
 
     def lrs(self, progress: float, extent: float) -> dict[str, float]:
         """Return the learning rate, which falls from the first step on."""

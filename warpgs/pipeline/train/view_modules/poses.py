@@ -146,7 +146,7 @@ def refined_cameras(
     if FOCAL not in params:
         return found
     exact = {n: params[n].detach().cpu().double() for n in (FOCAL, CAMERA_NUMBER)}
-    factors = focal_factors(exact, torch.arange(len(train))).tolist()
+    factors = focal_factors(exact, torch.arange(len(train), device="cpu")).tolist()
     numbers = dict(zip([*train, *test], camera_numbers([given[n] for n in (*train, *test)])))
     of_camera = {numbers[n]: f for n, f in zip(train, factors)}
     for name in (*train, *test):
@@ -222,10 +222,10 @@ class RefinePoses(ViewModule):
 
     def parameters(self, views: Sequence[View]) -> dict[str, torch.Tensor]:
         """Return zeros, shape [V, 3] each; for learned focal lengths also zeros and the camera of each view, [V, 1] each."""
-        found = {name: torch.zeros(len(views), 3) for name in (ROTATION, TRANSLATION)}
+        found = {name: torch.zeros(len(views), 3, dtype=torch.float32, device="cpu") for name in (ROTATION, TRANSLATION)}
         if self.focal_lr is not None:
-            numbers = torch.tensor(camera_numbers([v.camera for v in views]), dtype=torch.float32)
-            found |= {FOCAL: torch.zeros(len(views), 1), CAMERA_NUMBER: numbers[:, None]}
+            numbers = torch.tensor(camera_numbers([v.camera for v in views]), dtype=torch.float32, device="cpu")
+            found |= {FOCAL: torch.zeros(len(views), 1, dtype=torch.float32, device="cpu"), CAMERA_NUMBER: numbers[:, None]}
         return found
 
     def lrs(self, progress: float, extent: float) -> dict[str, float]:
