@@ -26,10 +26,8 @@ def main(arguments: list[str] | None = None) -> float:
 
     split = "every:8"
     if a.scene is None:
-        from warpgs.synthetic.demo import write_demo
-
         a.scene = a.out / "scene"
-        split = write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
+        split = warpgs.write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
 
     scene = warpgs.load_scene(a.scene)
     config = dataclasses.replace(warpgs.PRESETS["quick"], steps=a.steps)

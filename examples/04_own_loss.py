@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import ClassVar
 
 import warpgs
-from warpgs.pipeline.train.loss import LossInputs, register
+from warpgs.train import LossInputs, register_loss_term
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ def roughness(depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor) -> 
     return total
 
 
-@register("depth_smoothness")
+@register_loss_term("depth_smoothness")
 @dataclass(frozen=True)
 class DepthSmoothness(warpgs.LossTerm):
     """Edge-aware smoothness of the rendered inverse depth."""
@@ -69,10 +69,8 @@ def main(arguments: list[str] | None = None) -> float:
     with tempfile.TemporaryDirectory() as folder:
         split = "every:8"
         if a.scene is None:
-            from warpgs.synthetic.demo import write_demo
-
             a.scene = Path(folder) / "scene"
-            split = write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
+            split = warpgs.write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
         scene = warpgs.load_scene(a.scene)
         plain = dataclasses.replace(warpgs.PRESETS["quick"], steps=a.steps)
         smooth = dataclasses.replace(plain, loss_terms=(DepthSmoothness(a.weight),))

@@ -16,9 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import warpgs
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.table import Column, DensityUpdate
-from warpgs.pipeline.train.strategies.base import register
+from warpgs.train import Column, DensityUpdate, InitConfig, register_strategy
 
 import numpy as np
 import torch
@@ -37,7 +35,7 @@ class SproutConfig:
     """Gaussians below this opacity are removed."""
 
 
-@register("sprout")
+@register_strategy("sprout")
 class Sprout(warpgs.Strategy):
     """Adds Gaussians next to those with the largest gradients of projected means; removes transparent Gaussians."""
 
@@ -100,10 +98,8 @@ def main(arguments: list[str] | None = None) -> float:
     with tempfile.TemporaryDirectory() as folder:
         split = "every:8"
         if a.scene is None:
-            from warpgs.synthetic.demo import write_demo
-
             a.scene = Path(folder) / "scene"
-            split = write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
+            split = warpgs.write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
         scene = warpgs.load_scene(a.scene)
         results = [warpgs.fit(scene, config, split=split, verbose=False) for config in configs]
 

@@ -26,17 +26,11 @@ import tempfile
 from pathlib import Path
 
 import warpgs
-from warpgs.errors import DataError
-from warpgs.geometry import look_at
-from warpgs.io.folders import SceneFolder, ViewList, view_name
-from warpgs.io.images import Lens
-from warpgs.io.readers import Probe, Reader, ReadOptions
-from warpgs.report.images import png
-from warpgs.scene import Scene
-from warpgs.synthetic import raycast
-from warpgs.synthetic.demo import camera_path, still_life
+from warpgs.io import Lens, Probe, Reader, ReadOptions, SceneFolder, ViewList, view_name
 
 import numpy as np
+import torch
+from PIL import Image
 
 UP = np.array([0.0, -1.0, 0.0])
 """Upward direction of the format: +y points down, as in an OpenCV camera."""
@@ -52,7 +46,7 @@ class ShotsReader(Reader):
         """Return the file that identifies the format; None if it is missing."""
         return Probe("shots.csv") if (folder / "shots.csv").is_file() else None
 
-    def read(self, folder: Path, options: ReadOptions) -> Scene:
+    def read(self, folder: Path, options: ReadOptions) -> warpgs.Scene:
         """Return the scene in file coordinates; an invalid line raises a DataError with the line's number."""
         path = folder / "shots.csv"
         scene, views = SceneFolder(folder, options), ViewList()
@@ -64,7 +58,7 @@ class ShotsReader(Reader):
                     scene.child(folder, name, where),
                     lambda width, height: centred_lens(focal, width, height).checked(where),  # noqa: B023 - called at once
                 )
-                views.add(view_name(name), look_at(position, target, UP), image)
+                views.add(view_name(name), warpgs.look_at(position, target, UP), image)
         return self.scene(folder, views.views, views.notes(options))
 
 
@@ -78,13 +72,13 @@ def parse(row: list[str], where: str) -> tuple[str, np.ndarray, np.ndarray, floa
         name, *numbers = (word.strip() for word in row)
         values = np.array([float(word) for word in numbers])
     except ValueError as e:
-        raise DataError(f"{where}: cannot be understood ({e}); write a name and seven numbers") from e
+        raise warpgs.DataError(f"{where}: cannot be understood ({e}); write a name and seven numbers") from e
     if len(values) != 7 or not np.isfinite(values).all():
-        raise DataError(f"{where}: found {len(values)} numbers; write a name and seven finite numbers")
+        raise warpgs.DataError(f"{where}: found {len(values)} numbers; write a name and seven finite numbers")
     position, target = values[:3], values[3:6]
     direction = target - position
     if not np.linalg.norm(np.cross(direction, UP)) > 1e-9:
-        raise DataError(f"{where}: the camera looks straight up or down, or at itself; move its target")
+        raise warpgs.DataError(f"{where}: the camera looks straight up or down, or at itself; move its target")
     return name, position, target, float(values[6])
 
 
@@ -93,36 +87,52 @@ def centred_lens(focal: float, width: int, height: int) -> Lens:
     return Lens(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]]), width, height)
 
 
+def blobs(count: int = 300) -> warpgs.Gaussians:
+    """Return coloured Gaussians in a box in front of the cameras, in file units."""
+    generator = torch.Generator().manual_seed(0)
+    return warpgs.Gaussians(
+        means=4 * torch.rand(count, 3, generator=generator) + torch.tensor([-2.0, -2.0, 3.0]),
+        quats=torch.randn(count, 4, generator=generator),
+        log_scales=torch.full((count, 3), -1.5) + 0.3 * torch.randn(count, 3, generator=generator),
+        logit_opacities=torch.full((count,), 1.5),
+        sh=torch.randn(count, 1, 3, generator=generator),
+    )
+
+
+def render(viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return the image of the Gaussians, [height, width, 3] from 0 to 1, for camera_from_world [4, 4] in file units."""
+    camera = warpgs.Camera(
+        torch.as_tensor(viewmat, dtype=torch.float32), torch.as_tensor(K, dtype=torch.float32), width, height
+    )
+    image: np.ndarray = warpgs.rasterize(blobs(), camera).rgb.clamp(0, 1).numpy()
+    return image
+
+
 def write_shots(folder: Path, count: int = 8, width: int = 64, height: int = 48) -> None:
-    """Write the still life of the synthetic demo in the shots.csv format, ``count`` images of ``width`` x ``height`` px."""
+    """Write ``count`` images of ``width`` x ``height`` px in the shots.csv format, with cameras from left to right."""
     folder.mkdir(parents=True, exist_ok=True)
-    shapes, light, focal = still_life(), raycast.Light(), 0.95 * width
-    lines = []
-    for i, camera in enumerate(camera_path(count, width, height)):
-        # rounded as in the file, so that image and pose agree exactly
-        position = camera.center.round(6)
-        target = (position + 5 * camera.viewmat[2, :3]).round(6)
-        viewmat = look_at(position, target, UP)
-        rgb = raycast.render(shapes, light, centred_lens(focal, width, height).K, viewmat, width, height)
-        (folder / f"shot{i}.png").write_bytes(png(rgb))
+    focal, lines = 0.95 * width, []
+    for i, x in enumerate(np.linspace(-1.6, 1.6, count).round(6)):
+        position, target = np.array([x, 0.2 * x * x - 0.5, 0.0]).round(6), np.array([0.4 * x, 0.0, 5.0]).round(6)
+        rgb = render(warpgs.look_at(position, target, UP), centred_lens(focal, width, height).K, width, height)
+        Image.fromarray((255 * rgb).round().astype(np.uint8)).save(folder / f"shot{i}.png")
         lines.append(", ".join([f"shot{i}.png", *(f"{v:.6f}" for v in (*position, *target, focal))]))
     (folder / "shots.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def check(scene: Scene) -> float:
+def check(scene: warpgs.Scene) -> float:
     """Render every view again from the pose that was read.
 
     Returns:
         The smallest PSNR [dB] between image and rendering: about 59 dB, from rounding to 8 bits, if position, direction,
         focal length and axes are right.
     """
-    shapes, light, worst = still_life(), raycast.Light(), math.inf
-    n = scene.normalization
+    n, worst = scene.normalization, math.inf
     for view in scene.views:
         viewmat = np.array(view.camera.viewmat)
         # back from scene units to file units
         viewmat[:3, 3] = viewmat[:3, 3] / n.scale - viewmat[:3, :3] @ n.offset
-        rgb = raycast.render(shapes, light, np.asarray(view.camera.K), viewmat, view.camera.width, view.camera.height)
+        rgb = render(viewmat, np.asarray(view.camera.K), view.camera.width, view.camera.height)
         worst = min(worst, -10 * math.log10(float(np.mean((rgb - view.image) ** 2))))
     return worst
 

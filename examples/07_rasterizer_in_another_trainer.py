@@ -53,10 +53,8 @@ def main(arguments: list[str] | None = None) -> float:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     with tempfile.TemporaryDirectory() as folder:
         if a.scene is None:
-            from warpgs.synthetic.demo import write_demo
-
             a.scene = Path(folder) / "scene"
-            write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
+            warpgs.write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
         scene = warpgs.load_scene(a.scene)
     held_out, *train = scene.views[len(scene.views) // 2 :] + scene.views[: len(scene.views) // 2]
     images = [torch.from_numpy(v.image).to(device) for v in train]

@@ -11,7 +11,6 @@ import math
 from pathlib import Path
 
 import warpgs
-from warpgs.geometry import depth_normals, gaussian_normals
 
 import torch
 from PIL import Image
@@ -56,12 +55,12 @@ def main(arguments: list[str] | None = None) -> float:
     K = torch.tensor([[1.0 * a.size, 0, a.size / 2], [0, 1.0 * a.size, a.size / 2], [0, 0, 1]])
     camera = warpgs.Camera(torch.eye(4), K, a.size, a.size)
     gaussians = ball_and_wall(a.count)
-    options = warpgs.RasterizeOptions(features=gaussian_normals(gaussians, camera), median_depth=True)
+    options = warpgs.RasterizeOptions(features=warpgs.gaussian_normals(gaussians, camera), median_depth=True)
     render = warpgs.rasterize(gaussians, camera, options)
     assert render.features is not None and render.median_depth is not None
 
     depths = [render.depth, render.depth * render.alpha, render.median_depth]
-    normals = [torch.nn.functional.normalize(render.features, dim=-1), depth_normals(camera, render.depth)]
+    normals = [torch.nn.functional.normalize(render.features, dim=-1), warpgs.depth_normals(camera, render.depth)]
 
     grey = [((5 - d) / 3.5)[..., None].expand(-1, -1, 3) for d in depths]  # white at 1.5 u, black at the wall
     colored = [0.5 + 0.5 * n * torch.tensor([1.0, -1.0, -1.0]) for n in normals]  # blue faces the camera

@@ -18,19 +18,21 @@ from pathlib import Path
 from typing import Any
 
 import warpgs
-from warpgs import schema
-from warpgs.errors import UsageError
-from warpgs.pipeline.model.table import DensityUpdate, Table
-from warpgs.pipeline.train.context import StrategyContext
-from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
-from warpgs.pipeline.train.memory_plan import most_instances
-from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.step import captured_renderer, eager_renderer
-from warpgs.pipeline.train.strategies.base import register
-from warpgs.pipeline.train.strategies.clone_split import CloneSplit
-from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
-from warpgs.pipeline.train.views import TrainingView
+from warpgs.train import (
+    CloneSplit,
+    DensityUpdate,
+    GradientGrowth,
+    OptimizerConfig,
+    StrategyContext,
+    Table,
+    TrainingView,
+    captured_renderer,
+    eager_renderer,
+    most_instances,
+    photometric_loss,
+    register_strategy,
+    state_schema,
+)
 
 import numpy as np
 import torch
@@ -43,7 +45,7 @@ CHUNK = 2**24
 SPARE, MIN_INSTANCES = 2, 100_000
 """Capacity for (Gaussian, tile) instances of a captured render: `SPARE` times the most instances of a training view, plus
 `MIN_INSTANCES`."""
-OF_TWIN = {"twin": schema.fields(GradientGrowth.STATE)}
+OF_TWIN = {"twin": state_schema(GradientGrowth.STATE)}
 """Schema of the second model in a checkpoint, without its tensors."""
 
 
@@ -92,7 +94,7 @@ def random_cameras(views: list[TrainingView], noise: float, count: int, generato
     return viewmats
 
 
-@register("cor_gs")
+@register_strategy("cor_gs")
 class CorGS(CloneSplit):
     """Two models of one scene, pruned and regularised where they disagree; the first model is the result.
 
@@ -100,7 +102,7 @@ class CorGS(CloneSplit):
     """
 
     Config = CorConfig
-    STATE = staticmethod(schema.fields(GradientGrowth.STATE | OF_TWIN))
+    STATE = staticmethod(state_schema(GradientGrowth.STATE | OF_TWIN))
 
     def setup(self) -> None:
         """Copy the first model to the second, and sample the random cameras and the order of views.
@@ -111,7 +113,7 @@ class CorGS(CloneSplit):
         context, views = self.context, self.context.views
         shapes = {v.image.shape for v in views}
         if len(views) < 2 or len(shapes) > 1 or any(v.alpha is not None or v.camera.distortion is not None for v in views):
-            raise UsageError(
+            raise warpgs.UsageError(
                 "cor_gs needs at least two opaque training views of one size, without lens distortion; use another --strategy"
             )
         table = Table.of_gaussians(context.gaussians, GradientGrowth.columns())
@@ -249,13 +251,11 @@ def main(arguments: list[str] | None = None) -> float:
     parser.add_argument("--width", type=int, default=96, help="width of the synthetic images [px]")
     a = parser.parse_args(arguments)
 
-    base = dataclasses.replace(PRESETS["3dgs"], steps=a.steps, sh_degree=0)
+    base = dataclasses.replace(warpgs.PRESETS["3dgs"], steps=a.steps, sh_degree=0)
     with tempfile.TemporaryDirectory() as folder:
         if a.scene is None:
-            from warpgs.synthetic.demo import write_demo
-
             a.scene = Path(folder) / "scene"
-            a.split = write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
+            a.split = warpgs.write_demo(a.scene, views=9, width=a.width, height=3 * a.width // 4)
         scene = warpgs.load_scene(a.scene)
         settings = {"split": a.split, "verbose": False}
         results = [warpgs.fit(scene, base, **settings), warpgs.fit(scene, base, strategy=CorGS, **settings)]

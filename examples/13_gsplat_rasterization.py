@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import warpgs
-from warpgs.rules import rule_named
 
 import torch
 from PIL import Image
@@ -72,7 +71,7 @@ def rasterization(
     harmonics = sh_degree is not None
     camera = warpgs.Camera(viewmats, Ks, width, height, **lens_of(camera_model, radial_coeffs, tangential_coeffs))
     options = warpgs.RasterizeOptions(
-        rule=dataclasses.replace(rule_named("gsplat-1.6"), low_pass=eps2d),
+        rule=dataclasses.replace(warpgs.rule_named("gsplat-1.6"), low_pass=eps2d),
         near=near_plane, far=far_plane, sh_degree=sh_degree, tile_size=tile_size, colors=None if harmonics else colors,
         background=backgrounds if "RGB" in render_mode else None, absgrad=absgrad, antialiased=rasterize_mode == "antialiased",
     )  # fmt: skip

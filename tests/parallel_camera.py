@@ -5,12 +5,12 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpgs.kernels.cameras.base import CameraModel, register
+from warpgs.kernels import CameraModel, register_camera_model
 
 NAME = "test_parallel"
 
 
-@register(NAME)
+@register_camera_model(NAME)
 class Parallel(CameraModel):
     """u = K00 (x + c0 x^2 + c1 x^3) + K02 and v = K11 (y + c2 y^2 + c3 y^3) + K12, whatever the depth."""
 

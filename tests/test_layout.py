@@ -1,34 +1,43 @@
 """The house rules that a machine can check."""
 
 import ast
+import re
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 PRODUCT = sorted((ROOT / "warpgs").rglob("*.py"))
 BENCH = ROOT / "bench"
 BENCHES = sorted(p for name in ("kernels", "fits", "peers", "studies") for p in (BENCH / name).glob("*.py"))
-SHARED = {
-    "__init__", "functions", "native", "compiler", "covariance", "falloff",
-    "project_backward", "project_cpu", "project_cpu_backward", "project_cuda", "project_inputs", "project_lanes",
-    "ssim_cpu", "ssim_cuda", "blend_cpu", "blend_batch", "blend_contributions", "blend_cpu_backward",
-    "blend_cuda", "blend_records", "blend_settings", "scanlines_cpu", "sh", "tiles_emit", "tiles_emit_cpu", "tiles_order",
-}  # fmt: skip
-
-
-def test_an_op_has_one_name_in_four_places():
-    """Kernel, reference, test and bench."""
-    for op in {p.stem for p in (ROOT / "warpgs/kernels").glob("*.py")} - SHARED:
-        for room in (f"tests/reference/{op}.py", f"tests/kernels/test_{op}.py", f"bench/kernels/bench_{op}.py"):
-            assert (ROOT / room).is_file(), room
 
 
 def test_files_are_rooms():
-    """At most 400 lines, a name that says what is made, and a module docstring."""
+    """At most 800 lines, a name that says what is made, and a module docstring."""
     for path in PRODUCT:
         text = path.read_text("utf-8")
-        assert len(text.splitlines()) <= 400, path
+        assert len(text.splitlines()) <= 800, path
         assert path.stem not in ("utils", "helpers", "common", "misc", "manager"), path
         assert ast.get_docstring(ast.parse(text)), path
+
+
+PARTS = {
+    "adam_scheduled", "check_round_trip", "instance_weights", "packed_covariances", "project_gradients", "project_inputs",
+    "project_tensors",
+}  # fmt: skip
+"""Functions of kernel rooms that launch, but are compared as a part of the op that calls them."""
+
+
+def test_an_op_is_compared_with_a_dense_reference():
+    """Every function of a kernel room that launches is named by a test that imports from `tests/reference`."""
+    tests = [p.read_text("utf-8") for p in (ROOT / "tests").rglob("test_*.py")]
+    named = {word for text in tests if re.search(r"^from tests\.reference", text, re.M) for word in re.findall(r"\w+", text)}
+    ops = {f.name for p in (ROOT / "warpgs/kernels").glob("*.py") for f in ast.parse(p.read_text("utf-8")).body if launches(f)}
+    assert len(ops) > 20 and ops - named == PARTS
+
+
+def launches(node: ast.stmt) -> bool:
+    """Whether a statement defines a public function that launches a kernel, or calls an autograd function that does."""
+    called = [ast.unparse(n.func).rpartition(".")[2] for n in ast.walk(node) if isinstance(n, ast.Call)]
+    return isinstance(node, ast.FunctionDef) and node.name[0] != "_" and bool({"launch", "apply"} & set(called))
 
 
 def nodes_of(path: Path) -> list[ast.AST]:
@@ -87,10 +96,10 @@ def bench_imports(path: Path) -> set[str]:
 
 
 def test_benches_share_only_what_stands_in_lib():
-    """A program imports no other program; what two of them share stands in `bench/lib`. Files are short as elsewhere."""
+    """A program imports no other program; what two of them share stands in `bench/lib`. Files are rooms as elsewhere."""
     for path in [*BENCHES, *(BENCH / "lib").glob("*.py")]:
         assert all(name.startswith("bench.lib") for name in bench_imports(path)), path
-        assert len(path.read_text("utf-8").splitlines()) <= 400, path
+        assert len(path.read_text("utf-8").splitlines()) <= 800, path
 
 
 def test_tests_import_only_the_lib_of_the_benches():

@@ -12,24 +12,43 @@ from pathlib import Path
 import pytest
 
 import warpgs
+from warpgs import faces
 
 ROOT = Path(warpgs.__file__).parent
+BELOW = ("train", "kernels", "io", "export")
+FACES = {name: importlib.import_module(name) for name in ("warpgs", *(f"warpgs.{n}" for n in BELOW))}
+NAMES = [f"{face}.{name}" for face, module in FACES.items() for name in module.__all__]
+PAGES = [ROOT.parent / "README.md", ROOT.parent / "CONTRIBUTING.md", *sorted((ROOT.parent / "docs").glob("*.md"))]
 
 
-def test_dir_lists_the_public_names_and_nothing_else():
-    """Beside names with two underscores; sorted as written, none twice."""
-    assert {n for n in dir(warpgs) if not n.startswith("__")} == set(warpgs.__all__)
-    assert len(set(warpgs.__all__)) == len(warpgs.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'os_path'"):
-        warpgs.os_path  # noqa: B018
+def seen_by_type_checkers(face: str) -> dict[str, tuple[str, str]]:
+    """Module and name there of each name that a face imports under TYPE_CHECKING; modules are left out."""
+    tree = ast.parse(Path(FACES[face].__file__).read_text("utf-8"))
+    (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
+    found = {a.asname or a.name: (n.module, a.name) for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
+    return {public: home for public, home in found.items() if home[0] != "warpgs"}
 
 
-@pytest.mark.parametrize("name", warpgs.__all__)
+@pytest.mark.parametrize("face", FACES)
+def test_dir_lists_the_public_names_and_nothing_else(face):
+    """Beside the faces and names with two underscores; none twice, and none that a module of the same folder would hide."""
+    module = FACES[face]
+    others = set(BELOW) if module is warpgs else set()
+    assert {n for n in dir(module) if not n.startswith("__")} == set(module.__all__) | others
+    assert len(set(module.__all__)) == len(module.__all__)
+    assert not set(module.__all__) & {p.stem for path in getattr(module, "__path__", []) for p in Path(path).iterdir()}
+    with pytest.raises(AttributeError, match=f"module '{face}' has no attribute 'os_path'"):
+        module.os_path  # noqa: B018
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_every_public_name_is_there_and_documented(name):
-    """It loads, and its own docstring says what it is."""
-    value = getattr(warpgs, name)
-    assert value is getattr(importlib.import_module(warpgs._HOMES[name]), name)
-    assert name.isupper() or value.__doc__
+    """It loads from where type checkers find it, and its own docstring says what it is."""
+    face, _, public = name.rpartition(".")
+    home, attribute = seen_by_type_checkers(face)[public]
+    value = getattr(FACES[face], public)
+    assert value is getattr(importlib.import_module(home), attribute) or attribute == "register"  # a method: new at each look
+    assert public.isupper() or value.__doc__
 
 
 @pytest.mark.parametrize("kind", [warpgs.RasterizeOptions, warpgs.Rule])
@@ -41,19 +60,18 @@ def test_help_describes_every_option(kind):
     assert all(re.search(rf"^    {f.name}: \w.{{20}}", text, re.MULTILINE) for f in dataclasses.fields(kind))
 
 
-def test_type_checkers_see_the_same_names():
-    """The imports under TYPE_CHECKING come from where the names load at run time; the marker of PEP 561 is there."""
-    tree = ast.parse((ROOT / "__init__.py").read_text("utf-8"))
-    (block,) = (n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")
-    seen = {a.name: n.module for n in block.body if isinstance(n, ast.ImportFrom) for a in n.names}
-    assert seen == warpgs._HOMES and set(seen) == set(warpgs.__all__)
+@pytest.mark.parametrize("face", FACES)
+def test_type_checkers_see_the_same_names(face):
+    """Names under TYPE_CHECKING are those of ``__all__``; the marker of PEP 561 is there."""
+    assert set(seen_by_type_checkers(face)) == set(FACES[face].__all__)
     assert (ROOT / "py.typed").is_file()
 
 
 def test_import_loads_neither_torch_nor_warp():
     """A bare import is cheap; the first use of a name pays for it."""
     code = (
-        "import sys, warpgs; heavy = {'torch', 'warp', 'numpy', 'cv2', 'tyro'}; print(sorted(heavy & set(sys.modules)));"
+        "import sys, warpgs; heavy = {'torch', 'warp', 'numpy', 'cv2', 'tyro'};"
+        "warpgs.train, warpgs.kernels, warpgs.io, warpgs.export; print(sorted(heavy & set(sys.modules)));"
         "dir(warpgs); warpgs.Camera; print('numpy' in sys.modules, 'torch' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -79,12 +97,98 @@ def names_in_annotations(cls: type) -> set[str]:
     return {n for n in found & (imported | {n.name for n in module.body if isinstance(n, ast.ClassDef)}) if n[0] != "_"}
 
 
+REFERENCE = (ROOT.parent / "docs/api.md").read_text("utf-8")
+LISTED = re.findall(r"^\.\. (?:auto\w+|py:data):: (warpgs[\w.]+)", REFERENCE, re.MULTILINE)
+
+
+def test_the_reference_lists_every_public_name():
+    """Under the face; a name of several faces at one of them; decorators and `STEP` stand in the text."""
+    named = {n.rpartition(".")[2] for n in [*LISTED, *re.findall(r"`(warpgs[\w.]+)", REFERENCE)]}
+    assert {n.rpartition(".")[2] for n in NAMES} - named == set()
+    assert set(LISTED) <= set(NAMES)
+
+
 def test_the_reference_lists_what_a_class_of_ones_own_meets():
     """Every type in the signatures of the base classes, and in those of the types that they lead to."""
-    page = (ROOT.parent / "docs" / "api.md").read_text("utf-8")
-    listed = re.findall(r"^\.\. (?:autoclass|py:class|py:data):: (warpgs[\w.]+)", page, re.MULTILINE)
-    own = re.findall(r"^\.\. autoclass:: (warpgs[\w.]+)", page.split("## Classes to derive from")[1], re.MULTILINE)
+    own = re.findall(r"^\.\. autoclass:: (warpgs[\w.]+)", REFERENCE.split("## Classes to derive from")[1], re.MULTILINE)
     assert len(own) > 15
     classes = [getattr(importlib.import_module(path.rpartition(".")[0]), path.rpartition(".")[2]) for path in own]
     named = set().union(*map(names_in_annotations, classes))
-    assert named - {path.rpartition(".")[2] for path in listed} == set()
+    assert named - {path.rpartition(".")[2] for path in LISTED} == set()
+
+
+def named(code: str) -> set[str]:
+    """Full names of all that a text of code imports or uses of warpgs, up to the first name that is not a face."""
+    tree = ast.walk(ast.parse(code))
+    found = set()
+    for node in tree:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "warpgs":
+            found |= {f"{node.module}.{a.name}" for a in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {a.name for a in node.names if a.name.startswith("warpgs.")}
+        elif isinstance(node, ast.Attribute) and re.fullmatch(r"warpgs(\.\w+)+", text := ast.unparse(node)):
+            found.add(re.match(r"warpgs\.(?:(?:train|kernels|io|export)\.)?\w+", text)[0])
+    return found
+
+
+def code_of_pages() -> dict[str, str]:
+    """Examples, a plug-in of the tests, and the Python blocks of all pages, by place."""
+    files = [*sorted((ROOT.parent / "examples").rglob("*.py")), ROOT.parent / "tests/parallel_camera.py"]
+    code = {path.name: path.read_text("utf-8") for path in files}
+    for page in PAGES:
+        for i, block in enumerate(re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)):
+            code[f"{page.name}, block {i}"] = block
+    return code
+
+
+def test_examples_and_pages_import_faces_alone():
+    """Users copy them, and what is not on a face may move on any day."""
+    code = code_of_pages()
+    assert len(code) > 20
+    strangers = {place: left for place, text in code.items() if (left := named(text) - set(NAMES) - set(FACES))}
+    assert not strangers
+
+
+def test_the_package_imports_nothing_from_a_face():
+    """Names come from where they are defined; modules of a face's folder are no names of the face."""
+    for path in ROOT.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ImportFrom) and node.module in FACES and path != ROOT / "__init__.py":
+                assert not {a.name for a in node.names} & {*FACES[node.module].__all__, "train"}, f"{path}:{node.lineno}"
+
+
+OLD = [(f"warpgs.{module}", name, new) for module, names in faces.OLD.items() for name, new in names.items()]
+
+
+@pytest.mark.parametrize("module,name,new", OLD)
+def test_an_old_import_answers(module, name, new):
+    """It works as long as the name stays where it is; then the error has the new name, which exists."""
+    try:
+        getattr(importlib.import_module(module), name)
+    except ImportError as error:
+        assert f"{module}.{name} is now {new}" in str(error)
+    assert new in NAMES or not new.startswith("warpgs.")
+
+
+def test_what_is_gone_names_its_new_place(monkeypatch):
+    """A module, a module of a folder that is gone or became a file, and a name; other names of the module stay."""
+    gone = {name: {"Thing": "warpgs.train.Thing"} for name in ("nowhere.at_all", "version", "version.deep")}
+    monkeypatch.setattr(faces, "OLD", gone)
+    monkeypatch.delitem(sys.modules, "warpgs.version")
+    for name in ("nowhere.at_all", "nowhere", "version.deep"):
+        with pytest.raises(ModuleNotFoundError, match=r"Thing is now warpgs\.train\.Thing"):
+            importlib.import_module(f"warpgs.{name}")
+    with pytest.raises(ImportError, match=r"^warpgs\.version\.Thing is now warpgs\.train\.Thing$"):
+        from warpgs.version import Thing  # noqa: F401
+    version = importlib.import_module("warpgs.version")
+    assert version.__version__ and not hasattr(version, "Other")
+    with pytest.raises(ModuleNotFoundError, match=r"No module named 'warpgs\.never_was'"):
+        importlib.import_module("warpgs.never_was")
+
+
+def test_the_changelog_lists_old_imports():
+    """A row for each, with the version since which the new name is there."""
+    rows = re.findall(
+        r"^\| `(warpgs\.\S+)` \| `(\S+)` \| \S+ \|$", (ROOT.parent / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert rows == [(f"{module}.{name}", new) for module, name, new in OLD]

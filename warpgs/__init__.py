@@ -7,58 +7,81 @@ argument ``units``. All other functions, such as `rasterize`, need Gaussians and
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
+from warpgs.faces import OldNames, lazy
 from warpgs.runtime.openmp import let_idle_threads_sleep
 from warpgs.version import __version__ as __version__
 
 let_idle_threads_sleep()  # before torch is imported
+sys.meta_path.insert(0, OldNames())
 
 __all__ = [
     "PRESETS",
     "ActivatedGaussians",
     "Camera",
     "CovarianceGaussians",
+    "DataError",
     "FitConfig",
     "FitResult",
     "Format",
     "Gaussians",
     "GivenDepth",
     "LossTerm",
+    "MeshOptions",
     "Model",
     "Normalization",
+    "NotFiniteError",
     "PointCloud",
     "RasterizeOptions",
     "Reader",
     "Render",
+    "ResourceError",
     "Rule",
     "Scene",
     "StepReport",
     "StoredRun",
     "Strategy",
+    "UsageError",
     "View",
     "ViewMetrics",
     "ViewModule",
+    "WarpgsError",
     "clear_graph_cache",
+    "depth_normals",
     "evaluate",
     "fit",
+    "fuse_mesh",
+    "gaussian_normals",
     "load",
     "load_scene",
+    "look_at",
     "open_run",
     "rasterize",
     "read_ply",
     "render_path",
+    "rule_named",
     "save",
     "select_rule",
+    "write_demo",
     "write_ply",
 ]
 
 if TYPE_CHECKING:
+    from warpgs import export as export
+    from warpgs import io as io
+    from warpgs import kernels as kernels
+    from warpgs import train as train
     from warpgs.constants import Rule
+    from warpgs.errors import DataError, NotFiniteError, ResourceError, UsageError, WarpgsError
     from warpgs.export.base import Format
     from warpgs.export.ply import read_ply, write_ply
+    from warpgs.geometry import depth_normals, gaussian_normals, look_at
     from warpgs.io.load import load_scene
     from warpgs.io.readers import Reader
+    from warpgs.mesh.fuse import MeshOptions
+    from warpgs.mesh.fuse import fuse as fuse_mesh
     from warpgs.pipeline.films.film import render_path
     from warpgs.pipeline.metrics.evaluate import ViewMetrics, evaluate
     from warpgs.pipeline.model.model_file import Model, load, save
@@ -74,6 +97,7 @@ if TYPE_CHECKING:
     from warpgs.render.options import RasterizeOptions
     from warpgs.render.rasterize import rasterize
     from warpgs.render.select_rule import select_rule
+    from warpgs.rules import rule_named
     from warpgs.scene import (
         ActivatedGaussians,
         Camera,
@@ -86,58 +110,39 @@ if TYPE_CHECKING:
         Scene,
         View,
     )
-
-_HOMES = {
-    name: module
-    for module, names in {
-        "warpgs.export.base": ("Format",),
-        "warpgs.export.ply": ("read_ply", "write_ply"),
-        "warpgs.io.load": ("load_scene",),
-        "warpgs.io.readers": ("Reader",),
-        "warpgs.pipeline.metrics.evaluate": ("ViewMetrics", "evaluate"),
-        "warpgs.pipeline.runs.fit": ("FitResult", "fit"),
-        "warpgs.pipeline.runs.folder": ("StoredRun", "open_run"),
-        "warpgs.pipeline.model.model_file": ("Model", "load", "save"),
-        "warpgs.pipeline.films.film": ("render_path",),
-        "warpgs.pipeline.train.config": ("FitConfig",),
-        "warpgs.pipeline.train.loss": ("LossTerm",),
-        "warpgs.pipeline.train.presets": ("PRESETS",),
-        "warpgs.pipeline.train.strategies.base": ("Strategy",),
-        "warpgs.pipeline.train.view_modules.base": ("ViewModule",),
-        "warpgs.pipeline.train.step_report": ("StepReport",),
-        "warpgs.render.graphed": ("clear_graph_cache",),
-        "warpgs.render.options": ("RasterizeOptions",),
-        "warpgs.render.rasterize": ("rasterize",),
-        "warpgs.render.select_rule": ("select_rule",),
-        "warpgs.constants": ("Rule",),
-        "warpgs.scene": (
-            "ActivatedGaussians",
-            "Camera",
-            "CovarianceGaussians",
-            "Gaussians",
-            "GivenDepth",
-            "Normalization",
-            "PointCloud",
-            "Render",
-            "Scene",
-            "View",
-        ),
-    }.items()
-    for name in names
-}
-"""Module of each public name. Modules load on first use, because importing torch and Warp would delay `warpgs --help` by
-seconds."""
-
-
-def __getattr__(name: str) -> object:
-    """Import a public name on first use."""
-    if name not in _HOMES:
-        raise AttributeError(f"module 'warpgs' has no attribute {name!r}")
-    import importlib
-
-    return getattr(importlib.import_module(_HOMES[name]), name)
-
-
-def __dir__() -> list[str]:
-    """Return the public names and those with two underscores."""
-    return sorted([*__all__, *(n for n in globals() if n.startswith("__"))])
+    from warpgs.synthetic.demo import write_demo
+else:
+    __getattr__, __dir__ = lazy(
+        __name__,
+        ("warpgs.constants", "Rule"),
+        ("warpgs.errors", "DataError", "NotFiniteError", "ResourceError", "UsageError", "WarpgsError"),
+        ("warpgs.export.base", "Format"),
+        ("warpgs.export.ply", "read_ply", "write_ply"),
+        ("warpgs.geometry", "depth_normals", "gaussian_normals", "look_at"),
+        ("warpgs.io.load", "load_scene"),
+        ("warpgs.io.readers", "Reader"),
+        ("warpgs.mesh.fuse", "MeshOptions", "fuse as fuse_mesh"),
+        ("warpgs.pipeline.films.film", "render_path"),
+        ("warpgs.pipeline.metrics.evaluate", "ViewMetrics", "evaluate"),
+        ("warpgs.pipeline.model.model_file", "Model", "load", "save"),
+        ("warpgs.pipeline.runs.fit", "FitResult", "fit"),
+        ("warpgs.pipeline.runs.folder", "StoredRun", "open_run"),
+        ("warpgs.pipeline.train.config", "FitConfig"),
+        ("warpgs.pipeline.train.loss", "LossTerm"),
+        ("warpgs.pipeline.train.presets", "PRESETS"),
+        ("warpgs.pipeline.train.step_report", "StepReport"),
+        ("warpgs.pipeline.train.strategies.base", "Strategy"),
+        ("warpgs.pipeline.train.view_modules.base", "ViewModule"),
+        ("warpgs.render.graphed", "clear_graph_cache"),
+        ("warpgs.render.options", "RasterizeOptions"),
+        ("warpgs.render.rasterize", "rasterize"),
+        ("warpgs.render.select_rule", "select_rule"),
+        ("warpgs.rules", "rule_named"),
+        ("warpgs.scene", "ActivatedGaussians", "Camera", "CovarianceGaussians", "Gaussians", "GivenDepth"),
+        ("warpgs.scene", "Normalization", "PointCloud", "Render", "Scene", "View"),
+        ("warpgs.synthetic.demo", "write_demo"),
+        ("warpgs.export",),
+        ("warpgs.io",),
+        ("warpgs.kernels",),
+        ("warpgs.train",),
+    )

@@ -113,8 +113,9 @@ class Registry(Generic[T]):
                 f"give {module}:NAME instead of {Path(file).name}:NAME, or use one file"
             )
         return (
-            f"the {self.kind} {cls.__qualname__} has no registered name; register it "
-            f'with @register("name") of {self.base.__module__} above the class, or name it as module:Class'
+            f"the {self.kind} {cls.__qualname__} has no registered name; register it with "
+            f'@warpgs.{_FACES.get(self.kind, "train")}.register_{self.kind.replace(" ", "_")}("name") above the class, '
+            "or name it as module:Class"
         )
 
     def find(self, name: str | type[T]) -> type[T]:
@@ -155,6 +156,8 @@ class Registry(Generic[T]):
         return cls
 
 
+_FACES = {"camera model": "kernels", "reader": "io", "format": "export"}
+"""Face of the decorator of each kind; for all others `warpgs.train`."""
 _PREFIX = "_warpgs_"
 """Start of the names of modules that were loaded by their path."""
 LOADED: set[str] = set()

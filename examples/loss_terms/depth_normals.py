@@ -2,7 +2,7 @@
 
     warpgs fit scene --out run --loss-terms examples/loss_terms/depth_normals.py:NormalSmoothness --normal-smoothness.weight 0.1
 
-The normals come from rendered depth (`warpgs.geometry.depth_normals`). The term is the mean of 1 - cos of the angle between the
+The normals come from rendered depth (`warpgs.depth_normals`). The term is the mean of 1 - cos of the angle between the
 normals of neighbours, with less weight at colour edges, as in Godard et al. 2017, eq. 5. The weight of the term grows over the
 first steps, because depth is noisy at first.
 """
@@ -14,9 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import warpgs
-from warpgs.errors import UsageError
-from warpgs.geometry import depth_normals
-from warpgs.pipeline.train.loss import LossInputs, register, total
+from warpgs.train import LossInputs, register_loss_term, total
 
 import torch
 
@@ -42,7 +40,7 @@ def unevenness(normals: torch.Tensor, image: torch.Tensor) -> torch.Tensor:
     return difference / weights.clamp_min(1)
 
 
-@register("normal_smoothness")
+@register_loss_term("normal_smoothness")
 @dataclass(frozen=True)
 class NormalSmoothness(warpgs.LossTerm):
     """Edge-aware smoothness of the normals of rendered depth; for pinhole cameras."""
@@ -55,7 +53,7 @@ class NormalSmoothness(warpgs.LossTerm):
 
     def __post_init__(self) -> None:
         if not (0 <= self.weight <= 1000 and self.growth >= 1):
-            raise UsageError(
+            raise warpgs.UsageError(
                 f"normal-smoothness: weight {self.weight} must be between 0 and 1000, growth {self.growth} must be at least 1"
             )
 
@@ -65,4 +63,4 @@ class NormalSmoothness(warpgs.LossTerm):
         # in the axes of the camera: angles between normals do not depend on the pose, and a refined pose gets no gradient
         camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
         weight = self.weight * (inputs.step / self.growth).clamp_max(1)
-        return weight * unevenness(depth_normals(camera, depth), inputs.target.image)
+        return weight * unevenness(warpgs.depth_normals(camera, depth), inputs.target.image)

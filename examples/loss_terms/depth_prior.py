@@ -14,10 +14,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import warpgs
-from warpgs.errors import UsageError
-from warpgs.pipeline.train.loss import LossInputs, register, total
-from warpgs.pipeline.train.views import TrainingView
-from warpgs.scene import Prior
+from warpgs.train import LossInputs, Prior, TrainingView, register_loss_term, total
 
 import torch
 
@@ -68,7 +65,7 @@ def depth_disagreement(
     return torch.where(flat, 0, 1 - total(a * b) / pixels / spread.to(a.dtype))
 
 
-@register("depth_correlation")
+@register_loss_term("depth_correlation")
 @dataclass(frozen=True)
 class DepthCorrelation(warpgs.LossTerm):
     """The weighted disagreement of rendered depth with the prior of the view, in the first part of a fit."""
@@ -82,7 +79,7 @@ class DepthCorrelation(warpgs.LossTerm):
 
     def __post_init__(self) -> None:
         if not (0 <= self.weight <= 1000 and 0 <= self.until <= 1):
-            raise UsageError(
+            raise warpgs.UsageError(
                 f"depth-correlation: weight {self.weight} must be between 0 and 1000, until {self.until} between 0 and 1"
             )
 

@@ -65,7 +65,7 @@ def test_a_term_that_is_not_active_changes_no_bit():
 
 def test_a_term_without_a_name_of_its_own_is_refused():
     """A run folder could not tell it: never registered, or only by the name of the class that it derives from."""
-    with pytest.raises(UsageError, match=r"the loss term Gray has no registered name.*register"):
+    with pytest.raises(UsageError, match=r"the loss term Gray has no registered name.*register_loss_term"):
         dataclasses.replace(PLAIN, loss_terms=(Gray(),))
     LOSS_TERMS.register("gray")(Gray)
 

@@ -1,1 +1,28 @@
 """Export of Gaussians to files of other programs, in the coordinates of the input files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from warpgs.faces import lazy
+
+__all__ = [
+    "Arrays",
+    "Format",
+    "read_gaussians",
+    "register_format",
+    "write_gaussians",
+]
+
+if TYPE_CHECKING:
+    from warpgs.export.arrays import Arrays
+    from warpgs.export.base import Format
+    from warpgs.export.base import register as register_format
+    from warpgs.export.formats import read_gaussians, write_gaussians
+else:
+    __getattr__, __dir__ = lazy(
+        __name__,
+        ("warpgs.export.arrays", "Arrays"),
+        ("warpgs.export.base", "Format", "register as register_format"),
+        ("warpgs.export.formats", "read_gaussians", "write_gaussians"),
+    )

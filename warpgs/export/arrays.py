@@ -90,7 +90,8 @@ def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
 def sigmoid(logits: np.ndarray) -> np.ndarray:
     """Return 1 / (1 + exp(-x)) in float64 without overflow, in the shape [N] of ``logits``."""
     small = np.exp(-np.abs(logits.astype(np.float64)))
-    return np.where(logits >= 0, 1, small) / (1 + small)
+    result: np.ndarray = np.where(logits >= 0, 1, small) / (1 + small)
+    return result
 
 
 def logits(opacities: np.ndarray, quantum: float) -> np.ndarray:

@@ -102,7 +102,7 @@ class Format:
         return Path(path).name.lower().endswith(self.suffix)
 
     def write(self, path: Path, gaussians: Gaussians, normalization: Normalization | None, units: str) -> None:
-        """Write Gaussians, with the arguments of `warpgs.export.formats.write_gaussians`.
+        """Write Gaussians, with the arguments of `warpgs.export.write_gaussians`.
 
         Raises:
             DataError: There are no Gaussians, a number is not finite or cannot be stored, or the degree is too high.
@@ -124,7 +124,7 @@ class Format:
         write_bytes(path, *self.encode(arrays))
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-        """Read Gaussians, with the arguments of `warpgs.export.formats.read_gaussians`.
+        """Read Gaussians, with the arguments of `warpgs.export.read_gaussians`.
 
         Raises:
             DataError: The file is missing or malformed.

@@ -94,11 +94,11 @@ def write_gaussians(
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
 
     Raises:
-        warpgs.errors.DataError: A tensor contains a non-finite number, or one that the format cannot store; there are no
+        warpgs.DataError: A tensor contains a non-finite number, or one that the format cannot store; there are no
             Gaussians; or their spherical-harmonics degree is too high for the format.
-        warpgs.errors.ResourceError: The file cannot be written.
+        warpgs.ResourceError: The file cannot be written.
         TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
-        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+        warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
         ValueError: A tensor has the wrong shape.
     """
@@ -128,9 +128,9 @@ def read_gaussians(
         N Gaussians, torch float32 tensors on the CPU.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
+        warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
             a NaN, an infinity that `read_ply` does not replace, or a rotation of zero length.
-        warpgs.errors.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+        warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
             normalization.
     """
     gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)

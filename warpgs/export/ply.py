@@ -60,11 +60,11 @@ def write_ply(
         antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`; the header declares it.
 
     Raises:
-        warpgs.errors.DataError: A tensor is not finite, before or after the change of coordinates; or the normalization is not
+        warpgs.DataError: A tensor is not finite, before or after the change of coordinates; or the normalization is not
             a similarity. Nothing is written.
-        warpgs.errors.ResourceError: The file cannot be written.
+        warpgs.ResourceError: The file cannot be written.
         TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
-        warpgs.errors.UsageError: The units are unknown, or scene units are given without a normalization.
+        warpgs.UsageError: The units are unknown, or scene units are given without a normalization.
         ValueError: A tensor has the wrong shape.
     """
     path = Path(path)
@@ -100,9 +100,9 @@ def read_ply(path: str | os.PathLike[str], normalization: Normalization | None =
         opacities [N], spherical harmonics [N, K, 3] with K in {1, 4, 9, 16, 25}.
 
     Raises:
-        warpgs.errors.DataError: The file is missing, malformed, truncated, or contains a NaN, another infinity or a rotation of
+        warpgs.DataError: The file is missing, malformed, truncated, or contains a NaN, another infinity or a rotation of
             zero length; the message names the place.
-        warpgs.errors.UsageError: The units are unknown, or scene units are requested without a normalization.
+        warpgs.UsageError: The units are unknown, or scene units are requested without a normalization.
     """
     path = Path(path)
     gaussians = _read(path, normalization, units)

@@ -190,7 +190,7 @@ def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float,
     fx, fy, cx, cy = intrinsics
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
     with np.errstate(all="ignore"):
-        return np.isfinite(lenses.from_plane(model, np.array(distortion), np.stack([x, y], -1))).all(-1)
+        return np.asarray(np.isfinite(lenses.from_plane(model, np.array(distortion), np.stack([x, y], -1))).all(-1))
 
 
 def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:

@@ -115,7 +115,7 @@ class Reader(abc.ABC):
             the fingerprint.
 
         Raises:
-            warpgs.errors.DataError: A file is missing or malformed; the message names file, reason and fix.
+            warpgs.DataError: A file is missing or malformed; the message names file, reason and fix.
         """
 
     def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:

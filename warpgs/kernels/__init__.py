@@ -1,1 +1,21 @@
-"""Warp kernels: one file per op, forward and hand-written backward side by side."""
+"""Warp kernels: one file per op, forward and hand-written backward side by side. Public names are for camera models."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from warpgs.faces import lazy
+
+__all__ = [
+    "CameraModel",
+    "register_camera_model",
+]
+
+if TYPE_CHECKING:
+    from warpgs.kernels.cameras.base import CameraModel
+    from warpgs.kernels.cameras.base import register as register_camera_model
+else:
+    __getattr__, __dir__ = lazy(
+        __name__,
+        ("warpgs.kernels.cameras.base", "CameraModel", "register as register_camera_model"),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import ClassVar
 
 from warpgs.errors import UsageError
 from warpgs.plugins import Registry
@@ -12,7 +13,7 @@ from warpgs.scene import Camera
 class CameraModel:
     """A camera model: Warp functions that map a point in camera coordinates to a pixel, and their gradients."""
 
-    name: str
+    name: ClassVar[str]
     """Name of the model in `Camera.model`."""
     coefficients: int = 0
     """Number P of coefficients in `Camera.distortion`."""

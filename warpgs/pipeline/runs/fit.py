@@ -117,7 +117,7 @@ def fit(
         notes: Earlier choices, which are printed and recorded with the choices of the fit.
         verbose: True to print everything, False to print nothing, "progress" to print progress only.
         on_model: Called after every step with the current model, for viewers: the next step overwrites its tensors.
-        ranks: Processes that fit together, from `warpgs.runtime.ranks.join`, all with the same arguments. Only the first
+        ranks: Processes that fit together, from `warpgs.train.join_ranks`, all with the same arguments. Only the first
             prints, writes and scores; the others return a result without metrics.
         **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
             ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` and `warpgs

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import torch
 
@@ -132,7 +133,7 @@ class MemoryPlan:
     graph_refused: bool = False
     """True if captured steps would exceed the limit, so that steps are not captured."""
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Return plain values for metrics.json."""
         return asdict(self)
 

@@ -65,7 +65,7 @@ class OptimizerConfig:
     """Fraction of the steps, the last ones, over which the parameters are averaged; the mean is the result of the fit. 0 for no
     mean. None: chosen by the number of views."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.average_last is not None and not 0 <= self.average_last <= 1:
             raise UsageError(f"optimizer: `average-last` must be in [0, 1], not {self.average_last}")
         if self.opacities_decay is not None and not 0 <= self.opacities_decay <= MAX_DECAY:
@@ -118,7 +118,7 @@ class PhaseConfig:
     """Smallest number of steps from the first sampling event to the second in a short fit, which shortens this interval. On a
     CPU an event takes as long as ten steps."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.coarse < 0 or self.stable < 0 or not 0 <= self.growth < math.inf:
             raise UsageError(
                 "phases: `coarse`, `stable` and `growth` must be at least 0 and finite, not "

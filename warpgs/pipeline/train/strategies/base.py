@@ -33,7 +33,7 @@ class Strategy:
     """Frozen dataclass of the strategy's settings; None without settings. They become flags, grouped under the strategy's
     name."""
     STATE: ClassVar[staticmethod[[Any, str], None]] = staticmethod(anything)
-    """Schema (`warpgs.schema`) of the plain values that `state` returns; stored values are checked against it before `load`."""
+    """Schema (`warpgs.train.state_schema`) of the plain values that `state` returns; checked before `load`."""
 
     def __init__(self, context: StrategyContext):
         """Keep the context, which the strategy works with; nothing is trained yet.
@@ -97,7 +97,7 @@ class Strategy:
 
         Args:
             phase: Value of `phase` for the step.
-            settings: Settings of the step, by the columns of `warpgs.kernels.step_buffers.Setting`, float32, shape [7].
+            settings: Settings of the step, by the columns of `warpgs.train.Setting`, float32, shape [7].
             going: True if the step is taken, bool, shape [1]; if False, nothing may change.
         """
 

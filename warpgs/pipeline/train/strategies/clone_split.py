@@ -9,7 +9,7 @@ import torch
 
 from warpgs import schema
 from warpgs.pipeline.model.table import Column, DensityUpdate
-from warpgs.pipeline.train.context import Growth
+from warpgs.pipeline.train.context import Growth, StrategyContext
 from warpgs.pipeline.train.strategies.base import Strategy, register
 from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
 
@@ -20,7 +20,7 @@ class CloneSplit(Strategy):
 
     STATE = staticmethod(schema.fields(GradientGrowth.STATE))
 
-    def __init__(self, context):
+    def __init__(self, context: StrategyContext):
         """Begin without statistics, and before the first opacity reset."""
         super().__init__(context)
         self.gradients = GradientGrowth(context)
@@ -37,7 +37,9 @@ class CloneSplit(Strategy):
         """Return whether gradients are gathered in a step."""
         return self.gradients.gathers(step)
 
-    def statistics(self, phase, v_projected, visible, size):
+    def statistics(
+        self, phase: Hashable, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
+    ) -> Mapping[str, torch.Tensor]:
         """Return statistics of gradients, [N] each; ``v_projected`` has shape [1, N, 12], ``visible`` [1, N]."""
         return self.gradients.statistics(v_projected, visible, size) if phase else {}
 

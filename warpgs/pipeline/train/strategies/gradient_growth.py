@@ -50,7 +50,7 @@ class DensityConfig:
     morton_order: bool = True
     """Order the Gaussians along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.every < 1 or self.start < 0 or self.reset_every < 0:
             raise UsageError(
                 "density: `every` must be at least 1, `start` and `reset-every` at least 0, not "

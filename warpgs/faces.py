@@ -1,0 +1,143 @@
+"""Public names: how a face loads them on first use, and where a name is that older code imports from within the package.
+
+The faces are `warpgs`, `warpgs.train`, `warpgs.kernels`, `warpgs.io` and `warpgs.export`. Everything else may move. Inside the
+package, names are imported from the modules that define them, so that faces make no circle.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+OLD = {
+    "errors": {
+        name: f"warpgs.{name}" for name in ("DataError", "NotFiniteError", "ResourceError", "UsageError", "WarpgsError")
+    },
+    "export.arrays": {"Arrays": "warpgs.export.Arrays"},
+    "export.base": {"Format": "warpgs.export.Format", "register": "warpgs.export.register_format"},
+    "export.formats": {name: f"warpgs.export.{name}" for name in ("read_gaussians", "write_gaussians")},
+    "geometry": {name: f"warpgs.{name}" for name in ("depth_normals", "gaussian_normals", "look_at")},
+    "io.folders": {name: f"warpgs.io.{name}" for name in ("SceneFolder", "ViewList", "view_name")},
+    "io.given_maps": {"NamedMaps": "warpgs.io.NamedMaps"},
+    "io.images": {name: f"warpgs.io.{name}" for name in ("Lens", "LoadedImage")},
+    "io.map_files": {"MapOptions": "warpgs.io.MapOptions"},
+    "io.readers": {
+        **{name: f"warpgs.io.{name}" for name in ("Probe", "Reader", "ReadOptions")},
+        "register": "warpgs.io.register_reader",
+    },
+    "kernels.cameras.base": {
+        "CameraModel": "warpgs.kernels.CameraModel",
+        "register": "warpgs.kernels.register_camera_model",
+    },
+    "kernels.ssim": {"ssim": "warpgs.train.ssim"},
+    "kernels.step_buffers": {"Setting": "warpgs.train.Setting"},
+    "mesh.fuse": {"MeshOptions": "warpgs.MeshOptions", "fuse": "warpgs.fuse_mesh"},
+    "pipeline.model.init": {"InitConfig": "warpgs.train.InitConfig"},
+    "pipeline.model.table": {name: f"warpgs.train.{name}" for name in ("Column", "DensityUpdate", "Table")},
+    "pipeline.train.context": {name: f"warpgs.train.{name}" for name in ("Growth", "Settings", "StrategyContext")},
+    "pipeline.train.learned_views": {"LearnedView": "warpgs.train.LearnedView"},
+    "pipeline.train.loss": {
+        **{name: f"warpgs.train.{name}" for name in ("LossInputs", "LossTerm", "Target", "total")},
+        "register": "warpgs.train.register_loss_term",
+    },
+    "pipeline.train.loss_terms.photometric": {"photometric_loss": "warpgs.train.photometric_loss"},
+    "pipeline.train.memory_plan": {"most_instances": "warpgs.train.most_instances"},
+    "pipeline.train.presets": {"PRESETS": "warpgs.PRESETS"},
+    "pipeline.train.schedule": {name: f"warpgs.train.{name}" for name in ("OptimizerConfig", "Phases")},
+    "pipeline.train.step": {name: f"warpgs.train.{name}" for name in ("captured_renderer", "eager_renderer")},
+    "pipeline.train.strategies.base": {
+        "Strategy": "warpgs.train.Strategy",
+        "register": "warpgs.train.register_strategy",
+    },
+    "pipeline.train.strategies.clone_split": {"CloneSplit": "warpgs.train.CloneSplit"},
+    "pipeline.train.strategies.gradient_growth": {"GradientGrowth": "warpgs.train.GradientGrowth"},
+    "pipeline.train.view_modules.base": {
+        **{name: f"warpgs.train.{name}" for name in ("FittedViews", "Tensors", "ViewModule")},
+        "register": "warpgs.train.register_view_module",
+    },
+    "pipeline.train.views": {"TrainingView": "warpgs.train.TrainingView"},
+    "report.images": {"png": "PIL.Image.Image.save"},
+    "rules": {"rule_named": "warpgs.rule_named"},
+    "runtime.ranks": {"join": "warpgs.train.join_ranks"},
+    "runtime.step_sizes": {name: f"warpgs.train.{name}" for name in ("Needs", "STEP", "StepSizes")},
+    "scene": {"Prior": "warpgs.train.Prior", "Scene": "warpgs.Scene"},
+    "schema": {"fields": "warpgs.train.state_schema"},
+    "synthetic.demo": dict.fromkeys(("camera_path", "still_life", "write_demo"), "warpgs.write_demo"),
+    "synthetic.raycast": dict.fromkeys(("Light", "render"), "warpgs.write_demo"),
+}
+"""Names that older pages and examples imported, by their module below ``warpgs``, each with the name that replaces it."""
+
+
+def lazy(face: str, *homes: tuple[str, ...]) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` of a face, whose names load on first use.
+
+    Importing torch and Warp at once would delay `warpgs --help` by seconds.
+
+    Args:
+        face: Name of the face's module.
+        homes: Rows of a module's dotted name and its public names, each as ``name`` or ``name as public_name``. A module
+            without names is itself an attribute of the face, by the last part of its dotted name.
+    """
+    places: dict[str, tuple[str, str]] = {}
+    for home, *names in homes:
+        for name in names or [f" as {home.rpartition('.')[2]}"]:
+            attribute, _, public = name.partition(" as ")
+            places[public or attribute] = (home, attribute)
+
+    def get(name: str) -> object:
+        """Import a public name on first use."""
+        if name not in places:
+            raise AttributeError(f"module {face!r} has no attribute {name!r}")
+        home, attribute = places[name]
+        module = importlib.import_module(home)
+        return getattr(module, attribute) if attribute else module
+
+    def names_of_face() -> list[str]:
+        """Return the public names and those with two underscores."""
+        return sorted([*places, *(n for n in vars(sys.modules[face]) if n.startswith("__"))])
+
+    return get, names_of_face
+
+
+class OldNames:
+    """Finder of the modules of `OLD`: an import of a module or name that is gone raises an error with the new name."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        """Return what the next finders find; None for other modules.
+
+        Raises:
+            ModuleNotFoundError: The module is gone.
+        """
+        if not name.startswith("warpgs."):
+            return None
+        own = OLD.get(name.removeprefix("warpgs."), {})
+        below = {f"warpgs.{old}": names for old, names in OLD.items() if f"warpgs.{old}".startswith(f"{name}.")}
+        if not own and not below:
+            return None
+        later: list[Any] = sys.meta_path[sys.meta_path.index(self) + 1 :]
+        spec = next((found for finder in later if (found := finder.find_spec(name, path, target))), None)
+        if spec is None:
+            moved = [f"{old}.{n} is now {new}" for old, names in {name: own, **below}.items() for n, new in names.items()]
+            raise ModuleNotFoundError(f"the module {name} is gone: {'; '.join(moved)}", name=name)
+        load = spec.loader.exec_module
+
+        def load_and_compare(module: Any) -> None:
+            """Load a module; let it name the new places of what it lacks, and ask this finder for modules below it."""
+            load(module)
+            lost = {n: new for n, new in own.items() if not hasattr(module, n)}
+            if lost:
+                module.__getattr__ = lambda n: _raise_moved(name, n, lost)
+            if below and not hasattr(module, "__path__"):
+                module.__path__ = []  # a folder that became a file
+
+        spec.loader.exec_module = load_and_compare
+        return spec
+
+
+def _raise_moved(module: str, name: str, lost: dict[str, str]) -> None:
+    """Raise the error about a name that a module lacks."""
+    if name in lost:
+        raise ImportError(f"{module}.{name} is now {lost[name]}", name=module)
+    raise AttributeError(f"module {module!r} has no attribute {name!r}")
