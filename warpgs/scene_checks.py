@@ -169,7 +169,7 @@ def _checked_normals(what: str, value: Any, camera: Camera) -> np.ndarray:
         raise _wrong(what, "unit vectors, or 0 where missing", f"a length of {math.sqrt(squares.max()):.4g}", fix)
     if camera.model == "pinhole":
         K, x, y = camera.K, np.arange(0, camera.width, 4) + 0.5, np.arange(0, camera.height, 4)[:, None] + 0.5
-        part = normals[::4, ::4]  # enough for a share of the pixels
+        part = normals[::4, ::4]  # enough for a fraction of the pixels
         along = part[..., 0] * ((x - K[0, 2]) / K[0, 0]) + part[..., 1] * ((y - K[1, 2]) / K[1, 1]) + part[..., 2]
         if np.count_nonzero(along > 0) > 0.5 * np.count_nonzero(squares[::4, ::4]):
             fix = "for OpenGL axes, give normals * np.float32([1, -1, -1])"
