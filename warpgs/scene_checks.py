@@ -22,7 +22,7 @@ Record = TypeVar("Record", Camera, GivenDepth, View, PointCloud, Normalization, 
 SLACK = 1e-3
 """Accepted distance of a value from its range, a quarter of an 8-bit level: resampling and rounding may overshoot."""
 MOST = float(np.finfo(np.float32).max)
-"""Upper end of the range of depths."""
+"""Largest depth, and largest scale."""
 COEFFICIENTS = {"pinhole": 0, "orthographic": 0, "opencv": 8, "fisheye": 4}
 """Number of coefficients of distortion by camera model; a model of the user's own is checked when it is rendered."""
 MIN_FOCAL = 0.01
@@ -41,6 +41,8 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
         _check(of + name, getattr(scene, name), str, f"give str({name})")
     for name in ("views", "notes"):
         _check(of + name, getattr(scene, name), (tuple, list), f"give a tuple, ({name[:-1]}, ...)")
+    for i, note in enumerate(scene.notes):
+        _check(f"{of}notes[{i}]", note, str, "give str(note)")
     views, points, background, n = checked_views(scene.views, where), scene.points, scene.background, scene.normalization
     twice = [name for name, count in Counter(v.name for v in views).items() if count > 1]
     if twice:
@@ -52,7 +54,7 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
     colors = _numbers(f"{of}background", given, (3,), "give (red, green, blue)", kind=np.float64)
     _check(f"{of}normalization", n, Normalization, "give Normalization(offset, scale)")
     offset = _numbers(f"{of}normalization.offset", n.offset, (3,), "give three numbers", -math.inf, math.inf, np.float64)
-    if not (isinstance(n.scale, (int, float, np.number)) and 0 < n.scale < math.inf):
+    if not (isinstance(n.scale, (int, float, np.number)) and 0 < n.scale <= MOST):
         raise _wrong(f"{of}normalization.scale", "a number above 0", repr(n.scale), "give scene units per file unit, or 1.0")
     return _with(
         scene,
@@ -70,7 +72,7 @@ def checked_views(views: Iterable[View], where: str = "") -> list[View]:
     Raises:
         DataError: A field is invalid; the message starts with ``where``.
     """
-    if isinstance(views, (View, Scene)) or not isinstance(views, Iterable):
+    if isinstance(views, (View, Scene, np.ndarray)) or not isinstance(views, Iterable):
         fix = "give scene.views" if isinstance(views, Scene) else "give [view]"
         raise _wrong(f"{where}views", "a list of View", type(views).__name__, fix)
     return [_checked_view(f"{where}views[{i}]", v, where) for i, v in enumerate(views)]
@@ -92,7 +94,7 @@ def _checked_view(what: str, view: View, where: str) -> View:
     _check(f"{of}alpha_estimated", view.alpha_estimated, (bool, np.bool_), "give True or False")
     if depth is not None:
         _check(f"{of}depth", depth, GivenDepth, "give GivenDepth(depth)")
-        if depth.kind not in DEPTH_KINDS:
+        if not isinstance(depth.kind, str) or depth.kind not in DEPTH_KINDS:
             fix = f"give {', '.join(DEPTH_KINDS[:-1])} or {DEPTH_KINDS[-1]}"
             raise _wrong(f"{of}depth.kind", "the meaning of the values", repr(depth.kind), fix)
         sure = depth.confidence
@@ -108,7 +110,7 @@ def _checked_camera(what: str, camera: Camera) -> Camera:
     _check(what, camera, Camera, "give Camera(viewmat, K, width, height)")
     for name in ("width", "height"):
         pixels = getattr(camera, name)
-        if not isinstance(pixels, (int, np.integer)) or isinstance(pixels, bool) or pixels < 1:
+        if not isinstance(pixels, (int, np.integer)) or isinstance(pixels, bool) or not 1 <= pixels < 2**31:
             raise _wrong(f"{what}.{name}", "a whole number of pixels", repr(pixels), f"give int({name}), at least 1")
     _check(f"{what}.model", camera.model, str, "give its name, such as 'pinhole'")
 
@@ -221,6 +223,8 @@ def _plain(what: str, value: Any, needs: str, fix: str) -> np.ndarray:
             return np.asarray(value.detach().cpu().numpy())
         except (TypeError, RuntimeError) as e:  # bfloat16, sparse
             raise _wrong(what, needs, f"a tensor of {value.dtype}", "give a dense tensor, or .float()") from e
+    if isinstance(value, np.ma.MaskedArray):
+        raise _wrong(what, needs, "MaskedArray", f"give {what.rpartition(' ')[2]}.data, and its mask as View.mask")
     if not isinstance(value, np.ndarray):
         raise _wrong(what, needs, type(value).__name__, f"give {fix}")
     return value

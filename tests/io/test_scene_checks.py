@@ -84,6 +84,7 @@ IN_VIEWS = {
     "image of another size": (changed("view", image=PIXELS[:-2]), "image", f"resize it to the camera's {W} x {H} px"),
     "image a list": (changed("view", image=PIXELS.tolist()), "image", "np.asarray(image, np.float32)"),
     "image bfloat16": (changed("view", image=torch.from_numpy(PIXELS).bfloat16()), "image", ".float()"),
+    "image masked": (changed("view", image=np.ma.masked_array(PIXELS)), "image", "image.data, and its mask as View.mask"),
     "image None": (changed("view", image=None), "image", "np.asarray(image, np.float32)"),
     "mask of integers": (changed("view", mask=MASK.astype(np.int64)), "mask", "give mask > 0"),
     "mask of floats": (changed("view", mask=FLAT), "mask", "give mask > 0"),
@@ -130,6 +131,7 @@ IN_SCENE = {
     "name twice": (changed("view", name="a.png"), "view 'a.png': name", "rename or remove one"),
     "views a dict": (changed("scene", views={"a": 1}), "scene.views", "give a tuple, (view, ...)"),
     "notes a text": (changed("scene", notes="made by hand"), "scene.notes", "give a tuple, (note, ...)"),
+    "note a number": (changed("scene", notes=(1,)), "scene.notes[0]", "give str(note)"),
     "path None": (changed("scene", path=None), "scene.path", "give str(path)"),
     "points an array": (changed("scene", points=np.zeros((6, 3))), "scene.points", "give PointCloud(points, colors)"),
     "points homogeneous": (changed("points", points=np.ones((6, 4))), "scene.points.points", "a row x, y, z for each point"),
@@ -186,7 +188,7 @@ def test_a_wrong_field_is_named_with_its_fix(case, way, tmp_path):
 
 def test_arguments_that_are_no_views_and_no_scene():
     scene = right()
-    for views, fix in ((scene, "give scene.views"), (scene.views[0], r"give \[view\]"), (3, r"give \[view\]")):
+    for views, fix in ((scene, "give scene.views"), (scene.views[0], r"give \[view\]"), (PIXELS, r"give \[view\]")):
         with pytest.raises(DataError, match=f"views must be a list of View; got .*{fix}"):
             warpgs.evaluate(three_gaussians(), views)
     assert warpgs.evaluate(three_gaussians(), []) == []
