@@ -38,7 +38,7 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
     """
     of = f"{where}scene."
     for name in ("path", "format", "fingerprint", "pixels"):
-        _check(of + name, getattr(scene, name), str, f"give str({name})")
+        _check(of + name, getattr(scene, name), str, "give a str, '' if unknown")
     for name in ("views", "notes"):
         _check(of + name, getattr(scene, name), (tuple, list), f"give a tuple, ({name[:-1]}, ...)")
     for i, note in enumerate(scene.notes):
@@ -119,7 +119,8 @@ def _checked_camera(what: str, camera: Camera) -> Camera:
 
     viewmat = matrix("viewmat", camera.viewmat, (4, 4), "give camera_from_world, [R t] above the row 0, 0, 0, 1")
     K, R, row = matrix("K", camera.K, (3, 3), INTRINSICS), viewmat[:3, :3].astype(np.float64), viewmat[3]
-    off = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 2 else math.inf  # entries of a rotation are at most 1
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = float(np.abs(R @ R.T - np.eye(3)).max())
     for good, needs, got, fix in (
         (
             np.abs(row - (0, 0, 0, 1)).max() <= POSE_TOLERANCE,
@@ -133,7 +134,12 @@ def _checked_camera(what: str, camera: Camera) -> Camera:
         if not good:
             raise _wrong(f"{what}.viewmat", needs, str(got), fix)
     if not max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1))) <= K_TOLERANCE:
-        raise _wrong(f"{what}.K", "without skew, above 0, 0, 1", str(K.tolist()), f"divide K by K[2, 2]; {INTRINSICS}")
+        raise _wrong(
+            f"{what}.K",
+            "without skew, above 0, 0, 1",
+            str(K.tolist()),
+            f"divide K by K[2, 2], or undistort skewed images; {INTRINSICS}",
+        )
     focal, sides = np.abs([K[0, 0], K[1, 1]]), np.array([camera.width, camera.height])
     if not focal.all() or (camera.model in ("pinhole", "opencv") and (focal < MIN_FOCAL * sides).any()):
         fix = "multiply normalised intrinsics by width (first row) and height (second row)"
@@ -175,7 +181,7 @@ def _checked_normals(what: str, value: Any, camera: Camera) -> np.ndarray:
         along = part[..., 0] * ((x - K[0, 2]) / K[0, 0]) + part[..., 1] * ((y - K[1, 2]) / K[1, 1]) + part[..., 2]
         if np.count_nonzero(along > 0) > 0.5 * np.count_nonzero(squares[::4, ::4]):
             fix = "for OpenGL axes, give normals * np.float32([1, -1, -1])"
-            raise _wrong(what, "towards the camera, in OpenCV axes", "most of them facing away", fix)
+            raise _wrong(what, "turned towards the camera, in OpenCV axes", "most of them facing away", fix)
     return normals
 
 
@@ -226,7 +232,7 @@ def _plain(what: str, value: Any, needs: str, fix: str) -> np.ndarray:
     if isinstance(value, np.ma.MaskedArray):
         raise _wrong(what, needs, "MaskedArray", f"give {what.rpartition(' ')[2]}.data, and its mask as View.mask")
     if not isinstance(value, np.ndarray):
-        raise _wrong(what, needs, type(value).__name__, f"give {fix}")
+        raise _wrong(what, needs, type(value).__name__, "give an array" if value is None else f"give {fix}")
     return value
 
 
@@ -252,7 +258,9 @@ def _value_fix(noun: str, real: bool, least: float, most: float, low: float, hig
     """Return the fix for an array of another type, or with values from ``least`` to ``most`` outside of [low, high]."""
     if not math.isfinite(least + most):
         replaced = f"replace NaN and infinity: np.nan_to_num({noun}, posinf=0, neginf=0)"
-        return f"estimate it again, or remove it from {noun}" if high == math.inf else replaced
+        return "estimate it again, or remove what is not finite" if high == math.inf else replaced
+    if not real and low == -1:
+        return f"decode colours: {noun} / np.float32(127.5) - 1"
     if not real and high == MOST:
         return f"give {noun} * np.float32(unit); unit is 0.001 for millimetres if cameras are in metres"
     if high == 1 and least >= low and most > (16 if real else 1):
