@@ -78,7 +78,8 @@ def test_a_reader_that_does_not_find_its_format_is_refused(tmp_path):
 
 def test_camera_models_arrive_and_change_the_fingerprint(folder):
     def fisheye(scene):
-        return replace(scene, views=tuple(replace(v, camera=replace(v.camera, model="fisheye")) for v in scene.views))
+        lens = {"model": "fisheye", "distortion": np.zeros(4)}
+        return replace(scene, views=tuple(replace(v, camera=replace(v.camera, **lens)) for v in scene.views))
 
     plain, other = load_scene(folder, reader=Cameras()), load_scene(folder, reader=Cameras(fisheye))
     assert {v.camera.model for v in other.views} == {"fisheye"} and plain.fingerprint != other.fingerprint
@@ -93,12 +94,12 @@ def with_view(**changes):
     [
         (
             with_view(image=np.zeros((3, 4, 3), np.float32)),
-            r"'9.png': its image is float32 \[3, 4, 3\], the camera needs",
+            r"'9.png': image must be float32, in \[0, 1\], shape \[12, 16, 3\]; got shape \[3, 4, 3\]",
         ),
-        (with_view(image=np.zeros((12, 16, 3))), r"'9.png': its image is float64"),
-        (with_view(mask=np.ones((12, 16))), r"'9.png': its mask is float64 \[12, 16\], the camera needs bool"),
-        (with_view(camera=Camera(2 * np.eye(4), scenes.K, 16, 12)), r"'9.png': the pose is not rigid"),
-        (with_view(name="5.png"), r"the image '5.png' is listed twice"),
+        (with_view(image=np.zeros((12, 16, 3), np.uint8)), r"'9.png': image must be float32.* got uint8"),
+        (with_view(mask=np.ones((12, 16))), r"'9.png': mask must be bool.* got float64; give mask > 0"),
+        (with_view(camera=Camera(np.diag([2.0, 2, 2, 1]), scenes.K, 16, 12)), r"'9.png': camera.viewmat must be rigid"),
+        (with_view(name="5.png"), r"view '5.png': name must be unique"),
         (lambda scene: replace(scene, views=scene.views[:1]), r"1 usable view \(made in memory\)"),
     ],
 )

@@ -23,6 +23,14 @@ def test_psnr_of_known_errors():
     b = a.copy()
     b[4:] = 1
     assert psnr(b, a, region) == math.inf and psnr(b, a) < 10
+    for wrong, error, message in (
+        (region.astype(int), TypeError, "region must be bool, not int64; give region > 0"),
+        (region[1:], ValueError, "region must have shape"),
+    ):
+        with pytest.raises(error, match=message):
+            psnr(b, a, wrong)
+    with pytest.raises(ValueError, match="both images must have one shape"):
+        psnr(b[:1], a)  # which numpy would broadcast
 
 
 def test_scores_are_of_the_saved_picture():

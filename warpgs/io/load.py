@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from warpgs.errors import DataError, UsageError
 from warpgs.io.black_background import cut_from_black
 from warpgs.io.decoding import MAX_PIXELS
@@ -18,11 +16,11 @@ from warpgs.io.image_formats.kinds import READ
 from warpgs.io.images import list_images
 from warpgs.io.map_files import NO_MAPS, MapOptions
 from warpgs.io.normalize import fingerprint, normalization_of, normalize_points, normalize_view
-from warpgs.io.pose_matrices import rigid
 from warpgs.io.readers import Reader, ReadOptions, all_readers, find_reader, image_scale
 from warpgs.io.score_masks import FOLDER, add_score_masks
 from warpgs.io.unread_formats import unread_note
-from warpgs.scene import Normalization, Scene, View
+from warpgs.scene import Normalization, Scene
+from warpgs.scene_checks import checked_scene
 from warpgs.suggestion import similar_folder
 
 
@@ -169,8 +167,12 @@ def _finished(
     root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None, options: ReadOptions
 ) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
-    if not isinstance(scene, Scene) or scene.normalization.scale != 1 or scene.normalization.offset.any():
-        raise UsageError(f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it")
+    own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
+    if not isinstance(scene, Scene):
+        raise UsageError(own)
+    scene = checked_scene(scene, f"{root}, ")
+    if scene.normalization.scale != 1 or scene.normalization.offset.any():
+        raise UsageError(own)
     views, points, more = list(scene.views), scene.points, scene.notes
     if len(views) < 2:
         reasons = f" ({'; '.join(more)})" if more else ""
@@ -178,7 +180,6 @@ def _finished(
             f"{root}: the scene has {len(views)} usable view{'s' if len(views) != 1 else ''}{reasons}; depth needs at least 2. "
             "Add images with cameras"
         )
-    _check_views(root, views)
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more
@@ -203,26 +204,3 @@ def _finished(
         notes=(*notes, *more),
         fingerprint=fingerprint(views),
     )
-
-
-def _check_views(root: Path, views: list[View]) -> None:
-    """Check that names are unique, poses rigid, and images and masks of the size of the camera."""
-    seen: set[str] = set()
-    for v in views:
-        if v.name in seen:
-            raise DataError(f"{root}: the image {v.name!r} is listed twice; remove one of its cameras")
-        seen.add(v.name)
-        where, size = f"{root}, image {v.name!r}", (v.camera.height, v.camera.width)
-        rigid(np.asarray(v.camera.viewmat), where)
-        wanted = [
-            ("image", v.image, (*size, 3), np.float32), ("mask", v.mask, size, bool), ("alpha", v.alpha, size, np.float32),
-        ]  # fmt: skip
-        if v.depth is not None:
-            wanted += [("depth", v.depth.values, size, np.float32), ("confidence", v.depth.confidence, size, np.float32)]
-        wanted.append(("normals", v.normals, (*size, 3), np.float32))
-        for noun, array, shape, dtype in wanted:
-            if array is not None and (array.shape != shape or array.dtype != dtype):
-                raise DataError(
-                    f"{where}: its {noun} is {array.dtype} {list(array.shape)}, the camera needs {np.dtype(dtype)} "
-                    f"{list(shape)}; fix the reader"
-                )

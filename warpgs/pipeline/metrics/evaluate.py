@@ -16,6 +16,7 @@ from warpgs.pipeline.metrics.region import scored_region
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, View
+from warpgs.scene_checks import checked_views
 
 VARIANTS = {
     "psnr": "of images rounded to 8 bits, over the scored pixels alone; mean over images",
@@ -138,7 +139,11 @@ def evaluate(
 
     Returns:
         The scores of each view, in order; `summarize` gives their means.
+
+    Raises:
+        DataError: A field of a view is invalid; the message names the view, the field and the fix.
     """
+    views = checked_views(views)
     options = RasterizeOptions() if options is None else options
     rendered = ((v, render_view(gaussians, v, options)) for v in views)
     return [score(v, image, lpips, alpha) for v, (image, _, alpha) in rendered]

@@ -29,7 +29,18 @@ def psnr_of(mse: float) -> float:
 
 
 def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
-    """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal."""
+    """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal.
+
+    Raises:
+        TypeError: The region is not bool: integers would select rows.
+        ValueError: A shape disagrees.
+    """
+    if image.shape != target.shape:
+        raise ValueError(f"psnr: both images must have one shape, not {list(image.shape)} and {list(target.shape)}; resize one")
+    if region is not None and region.dtype != bool:
+        raise TypeError(f"psnr: region must be bool, not {region.dtype}; give region > 0")
+    if region is not None and region.shape != image.shape[:2]:
+        raise ValueError(f"psnr: region must have shape {list(image.shape[:2])}, not {list(region.shape)}; resize it")
     difference = image.astype(np.float64) - target
     if region is not None:
         difference = difference[region]

@@ -60,6 +60,7 @@ from warpgs.runtime.load_module import told_of_compiling
 from warpgs.runtime.ranks import ALONE, Ranks
 from warpgs.runtime.terminal import Detail, counted
 from warpgs.scene import Camera, Scene
+from warpgs.scene_checks import checked_scene
 
 COMPILING = "compiling kernels, once on this machine, for a minute or two"
 """Message while kernels are compiled."""
@@ -124,7 +125,7 @@ def fit(
             fit --help-all` list them.
 
     Raises:
-        DataError: The file of a preset cannot be read.
+        DataError: The file of a preset cannot be read, or a field of the scene is invalid; the message names view and field.
         UsageError: A setting is unknown, of the wrong type or out of range, a preset or a split is invalid, ``out`` is not
             empty, or ``resume`` is given without ``out``.
         WarpgsError: Any other error that a user can fix, before the first step if possible.
@@ -133,6 +134,12 @@ def fit(
     if resume and out is None:
         raise UsageError("resume requires out, the run folder to continue")
     check_overrides(overrides)
+    if isinstance(scene, Scene):
+        scene = checked_scene(scene)
+    elif not isinstance(scene, (SceneRequest, str, Path)):
+        raise UsageError(
+            f"scene must be a warpgs.Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)"
+        )
     config, origin = chosen_settings(preset, overrides)
     spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
     if spec is not None:
