@@ -256,3 +256,9 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
         assert said in text and len(text.splitlines()) == 1
     assert main(["compare", *base, "--presets", f"default,{tmp_path}/broken.py:X"]) == 2
     assert f"the preset '{tmp_path}/broken.py:X' cannot be loaded" in capsys.readouterr().err
+
+
+def test_presets_are_listed():
+    """As a mapping: names, number, membership."""
+    assert list(warpgs.PRESETS) == ["default", "3dgs", "mcmc", "paper-literal", "quick"]
+    assert len(warpgs.PRESETS) == 5 and "quick" in warpgs.PRESETS

@@ -83,7 +83,7 @@ class Presets(Mapping[str, "FitConfig"]):
         return iter([*self._files, *(n for n in self._made if n not in self._files)])
 
     def __len__(self) -> int:
-        return len([*self])
+        return sum(1 for _ in self)  # a list would ask for its length first
 
     def __contains__(self, name: object) -> bool:
         return name in self._files or name in self._made
