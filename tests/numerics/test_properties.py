@@ -30,13 +30,14 @@ RULE_NAMES = st.sampled_from(["exact", "gsplat-1.5", "inria"])
 F32, F64 = torch.float32, torch.float64
 
 ROUNDINGS = {
-    # property: largest error in epsilons of the terms that cancel. An operation rounds by half an epsilon.
-    "scale": 4,  # exponential of the logarithm (1), product with the pixel's distance (1), each in two scenes
-    "rigid": 16,  # 3 coordinates (sqrt 3) of a product with a matrix and a shift (3.5), perspective (2), each in two scenes
-    "rigid gradient": 176,  # d sigma away a slope changes d^2 times as much: 2 log 255 = 11 where alpha is 1/255
-    "identity": 8,  # a product with a matrix (2.5) and a cross product (1.5), each for the scene and the cameras
-    "mirror": 4,  # the principal point (0.5), the mean (1) and the pixel's distance (0.5) in pixels, each in two scenes
-    "sum over cameras": 3,  # three additions of four cameras, in two orders
+    # property: largest error in epsilons of the terms that cancel. An operation rounds by half an epsilon. Measured is the
+    # largest of 1000 to 3000 scenes, drawn with several seeds, on a CPU, of both scalar types
+    "scale": 4,  # measured 0.44; exponential of the logarithm (1), product with the pixel's distance (1), in two scenes
+    "rigid": 16,  # measured 1.1; 3 coordinates (sqrt 3) of matrix product and shift (3.5), perspective (2), in two scenes
+    "rigid gradient": 176,  # measured 9.2; d sigma away a slope changes d^2 times as much: 2 log 255 = 11 at alpha 1/255
+    "identity": 8,  # measured 1.0; a product with a matrix (2.5) and a cross product (1.5), for the scene and the cameras
+    "mirror": 4,  # measured 0.27; principal point (0.5), mean (1) and the pixel's distance (0.5) in pixels, in two scenes
+    "sum over cameras": 3,  # measured 1.6; three additions of four cameras, in two orders
 }
 
 
@@ -54,16 +55,19 @@ def build(scene, device, dtype=F32, cameras: int = 2, degree: int = 1) -> tuple[
 
 def close(name: str, found: torch.Tensor, wanted: torch.Tensor, terms: float) -> None:
     """Assert that an error is at most the table's number of roundings of the terms that cancel."""
-    error, rounding = float((found.detach() - wanted.detach()).double().norm()), torch.finfo(found.dtype).eps * terms
+    kind = torch.finfo(found.dtype)
+    error, rounding = float((found.detach() - wanted.detach()).double().norm()), kind.eps * terms + kind.tiny
     assert error <= ROUNDINGS[name] * rounding, f"{name}: an error of {error:.1e} with roundings of {rounding:.1e}"
 
 
 def close_pictures(name: str, found: Render, wanted: Render, terms: float, layers: int) -> None:
     """Assert the same of colour, alpha and depth. Every layer rounds what shines through once more: a random walk."""
     for picture in ("rgb", "alpha", "depth"):
-        own = getattr(wanted, picture).detach()
+        # where alpha rounds to 0, depth is a ratio of numbers that underflow
+        seen = (wanted.alpha > 0).to(wanted.alpha) if picture == "depth" else 1.0
+        own, other = getattr(wanted, picture).detach() * seen, getattr(found, picture).detach() * seen
         whole = torch.ones_like(own) if picture == "alpha" else own  # alpha is 1 less what shines through
-        close(name, getattr(found, picture), own, terms + layers**0.5 * float(whole.double().norm()))
+        close(name, other, own, terms + layers**0.5 * float(whole.double().norm()))
 
 
 def same(a: Render, b: Render) -> bool:
