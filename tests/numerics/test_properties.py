@@ -324,7 +324,7 @@ def painted(gaussians: Gaussians, cam: Camera, rule: str):
 @few
 @given(scenes(300), RULE_NAMES, st.integers(-30, 30))
 def test_the_picture_is_linear_in_colours(device, scene, rule, k):
-    """2^k times the colours is 2^k times the picture, bit for bit; colours add to within 4 units in the last place."""
+    """2^k times the colours is 2^k times the picture, bit for bit; colours add but for a random walk of roundings."""
     gaussians, cam = build(scene, device, cameras=1)
     paint = painted(gaussians, cam, rule)
     generator = torch.Generator().manual_seed(scene[0])
@@ -333,7 +333,8 @@ def test_the_picture_is_linear_in_colours(device, scene, rule, k):
     one = paint(a, black)[0]
     assert torch.equal(paint(2.0**k * a, black)[0], 2.0**k * one)
     total, parts = paint(a + b, black)[0], one + paint(b, black)[0]
-    assert bool(((total - parts).abs() <= 4 * torch.finfo(F32).eps * parts.abs()).all())  # measured 2.6
+    roundings = 2 + len(gaussians) ** 0.5  # of a + b and of both pictures' sum; and of the layers, at most all Gaussians
+    assert bool(((total - parts).abs() <= roundings * torch.finfo(F32).eps * parts.abs()).all())  # measured 5.7 of 18
 
 
 @few
