@@ -10,7 +10,8 @@ from bench.lib.importance_scores import best_opacity_gain, lift, opacity_slopes,
 from bench.lib.one_fit import plan
 from tests.scenes import photos, three_gaussians
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 from warpgs.synthetic.demo import split_spec, write_demo
 

@@ -12,7 +12,8 @@ from tests.gaussians import camera, cloud
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from warpgs.io.load import load_scene
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.synthetic.demo import write_demo
 
 CPU = torch.device("cpu")

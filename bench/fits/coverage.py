@@ -22,7 +22,7 @@ from bench.lib.scenes import made, row_of, shrunk
 from bench.lib.tables import markdown, mean_sd, named
 from warpgs.errors import WarpgsError
 from warpgs.files import write_bytes
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.run.request import choose_device
 
 WHAT = "scores of held-out views by the number of training views that saw each pixel, as warpgs eval --by-coverage gives them"
 BEFORE = "default:method.hier=true,optimizer.opacities_decay=0,loss.smooth_weight=0,init.extrapolate=false,steps=3000"

@@ -16,10 +16,8 @@ from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.scorer import Scorer
 from warpgs.export import spz
-from warpgs.export.arrays import arrays_of
-from warpgs.export.formats import read_gaussians, suffixes
-from warpgs.pipeline.runs.export_filters import Filters
-from warpgs.pipeline.runs.export_model import export
+from warpgs.export.base import arrays_of, read_gaussians, suffixes
+from warpgs.pipeline.run.export import Filters, export
 
 WHAT = "file size, and loss of PSNR on held-out views, of each file format"
 

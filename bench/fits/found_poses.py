@@ -27,10 +27,9 @@ from bench.lib.pose_errors import brought_over, errors
 from bench.lib.refined_views import refined
 from bench.lib.tables import mean_sd
 from warpgs.io.images import Lens, load_image
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.view_modules.poses import RefinePoses
-from warpgs.poses.find import find_poses
-from warpgs.poses.record import read_record
+from warpgs.pipeline.run.request import choose_device
+from warpgs.pipeline.train.view_modules import RefinePoses
+from warpgs.poses.find import find_poses, read_poses_record
 from warpgs.scene import Camera, Scene, View
 
 HOLD_EVERY = 8
@@ -51,7 +50,7 @@ def found_scene(images: Path, names: list[str], downscale: int, folder: Path, ma
         for name in names:
             (source / name).write_bytes((images / name).read_bytes())
         find_poses(source, folder / "scene", threads=2, matcher=matcher)
-    return warpgs.load_scene(folder / "scene", downscale=downscale), read_record(folder / "scene")
+    return warpgs.load_scene(folder / "scene", downscale=downscale), read_poses_record(folder / "scene")
 
 
 def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: int, factor: float) -> View:

@@ -26,7 +26,7 @@ from bench.lib.surface_errors import depth_rows, mesh_row
 from bench.lib.surfaces import true_points
 from bench.lib.tables import markdown, mean_sd
 from warpgs.mesh.fuse import MeshOptions
-from warpgs.pipeline.runs.request import SceneRequest, choose_device
+from warpgs.pipeline.run.request import SceneRequest, choose_device
 from warpgs.synthetic.demo import camera_path, split_spec, still_life, write_demo
 
 WHAT = "fits of the demo scene without and with given depth and normals: held-out scores, errors of rendered depth and mesh"

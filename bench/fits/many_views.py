@@ -18,7 +18,7 @@ from bench.lib.arguments import parse
 from bench.lib.one_fit import compile_all, config_of, figures_of
 from bench.lib.pool import finished
 from bench.lib.tables import named
-from warpgs.pipeline.runs.request import SceneRequest, choose_device
+from warpgs.pipeline.run.request import SceneRequest, choose_device
 from warpgs.synthetic.demo import write_demo
 
 WHAT = "fits of a demo of many views: time, steps, PSNR and peak memory"

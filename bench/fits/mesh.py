@@ -19,7 +19,7 @@ from bench.lib.surface_errors import depth_rows, mesh_row
 from bench.lib.surfaces import true_points
 from bench.lib.tables import named
 from warpgs.mesh.fuse import MeshOptions
-from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.run.folder import open_run
 from warpgs.synthetic.demo import still_life
 
 WHAT = "accuracy and completeness of meshes of a fitted demo scene, and errors of rendered depth, against the ray cast surfaces"

@@ -21,11 +21,11 @@ from bench.lib import result_file
 from bench.lib.arguments import SCENE, parse
 from bench.lib.refined_views import refined
 from warpgs.geometry import camera_extent, matmul
-from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.io.load import split_views
+from warpgs.pipeline.run.request import choose_device
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.view_modules.poses import RefinePoses, increments, similar_cameras
-from warpgs.runtime.terminal import say
+from warpgs.pipeline.train.view_modules import RefinePoses, increments, similar_cameras
+from warpgs.process import say
 from warpgs.scene import Camera, Scene
 
 WHAT = "held-out PSNR with given, noisy and refined poses"

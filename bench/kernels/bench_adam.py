@@ -4,7 +4,7 @@ import torch
 
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.adam import adam_step
+from warpgs.kernels.update import adam_step
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}

@@ -5,7 +5,7 @@ import torch
 from bench.lib.pairs import binned
 from bench.lib.timing import OURS, passes
 from warpgs.constants import RULES
-from warpgs.kernels.blend_channels import blend_channels
+from warpgs.kernels.blend import blend_channels
 
 AXES = ("count", "image", "cameras")
 PROGRAMS = {OURS: ("forward", "backward")}

@@ -4,7 +4,7 @@ import torch
 
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.camera_reach import camera_reach
+from warpgs.kernels.neighbours import camera_reach
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}

@@ -4,8 +4,7 @@ import torch
 
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.step_buffers import Setting
+from warpgs.kernels.update import Setting, opacity_dropout
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}

@@ -3,7 +3,7 @@
 from bench.lib.pairs import binned
 from bench.lib.timing import OURS, Task
 from warpgs.constants import RULES
-from warpgs.kernels.heaviest import heaviest
+from warpgs.kernels.walk import heaviest
 
 AXES = ("count", "image", "cameras")
 PROGRAMS = {OURS: ("forward",)}

@@ -4,7 +4,7 @@ import torch
 
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.neighbours import mean_square_distances
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}

@@ -3,7 +3,7 @@
 from bench.lib.pairs import binned
 from bench.lib.timing import OURS, Task
 from warpgs.constants import RULES
-from warpgs.kernels.median_depth import median_depth
+from warpgs.kernels.walk import median_depth
 
 AXES = ("count", "image", "cameras")
 PROGRAMS = {OURS: ("forward",)}

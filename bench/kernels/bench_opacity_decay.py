@@ -4,7 +4,7 @@ import torch
 
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.opacity_decay import opacity_decay
+from warpgs.kernels.update import opacity_decay
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}

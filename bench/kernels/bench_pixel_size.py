@@ -4,7 +4,7 @@ import torch
 
 from bench.lib import roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.pixel_size import pixel_size
+from warpgs.kernels.neighbours import pixel_size
 
 AXES = ("count",)
 PROGRAMS = {OURS: ("forward",)}

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.plane_costs import plane_costs
+from warpgs.kernels.sweep import plane_costs
 
 AXES = ("image",)
 PROGRAMS = {OURS: ("forward",)}

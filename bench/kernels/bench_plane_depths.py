@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.plane_depths import best_inverses
+from warpgs.kernels.sweep import best_inverses
 
 AXES = ("image",)
 PROGRAMS = {OURS: ("forward",)}

@@ -5,8 +5,8 @@ import torch
 
 from bench.lib import inputs, roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.scanlines import scanline_costs
-from warpgs.priors.sweep_planes import UNIT, step_limits
+from warpgs.kernels.sweep import scanline_costs
+from warpgs.priors.sweep import UNIT, step_limits
 
 AXES = ("image",)
 NUMPY = "numpy"

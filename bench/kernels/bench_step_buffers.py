@@ -4,7 +4,7 @@ import torch
 
 from bench.lib import inputs, roofline
 from bench.lib.timing import OURS, Task
-from warpgs.kernels.step_buffers import begin_step, end_step
+from warpgs.kernels.update import begin_step, end_step
 
 AXES = ("image",)
 PROGRAMS = {OURS: ("forward",)}

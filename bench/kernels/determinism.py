@@ -17,8 +17,9 @@ from bench.lib.arguments import parse
 from bench.lib.atomic_sums import atomic_spread
 from bench.lib.tables import named
 from bench.lib.timing import Task, measure_in_turn, peak_bytes
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.pipeline.run.request import choose_device
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 WARP = wp.DeterministicMode

@@ -29,7 +29,7 @@ import warp
 count, threads, target = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 if target != "native":
     warp.config.cpu_compiler_flags = warp.config.cpu_compiler_flags.replace("-march=native", f"-target-cpu {target}")
-from warpgs.runtime import interop
+from warpgs.kernels import launch as interop
 import torch
 try:
     from bench.lib import inputs, training

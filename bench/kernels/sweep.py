@@ -18,8 +18,8 @@ from bench.lib.arguments import parse
 from bench.lib.tables import named
 from warpgs.io.load import load_scene
 from warpgs.pipeline.model.depth_points import depth_bounds
-from warpgs.pipeline.model.init import camera_depths
-from warpgs.priors.matches import triangulate_matches
+from warpgs.pipeline.model.start import camera_depths
+from warpgs.priors.flow import triangulate_matches
 from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import View
 from warpgs.synthetic import demo, raycast

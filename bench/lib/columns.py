@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpgs.colors import C0
-from warpgs.export.arrays import arrays_of, unit_quats
+from warpgs.export.base import arrays_of, unit_quats
 from warpgs.geometry import rotation_matrices
-from warpgs.scene import Gaussians
+from warpgs.scene import C0, Gaussians
 
 STATISTICS = ("min", "max", "mean", "stdDev")
 

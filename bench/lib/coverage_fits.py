@@ -11,11 +11,9 @@ import numpy as np
 import warpgs
 from bench.lib.one_fit import Fit, config_of
 from bench.lib.scenes import scene_at
-from warpgs.pipeline.metrics.coverage_scores import score_by_coverage
-from warpgs.pipeline.metrics.psnr import psnr_of
-from warpgs.report.coverage_image import coverage_image
-from warpgs.report.crops import crops
-from warpgs.report.sheet import Cell, Strip, sheet
+from warpgs.pipeline.metrics.coverage import score_by_coverage
+from warpgs.pipeline.metrics.scores import psnr_of
+from warpgs.report.images import Cell, Strip, coverage_image, crops, sheet
 
 PARTS = 3
 """Side of a crop as a fraction of the image's side."""

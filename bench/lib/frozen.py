@@ -11,9 +11,8 @@ import numpy as np
 import torch
 
 from bench.lib import inputs
-from warpgs.colors import C0
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.scene import Camera, Gaussians
+from warpgs.pipeline.run.folder import open_run
+from warpgs.scene import C0, Camera, Gaussians
 
 
 @dataclass(frozen=True)

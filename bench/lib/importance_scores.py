@@ -15,11 +15,10 @@ import torch
 
 from warpgs.constants import Rule
 from warpgs.geometry import project_tensors
-from warpgs.pipeline.train.strategies.gain import gains, residual_of
-from warpgs.pipeline.train.strategies.importance import blur, normalized
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig, fine_gaussians, valid_pixels
+from warpgs.pipeline.train.sampling import SamplerConfig, blur, fine_gaussians, gains, normalized, residual_of, valid_pixels
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 STRIDE = 2

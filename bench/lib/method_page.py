@@ -7,7 +7,7 @@ import math
 from bench.lib import result_file
 from bench.lib.arms import SCORES
 from bench.lib.tables import markdown, mean_sd
-from warpgs.pipeline.study.statistics import family_confidence, paired_difference
+from warpgs.pipeline.study.tables import family_confidence, paired_difference
 
 RESULT = "importance_h200"
 ARMS = {

@@ -27,12 +27,11 @@ from bench.lib.importance_scores import (
 )
 from bench.lib.one_fit import Fit, config_of, figures_of, plan
 from bench.lib.scenes import row_of, scene_at
-from warpgs.io.splits import split_views
-from warpgs.pipeline.metrics.evaluate import evaluate
+from warpgs.io.load import split_views
+from warpgs.pipeline.metrics.scores import evaluate
 from warpgs.pipeline.model.table import Column, DensityUpdate
-from warpgs.pipeline.train.strategies.importance import ImportanceConfig, normalized
-from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
-from warpgs.pipeline.train.strategies.sampling_event import Event, MethodConfig
+from warpgs.pipeline.train.sampling import ImportanceConfig, normalized
+from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.synthetic.demo import split_spec, write_demo
 

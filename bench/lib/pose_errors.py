@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from warpgs.pipeline.train.view_modules.poses import similar_cameras
+from warpgs.pipeline.train.view_modules import similar_cameras
 from warpgs.scene import Camera, View
 
 

@@ -10,7 +10,7 @@ from bench.lib import result_file, strategy_runs
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
-from warpgs.pipeline.study.statistics import paired_difference
+from warpgs.pipeline.study.tables import paired_difference
 
 ABLATED = {
     "no events": "no sampling events: no placement, layers or protection",

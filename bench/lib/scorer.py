@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from warpgs.coordinates import convert_gaussians
-from warpgs.pipeline.runs.commands import scene_of
-from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.geometry import convert_gaussians
+from warpgs.pipeline.run.commands import scene_of
+from warpgs.pipeline.run.folder import StoredRun, open_run
+from warpgs.pipeline.run.results import evaluate_run
 from warpgs.scene import Gaussians
 
 

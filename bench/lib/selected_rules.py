@@ -14,11 +14,10 @@ from bench.lib import frozen
 from bench.lib.inputs import camera as bench_camera
 from bench.lib.timing import measure_in_turn
 from warpgs.errors import UsageError
-from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.run.folder import open_run
 from warpgs.render.options import RasterizeOptions
-from warpgs.render.rasterize import rasterize
+from warpgs.render.rasterize import FASTEST_FIRST, rasterize, select_rule
 from warpgs.render.reference import reference_image
-from warpgs.render.select_rule import FASTEST_FIRST, select_rule
 from warpgs.scene import Camera, Gaussians
 
 LIMITS = (1e-2, 1e-3, 1e-4)

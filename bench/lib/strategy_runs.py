@@ -16,7 +16,7 @@ from bench.lib.one_fit import config_of, scores
 from bench.lib.scenes import scene_at
 from bench.lib.tables import markdown, mean_sd
 from bench.lib.training import make_trainer
-from warpgs.io.splits import split_views
+from warpgs.io.load import split_views
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera
 

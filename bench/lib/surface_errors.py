@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from bench.lib.surfaces import distance_to, distance_to_mesh, sample, summary, true_depth
-from warpgs.coordinates import convert_mesh
+from warpgs.geometry import convert_mesh
 from warpgs.mesh.fuse import MeshOptions, fuse
-from warpgs.mesh.surface_views import surface_view
-from warpgs.pipeline.model.model_file import FittedModel
+from warpgs.mesh.views import surface_view
+from warpgs.pipeline.model.table import FittedModel
 from warpgs.synthetic import raycast
 
 SAMPLES = 100_000

@@ -18,7 +18,7 @@ import torch
 import warp as wp
 
 from bench.lib.roofline import Cost
-from warpgs.runtime import interop
+from warpgs.kernels import launch
 
 REPEATS = 30
 WARM_UP = 3
@@ -179,7 +179,7 @@ def recorded(work: Callable[[], object]) -> Callable[[], object]:
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
     with torch.cuda.graph(graph, stream=stream):
-        here = interop.warp_stream(torch.device("cuda"))
+        here = launch.warp_stream(torch.device("cuda"))
         wp.capture_begin(stream=here, external=True)
         held = work()
         lent = wp.capture_end(stream=here)

@@ -13,8 +13,8 @@ import torch
 from bench.lib.frozen import Frozen
 from bench.lib.settings import UNCUT, Setting, settings
 from bench.lib.timing import measure_in_turn, recorded
+from warpgs.kernels.launch import set_threads
 from warpgs.kernels.project import project
-from warpgs.runtime.interop import set_threads
 from warpgs.scene import Camera, Gaussians
 
 VISIBLE = 0.5 / 255

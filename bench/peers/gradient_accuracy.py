@@ -20,7 +20,7 @@ from bench.lib.gradient_errors import TENSORS, errors_of
 from bench.lib.inputs import first_camera, garden_inputs
 from bench.lib.rasterizers import ATOMIC, FAST_MATH, GSPLAT_PACKED, OURS, RULE_OF, Drawing
 from warpgs.constants import RULES, Rule
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.run.request import choose_device
 from warpgs.scene import Camera, Gaussians
 
 WHAT = "errors of float32 gradients against float64, by rasterizer, scene and parameter"

@@ -23,10 +23,10 @@ from bench.lib.pool import stored_rows
 from bench.lib.tables import markdown, mean_sd
 from bench.lib.training import make_trainer, with_cap
 from warpgs import load_scene
-from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.io.load import split_views
+from warpgs.pipeline.run.request import choose_device
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.scene import Scene, View
 
 WHAT = "held-out PSNR of preset 3dgs, of preset mcmc and of gsplat's MCMC under the same cap, by seed"

@@ -25,10 +25,8 @@ from bench.lib.arguments import parse
 from bench.lib.columns import STATISTICS, difference, statistics
 from bench.lib.scorer import Scorer
 from warpgs.export import spz
-from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
-from warpgs.export.formats import read_gaussians, suffixes
-from warpgs.pipeline.runs.export_filters import Filters
-from warpgs.pipeline.runs.export_model import export
+from warpgs.export.base import arrays_of, gaussians_of, half_turn, read_gaussians, suffixes
+from warpgs.pipeline.run.export import Filters, export
 from warpgs.scene import Gaussians
 
 WHAT = "differences between what splat-transform and this program read of the same files, and loss of PSNR of its own files"

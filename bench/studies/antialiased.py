@@ -21,8 +21,8 @@ from bench.lib.pool import measure_all
 from bench.lib.scenes import scene_at
 from bench.lib.tables import named
 from warpgs.errors import WarpgsError
-from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.io.load import split_views
+from warpgs.pipeline.run.request import choose_device
 
 FILTERS = {"none": "", "2D": "antialiased=true,limits.min_pixels=0", "2D and 3D": "antialiased=true"}
 """Settings of each row."""

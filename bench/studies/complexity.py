@@ -16,8 +16,8 @@ from bench.lib.arguments import parse
 from bench.lib.tables import named
 from warpgs.errors import WarpgsError
 from warpgs.files import write_text
-from warpgs.pipeline.runs.prune import prune
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.run.commands import prune
+from warpgs.pipeline.run.request import choose_device
 
 WHAT = "what is left of a model when it is pruned, by the training PSNR that is given up"
 KEEP = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)

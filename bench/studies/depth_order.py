@@ -22,7 +22,7 @@ from bench.lib.depth_order import depth_order
 from bench.lib.tables import named
 from warpgs.errors import DataError, WarpgsError
 from warpgs.io.load import load_scene
-from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.run.folder import open_run
 from warpgs.render.rasterize import rasterize
 
 

@@ -25,7 +25,7 @@ from bench.lib.pool import measure_all
 from bench.lib.scenes import ROWS, made, row_of, shrunk
 from bench.lib.tables import markdown
 from warpgs.errors import UsageError, WarpgsError
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.run.request import choose_device
 
 WHAT = "scores and sizes of fits whose fine Gaussians are placed by one score each"
 

@@ -12,10 +12,10 @@ from bench.lib import result_file
 from bench.lib.arguments import SCENE, parse
 from bench.lib.training import Trainer, make_trainer, sort_along_curve, take_steps, without_density
 from warpgs import load_scene
-from warpgs.io.splits import split_views
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.io.load import split_views
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.request import choose_device
+from warpgs.pipeline.train.settings import FitConfig
 
 REPEATS = 15
 STEPS_PER_BATCH = 100

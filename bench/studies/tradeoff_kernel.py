@@ -15,7 +15,7 @@ from bench.lib.pool import stored_rows
 from bench.lib.tables import markdown
 from bench.lib.tradeoff_kernel import measure_scene, sorting_share
 from warpgs.files import write_text
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.run.request import choose_device
 
 WHAT = "time of a render and its gradients against their error, for every setting"
 

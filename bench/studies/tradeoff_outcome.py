@@ -15,10 +15,10 @@ from bench.lib.pool import stored_rows
 from bench.lib.tables import markdown
 from warpgs import load_scene
 from warpgs.files import write_text
-from warpgs.io.splits import split_views
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.study.statistics import paired_difference
-from warpgs.runtime.interop import set_threads
+from warpgs.io.load import split_views
+from warpgs.kernels.launch import set_threads
+from warpgs.pipeline.run.request import choose_device
+from warpgs.pipeline.study.tables import paired_difference
 
 WHAT = "time of whole fits against scores of held-out views"
 TRIALS = {

@@ -14,13 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.gaussians import SMOOTH, camera, cloud, leaves
-from warpgs.colors import C0
 from warpgs.constants import RULES
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, Render
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import C0, Camera, Gaussians, Render
 
 few = settings(
     derandomize=True, deadline=None, database=None,

@@ -12,7 +12,7 @@ import torch
 from bench.lib import inputs
 from bench.lib.atomic_sums import atomic_spread, gradients_of
 from tests.gaussians import camera, cloud
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences
 
 REPEATS = 50
@@ -90,8 +90,8 @@ def test_a_side_stream_gives_the_same_bits():
 PROCESS = """
 import hashlib, torch
 from tests.scenes import photos
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
 torch.set_num_threads({threads})
 config = FitConfig(steps=12, seed=5, dropout=0.1, init=InitConfig(source="random", random_count=300))

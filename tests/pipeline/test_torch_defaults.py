@@ -8,7 +8,7 @@ import torch
 
 import warpgs
 from tests.scenes import photos, seeds
-from warpgs.pipeline.train.time_budget import probe_seconds
+from warpgs.pipeline.train.settings import probe_seconds
 from warpgs.scene import Scene
 
 ROOT = Path(warpgs.__file__).parent

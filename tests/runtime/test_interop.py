@@ -16,17 +16,16 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels.adam import adam_step
+from warpgs.kernels import launch as interop
+from warpgs.kernels import launch as sorting
 from warpgs.kernels.blend import blend, contributions
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.knn import mean_square_distances
-from warpgs.kernels.median_depth import median_depth
+from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.kernels.step_buffers import Setting
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
+from warpgs.kernels.update import Setting, adam_step, opacity_dropout
+from warpgs.kernels.walk import median_depth
 from warpgs.render.rasterize import rasterize
-from warpgs.runtime import interop, sorting
 from warpgs.scene import Gaussians
 
 
