@@ -38,13 +38,7 @@ SUMMED = 16
 
 @functools.cache
 def make_segments(real, values: int = VALUES, width: int = 9 + COLORS):
-    """Make the kernels that sum the gradient slots of each Gaussian, always in slot order, so that sums repeat bit for bit.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        values: Number of values of a gradient.
-        width: Number of values of a projected Gaussian; values without a gradient come last.
-    """
+    """Make the kernels that sum gradient slots of ``values`` numbers, always in slot order, into rows of ``width`` numbers."""
     reals = wp.types.vector(values, real)
     record = wp.types.vector(width, real)
     lane_reals = wp.types.vector(SUMMED * values, real)
@@ -129,24 +123,9 @@ def composite(
     allocator: Allocator = TORCH,
     image: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Return the images, and the data for the backward pass. Nothing is checked, and no gradient is recorded.
-
-    Args:
-        projected: Projected Gaussians, contiguous, shape [C, N, 9 + D]. D is one of `WIDTHS`: 3 channels of a colour, or more
-            channels instead.
-        tiles: Their (Gaussian, tile) instances.
-        backgrounds: Channels behind everything, contiguous, shape [C, D].
-        settings: Settings.
-        save: True where gradients will be taken.
-        allocator: Provider of the results' memory.
-        image: Memory of the channels, shape [C, H, W, D]; it may be a slice of the channels of an image. On CUDA in float32 it
-            may have fewer than D channels: then only the first ones are written. None for new memory.
-
-    Returns:
-        ``rgb`` [C, H, W, D], or ``image``; ``alpha``, ``depth``, transmittances and weight sums [C, H, W]; the index after that
-        of the last blended instance [C, H, W]; states of the chunks (CUDA in float32 only, else empty). Without ``save``,
-        transmittances and weight sums may be empty.
-    """
+    """Return rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states. Nothing is checked."""
+    # ``image`` may be a slice of the channels of an image; on CUDA in float32 it may have fewer than D channels: then only the
+    # first ones are written. Without ``save``, transmittances and weights may be empty.
     if is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
     real, device = launch.real_of(projected), projected.device
@@ -206,20 +185,9 @@ def composite_gradients(
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
 ) -> torch.Tensor:
-    """Return the gradient of ``projected``, shape [C, N, 9 + D]. Nothing is checked.
-
-    Args:
-        projected: Projected Gaussians as given to `composite`, shape [C, N, 9 + D].
-        tiles: Their tiles.
-        backgrounds: Channels behind everything, shape [C, D].
-        settings: Settings as given to `composite`.
-        saved: Results of `composite` without ``alpha``. Only those channels of ``rgb`` are read that have a gradient in
-            ``v_images``.
-        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W], each of which may be None. The gradient
-            of ``rgb`` may be a slice of channels of an image. On CUDA in float32 it may have fewer than D channels; the other
-            channels have gradient 0.
-        allocator: Provider of the gradient's memory.
-    """
+    """Return the gradient of ``projected`` [C, N, 9 + D], from `composite`'s results except alpha. Nothing is checked."""
+    # Only those channels of ``rgb`` are read that have a gradient. On CUDA in float32 the gradient of ``rgb`` may have fewer
+    # than D channels; the others have gradient 0.
     v_rgb, v_alpha, v_depth = v_images
     v_rgb = saved[0].new_zeros(*saved[0].shape[:-1], backgrounds.shape[1]) if v_rgb is None else v_rgb
     backward = blend_cuda.backward if is_native(projected) else _backward
@@ -266,22 +234,13 @@ def without_gradients(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
 
 
 def check_slots(tiles: Tiles) -> None:
-    """Check that the tiles were made with slots, which gradients need.
-
-    Raises:
-        ValueError: The tiles have no slots.
-    """
+    """Raise ValueError unless the tiles have slots, which gradients need."""
     if len(tiles.slots) != len(tiles.gaussian_ids):
         raise ValueError("gradients and contributions need tiles with slots: make the tiles with bin_tiles(slotted=True)")
 
 
 def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, **backgrounds) -> None:
-    """Check that tiles were made for an image of ``width`` x ``height`` px and for projected Gaussians [C, N, 12].
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        ValueError: A shape or device is wrong, or the tiles belong to another image size.
-    """
+    """Raise TypeError or ValueError unless tiles fit images of ``width`` x ``height`` px and projected Gaussians [C, N, 12]."""
     sizes = launch.check(projected=(projected, "C N 12"), **backgrounds)
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
@@ -303,33 +262,11 @@ def blend(
     origin: tuple[int, int] = (0, 0),
     absgrad: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3), with the cut-offs of ``rule``.
-
-    Differentiable in the first ten values of each projected Gaussian and in ``backgrounds``; a clamped alpha has gradient zero.
-    Derivation of the backward pass: docs/blend.md. Images repeat bit for bit, on CUDA and on any number of CPU threads;
-    gradients repeat if ``deterministic`` is True.
-
-    Args:
-        projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Result of `bin_tiles` for the same image size.
-        backgrounds: Colour behind everything, shape [C, 3].
-        width: Image width [px].
-        height: Image height [px].
-        rule: Cut-offs.
-        deterministic: True to sum gradients in a fixed order. False adds them atomically on CUDA in float32, which needs less
-            memory but is not repeatable to the bit; elsewhere it has no effect.
-        origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: True to also sum magnitudes of the mean's gradient over pixels. The sums take the place of the gradient of the
-            last two values of ``projected``, the half sides of the box.
-
-    Returns:
-        ``rgb`` [C, H, W, 3]; ``alpha`` [C, H, W], accumulated opacity; ``depth`` [C, H, W], the mean depth [u] under the
-        blending weights (z; the distance for a fisheye), 0 where the weights sum to less than `SMALLEST_WEIGHT`.
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        ValueError: A shape or device is wrong, or the tiles belong to another image size or lack the slots for gradients.
-    """
+    """Composite C images of H x W pixels (Kerbl et al. 2023, eq. 3): return rgb [C, H, W, 3], alpha and depth [C, H, W]."""
+    # Differentiable in the first ten values of ``projected`` [C, N, 12] and in ``backgrounds`` [C, 3]; a clamped alpha has
+    # gradient zero. Derivation: docs/blend.md. Depth is the mean [u] under the blending weights, 0 where they sum to less than
+    # SMALLEST_WEIGHT. ``deterministic=False`` adds gradients atomically on CUDA in float32. ``absgrad`` puts sums of magnitudes
+    # of the mean's gradient in the place of the gradient of the last two values of ``projected``.
     check_tiles(projected, tiles, width, height, backgrounds=(backgrounds, "C 3"))
     settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
     return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
@@ -338,23 +275,7 @@ def blend(
 def contributions(
     projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return for each Gaussian and image the sum and maximum of its blending weights alpha * T over pixels. Not differentiable.
-
-    Args:
-        projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Result of `bin_tiles` for the same image size.
-        width: Image width [px].
-        height: Image height [px].
-        rule: Cut-offs.
-        origin: Left and top [px] of the window that the tiles were made for.
-
-    Returns:
-        ``weight_sums`` [C, N] and ``weight_maxima`` [C, N].
-
-    Raises:
-        TypeError: The scalar type is neither float32 nor float64.
-        ValueError: A shape disagrees, or the tiles belong to another image size or have no slots.
-    """
+    """Return sum and maximum of each Gaussian's blending weights alpha * T over pixels, [C, N] each. Not differentiable."""
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     real, device = launch.real_of(projected), projected.device
@@ -395,12 +316,10 @@ def width_of(channels: int, widths: tuple[int, ...] = WIDTHS) -> int:
 
 
 def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
-    """Return the number of channels of a pass over projected Gaussians [C, N, 12].
-
-    The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an H100
-    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except with ``absgrad``, which needs a
-    single pass.
-    """
+    """Return the number of channels of a pass over projected Gaussians [C, N, 12]."""
+    # The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an
+    # H100 for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except with ``absgrad``, which
+    # needs one pass.
     narrow = projected.is_cuda and not is_native(projected) and not absgrad
     return width_of(channels, WIDTHS[:1] if narrow else WIDTHS)
 
@@ -558,31 +477,9 @@ def blend_channels(
     origin: tuple[int, int] = (0, 0),
     absgrad: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
-
-    Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The channels
-    are blended in several passes. The gradients of position, covariance factor and opacity are summed over the passes in a
-    fixed order, so they are as repeatable as those of `blend`.
-
-    Args:
-        projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Result of `bin_tiles` for the same image size.
-        colors: Finite values of any size and sign, shape [C, N, D] with D at least 1; or [1, N, D], the same for all images.
-        backgrounds: Values behind everything, shape [C, D].
-        width: Image width [px].
-        height: Image height [px].
-        rule: Cut-offs.
-        deterministic: True to sum gradients in a fixed order, see `blend`.
-        origin: Left and top [px] of the window that the tiles were made for.
-        absgrad: True to also sum magnitudes, see `blend`; with more than 11 channels, the magnitudes of the passes are added.
-
-    Returns:
-        The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        ValueError: A shape or device is wrong, there is no channel, or the tiles belong to another image size.
-    """
+    """Composite images [C, H, W, D] of any number of channels; colors [C or 1, N, D], backgrounds [C, D]; else as `blend`."""
+    # Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. Gradients are
+    # summed over the passes in a fixed order; with ``absgrad``, so are magnitudes.
     shared = "1" if len(colors) == 1 else "C"
     check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))
     if colors.shape[-1] == 0:

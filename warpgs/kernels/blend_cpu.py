@@ -373,15 +373,7 @@ def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
 
 @functools.cache
 def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, deep: bool = True):
-    """Make the kernel.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        tile_size: Side of a tile [px].
-        channels: Number of channels.
-        absgrad: As in `BlendSettings`.
-        deep: False where depth and alpha have no gradient; their data is then not read.
-    """
+    """Make the backward kernel; without ``deep``, depth and alpha have no gradient, and their data is not read."""
     f = make_functions(real)
     r = make_records(real, tile_size, channels, absgrad)
     b = make_batches(real, tile_size, channels)

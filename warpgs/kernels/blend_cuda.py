@@ -56,17 +56,9 @@ def _source(name: str, tile_size: int, channels: int, **numbers) -> str:
 
 @functools.cache
 def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
-    """Make the compositing kernel, for one tile size and a number of channels out of `WIDTHS`.
-
-    Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
-    long for 32-bit sizes.
-
-    Args:
-        tile_size: Side of a tile [px].
-        save: True to write the data for the backward pass: transmittances, weights and the states of the chunks.
-        per: Blocks of 8 x 4 px that a warp composites: 1, or 2 one below the other. The image does not depend on it.
-        channels: Number of channels.
-    """
+    """Make the compositing kernel; a warp composites ``per`` blocks of 8 x 4 px, 1 or 2, which does not change the image."""
+    # Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be
+    # too long for 32-bit sizes.
     Blending = make_struct(wp.float32)
 
     @wp.func_native(_source("forward", tile_size, channels, SAVE=str(save).lower(), PER=per))
@@ -101,11 +93,7 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
 
 @functools.cache
 def make_kernels(tile_size: int):
-    """Make the kernels that order tiles and find contributions, for one tile size.
-
-    Images and projected Gaussians are flat arrays. Arrays with a row per instance have two axes, since a flat one could be too
-    long for 32-bit sizes.
-    """
+    """Make the kernels that order tiles and find contributions, for one tile size."""
     Blending = make_struct(wp.float32)
 
     @wp.func_native(source("blend_order.cu", RANKS=RANKS))
@@ -149,17 +137,7 @@ def make_kernels(tile_size: int):
 def make_backward(
     tile_size: int, with_depth: bool, chunk: int, atomic: bool, channels: int = COLORS, absgrad: bool = False
 ):  # fmt: skip
-    """Make the backward kernels: sums per instance, then per Gaussian.
-
-    Args:
-        tile_size: Side of a tile [px].
-        with_depth: True for gradients of depth and alpha, too.
-        chunk: Instances per warp.
-        atomic: True to add each instance's sum to its Gaussian's sum atomically, in no fixed order; False to store it in the
-            instance's slot.
-        channels: Number of channels, out of `WIDTHS`.
-        absgrad: True to sum magnitudes of the mean's gradient, too (`BlendSettings.absgrad`).
-    """
+    """Make the backward kernels: sums per instance, then per Gaussian (or ``atomic`` additions, in no fixed order)."""
     Blending = make_struct(wp.float32)
     flags = {"WITH_DEPTH": with_depth, "ATOMIC": atomic, "ABSGRAD": absgrad}
     numbers = {"CHUNK": chunk, **{name: str(flag).lower() for name, flag in flags.items()}}
@@ -253,12 +231,7 @@ def forward(
     allocator: Allocator = TORCH,
     image: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, ...]:
-    """Return what `blend.composite` returns for projected Gaussians [C, N, 9 + D] and backgrounds [C, D], on CUDA.
-
-    Returns:
-        rgb [C, H, W, D]; alpha, depth, transmittances, weights and ends [C, H, W]; and states [S, P], with a row for each chunk
-        of instances and, with three channels, `STATE` numbers for each pixel of a tile.
-    """
+    """Return what `blend.composite` returns; states [S, P] have a row for each chunk of instances."""
     device, channels = projected.device, backgrounds.shape[1]
     shape = (backgrounds.shape[0], settings.height, settings.width)
     rgb = allocator.output((*shape, channels), torch.float32, device) if image is None else image
@@ -295,17 +268,7 @@ def backward(
     v_images: Sequence[torch.Tensor | None],
     allocator: Allocator = TORCH,
 ) -> torch.Tensor:
-    """Return the gradient of ``projected``, shape [C, N, 9 + D].
-
-    Args:
-        projected: Projected Gaussians as given to `forward`, shape [C, N, 9 + D].
-        tiles: Their tiles.
-        backgrounds: Colour behind everything, shape [C, D].
-        settings: Settings as given to `forward`.
-        saved: Results of `forward` without ``alpha``.
-        v_images: Gradients of ``rgb`` [C, H, W, D], ``alpha`` and ``depth`` [C, H, W]; the last two may be None.
-        allocator: Provider of the gradient's memory.
-    """
+    """Return the gradient of ``projected`` [C, N, 9 + D], from `forward`'s results except alpha; None is a zero gradient."""
     rgb, depth, transmittances, weights, ends, states = saved
     v_rgb, v_alpha, v_depth = v_images
     device, count, deterministic = projected.device, tiles.slots.shape[0], settings.deterministic
@@ -335,14 +298,7 @@ def backward(
 
 
 def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor) -> torch.Tensor:
-    """Return sum and maximum of each instance's blending weight over the pixels of its tile, in slot order, shape [M, 2].
-
-    Args:
-        projected: Projected Gaussians as given to `forward`, shape [C, N, 12].
-        tiles: Their tiles.
-        settings: Settings as given to `forward`.
-        ends: One past the last instance that was blended into each pixel, as `forward` returns it, int32, shape [C, H, W].
-    """
+    """Return sum and maximum of each instance's blending weight over its tile's pixels, in slot order [M, 2]."""
     weights = projected.new_zeros(tiles.slots.shape[0], 2)
     inputs = [
         settings.struct(tiles.size, wp.float32), *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots),

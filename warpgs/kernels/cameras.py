@@ -61,12 +61,7 @@ register = CAMERA_MODELS.register
 
 
 def check_camera(camera: Camera) -> type[CameraModel]:
-    """Return the model of a camera, or of a batch.
-
-    Raises:
-        UsageError: The model is unknown, the number of coefficients does not match it, or the coefficients require gradients,
-            which are not supported.
-    """
+    """Return the model of a camera, or of a batch; UsageError where the coefficients do not match it or require gradients."""
     model = CAMERA_MODELS.find(camera.model)
     found = 0 if camera.distortion is None else camera.distortion.shape[-1]
     if found and not model.coefficients:

@@ -170,17 +170,7 @@ def nothing(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) ->
 
 
 def checked_factors(means: torch.Tensor, factors: torch.Tensor | None) -> torch.Tensor:
-    """Return opacity factors as `ProjectInputs` holds them, shape [N], or [0] for None.
-
-    Args:
-        means: Positions of the Gaussians, shape [N, 3].
-        factors: Factors, shape [N]; None for 1.
-
-    Raises:
-        TypeError: The scalar types differ.
-        UsageError: A gradient of the factors would be recorded.
-        ValueError: The shape or the device differs.
-    """
+    """Return opacity factors [N] as `ProjectInputs` holds them, [0] for None; UsageError where they require gradients."""
     if factors is None:
         return nothing((0,), means.dtype, means.device)
     launch.check(means=(means, "N 3"), opacity_factors=(factors, "N"))
@@ -210,14 +200,7 @@ class _PackedCovariances(torch.autograd.Function):
 
 
 def packed_covariances(covars: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the symmetric part of covariances as `ProjectInputs` holds them. Differentiable.
-
-    Args:
-        covars: Covariances [u^2], shape [N, 3, 3].
-
-    Returns:
-        Entries xy, xz, yz and a 0, shape [N, 4], and the diagonals, shape [N, 3].
-    """
+    """Return the symmetric part of covariances [N, 3, 3] as xy, xz, yz and a 0 [N, 4], and diagonals [N, 3]. Differentiable."""
     found: tuple[torch.Tensor, torch.Tensor] = _PackedCovariances.apply(covars)
     return found
 
@@ -292,15 +275,9 @@ SHRINKS = 6
 
 @functools.cache
 def make_projection(real, camera_model: str, parameters: str = "stored", lanes: bool = False):
-    """Make the steps of the projection that forward and backward share (derivation: docs/project.md).
-
-    Args:
-        real: wp.float32 or wp.float64.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        lanes: True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to the
-            end, too. Scales and opacities are activated beforehand.
-    """
+    """Make the steps of the projection that forward and backward share (derivation: docs/project.md)."""
+    # ``lanes`` is True for loops that the compiler vectorises: without branches and calls, so culled Gaussians are computed to
+    # the end, too. Scales and opacities are activated beforehand.
     r = make_rotations(real)
     factor = make_covariance(real).factor
     camera = CAMERA_MODELS.find(camera_model).make_functions(real)
@@ -494,11 +471,9 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
 
 @functools.cache
 def make_spans(real, lanes: bool = False):
-    """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md).
-
-    Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its
-    own arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
-    """
+    """Make the functions that decide which tiles a projected Gaussian touches, for one scalar type (docs/tiles.md)."""
+    # Counting and emitting call the same functions. Every bound is widened by a margin that covers the rounding of its own
+    # arithmetic, so a pixel that blending would change is never missed; a tile listed in excess changes nothing.
     vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     vec2i = wp.types.vector(2, wp.int32)
@@ -587,17 +562,8 @@ def make_spans(real, lanes: bool = False):
 
 @functools.cache
 def make_functions(real, camera_model: str, parameters: str, antialiased: bool, bases: int, lanes: bool = False):
-    """Make the functions that compute the gradients of a Gaussian's parameters from the gradient of the projected Gaussian.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        antialiased: True where opacities were multiplied by `compensation`.
-        bases: Number of basis values that a colour may have (`sh.bases_for`).
-        lanes: As in `make_projection`. If True, functions take a projected Gaussian and its gradient as vectors, not as rows of
-            arrays.
-    """
+    """Make the functions that compute a Gaussian's gradients from that of the projected Gaussian."""
+    # With ``lanes``, they take a projected Gaussian and its gradient as vectors, not as rows of arrays.
     m = make_projection(real, camera_model, parameters, lanes)
     vec2 = m.vec2
     vec3 = m.vec3

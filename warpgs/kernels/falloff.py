@@ -173,11 +173,9 @@ TOGETHER = 16
 
 @functools.cache
 def make_batches(real, tile_size: int, channels: int):
-    """Make the record of a batch and its functions, for one scalar type, tile size and number of channels.
-
-    A tile is stored in columns as wide as a strip (`STRIP` pixels), one after the other. The strips of a column that a Gaussian
-    reaches are contiguous, since an ellipse is convex. So only the first of their rows and one past the last are stored.
-    """
+    """Make the record of a batch and its functions, for one scalar type, tile size and number of channels."""
+    # A tile is stored in columns as wide as a strip, one after the other. The strips of a column that a Gaussian reaches are
+    # contiguous, since an ellipse is convex. So only the first of their rows and one past the last are stored.
     f = make_functions(real)
     record = wp.types.vector(9 + channels, real)
     batch_reals = wp.types.vector(BATCH, real)
@@ -336,13 +334,11 @@ WIDTHS = (COLORS, 7, 11)
 
 @functools.cache
 def make_records(real, tile_size: int, channels: int, absgrad: bool):
-    """Make the records for one scalar type, tile size and number of channels.
-
-    A tile is stored in columns as wide as a strip, one after the other; entries of its pixels follow in that order. Vectors
-    are one row longer than the tile: see `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the
-    two magnitudes follow the channels if ``absgrad`` is set.
-    """
-    # The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in two lines.
+    """Make the records for one scalar type, tile size and number of channels."""
+    # Entries of pixels follow in the order of `make_batches`. Vectors are one row longer than the tile: see
+    # `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the two magnitudes follow the channels
+    # if ``absgrad`` is set. The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in
+    # two lines.
     lead_reals = wp.types.vector(2, real)
     trail_reals = wp.types.vector(14, real)
     tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)

@@ -48,20 +48,10 @@ class CapturedGraph:
     """A CUDA graph of the kernels that torch and Warp launch in one call, and the objects that it needs."""
 
     def __init__(self, work: Callable[[], object], stream: torch.cuda.Stream, pool: tuple[int, int] | None = None):
-        """Capture the work; nothing runs yet.
-
-        The caller lets ``stream`` wait for what ``work`` reads, and lets other streams wait for ``stream`` if necessary.
-
-        Args:
-            work: A function that neither reads from the device nor loads kernels: call it once before, to load them.
-            stream: Stream to capture on, not the default one.
-            pool: `pool` of a graph to share memory with. That graph must never be replayed at the same time, nor leave results
-                in the shared memory. None for own memory.
-
-        Raises:
-            RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
-        """
-        # torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
+        """Capture the work, which neither reads from the device nor loads kernels; nothing runs yet."""
+        # The caller lets ``stream``, not the default one, wait for what ``work`` reads. ``pool`` is that of a graph to share
+        # memory with: it must never be replayed at the same time, nor leave results there. Raises RuntimeError where the work
+        # cannot be captured. torch.cuda.graph would collect garbage and empty the cache each time, which takes 80 ms
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.stream(stream), _CAPTURING, _no_collection():
             here = launch.warp_stream(torch.device("cuda"))
@@ -87,10 +77,7 @@ class CapturedGraph:
 
 
 class GraphMemory:
-    """Account of the memory that torch keeps for deleted graphs.
-
-    A graph has its own memory. torch keeps that memory after the graph is deleted, and does not reuse it.
-    """
+    """Account of the memory of deleted graphs, which torch keeps and does not reuse."""
 
     def __init__(self, device: torch.device):
         self.device = device
@@ -98,10 +85,7 @@ class GraphMemory:
         """Bytes that torch held when memory was last given back."""
 
     def give_back(self, limit: int) -> None:
-        """Return unused memory to the device once torch holds ``limit`` bytes more than when memory was last given back.
-
-        Returning memory takes milliseconds, in which the device waits.
-        """
+        """Return unused memory once torch holds ``limit`` bytes more than at the last return; the device waits milliseconds."""
         if torch.cuda.memory_reserved(self.device) - self.reserved > limit:
             torch.cuda.empty_cache()
             self.reserved = torch.cuda.memory_reserved(self.device)
@@ -131,11 +115,7 @@ class GraphPool:
         return self.stream is not None and torch._C._cuda_isCurrentStreamCapturing()
 
     def capture(self, work: Callable[[], object]) -> CapturedGraph:
-        """Return a graph of ``work``, captured on a separate stream.
-
-        Raises:
-            RuntimeError: The work cannot be captured; `torch.OutOfMemoryError` where its memory does not fit.
-        """
+        """Return a graph of ``work``, captured on a separate stream, or raise what `CapturedGraph` raises."""
         if self._aside is None:
             self._aside = torch.cuda.Stream(self.device)
         here = torch.cuda.current_stream(self.device)
@@ -162,13 +142,9 @@ class GraphedFunction:
     """A function of tensors, captured as a graph for each set of their addresses, up to MAX_GRAPHS."""
 
     def __init__(self, function: Callable[..., tuple[torch.Tensor, ...]], graphs: GraphPool):
-        """Prepare the function; nothing is captured yet.
-
-        Args:
-            function: A function of an `Allocator` and of tensors or Nones, always of the same shapes. It gets its memory from
-                the allocator, does not read from the device, and returns the saved tensors that `saved` is to find.
-            graphs: Pool to capture graphs in.
-        """
+        """Prepare a function of an `Allocator` and of tensors or Nones, always of the same shapes; nothing is captured yet."""
+        # It gets its memory from the allocator, does not read from the device, and returns the saved tensors that `saved` is to
+        # find.
         self.function, self.graphs = function, graphs
         self.replays = self.captures = 0
         self._sizes: SizingAllocator | None = None

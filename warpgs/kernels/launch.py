@@ -72,11 +72,7 @@ def check_device(name: str, tensor: torch.Tensor) -> None:
 
 
 def real_of(tensor: torch.Tensor) -> type:
-    """Return the Warp scalar type of a tensor, float32 or float64.
-
-    Raises:
-        TypeError: The tensor has another type.
-    """
+    """Return the Warp scalar type of a tensor [...]; TypeError unless float32 or float64."""
     if tensor.dtype not in REALS:
         raise TypeError(f"kernels take float32 or float64 tensors, not {tensor.dtype}")
     return REALS[tensor.dtype]
@@ -88,10 +84,9 @@ def set_threads(count: int) -> None:
 
 
 class _Pool:
-    """Threads that make the calls of a queue.
+    """Threads that make the calls of a queue."""
 
-    The locks of `concurrent.futures` and of `threading.Thread.start` can stay locked after an interrupt; the queue's cannot.
-    """
+    # The locks of `concurrent.futures` and of `threading.Thread.start` can stay locked after an interrupt; the queue's cannot.
 
     def __init__(self, count: int):
         self.calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -165,10 +160,7 @@ def rows(tensor: torch.Tensor, dtype) -> View:
 
 
 def span(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, gaps between rows included.
-
-    Each row must be contiguous; `View.row_stride` is the distance from one row to the next.
-    """
+    """Return a tensor [..., K] of contiguous rows as an argument of one axis, including gaps between rows (`Vi."""
     return View(tensor, dtype, 0)
 
 
@@ -417,21 +409,10 @@ class _SharedLaunch:
 
 
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
-    """Launch ``kernel`` over ``count`` independent items; the kernel's first argument is the number of the first item.
-
-    On a CPU, as many threads as torch uses share the items; results are repeatable, since each item has its own output memory.
-
-    Args:
-        kernel: Warp kernel whose item number is ``begin + wp.tid()``.
-        count: Number of items.
-        inputs: Arguments after ``begin``.
-        device: Device of the arrays.
-        cost: Rough work of an item in units of 10 ns, which decides whether threads pay.
-        block_dim: CUDA threads per block.
-
-    Raises:
-        ResourceError: There are more items, or entries along an axis, than 32-bit integers can index.
-    """
+    """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item."""
+    # On a CPU, as many threads as torch uses share the items; results repeat, since each item has its own output memory.
+    # ``cost`` is the rough work of an item in units of 10 ns, which decides whether threads pay. ``block_dim`` is CUDA's
+    # threads per block.
     if count == 0:
         return
     _check_size(count)
@@ -477,17 +458,8 @@ def _symbols(pattern: str) -> tuple[str | int, ...]:
 
 
 def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
-    """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
-
-    A capital letter is a size that must agree wherever it occurs.
-
-    Returns:
-        The sizes by letter.
-
-    Raises:
-        TypeError: An argument is not a tensor or is sparse, a scalar type is neither float32 nor float64, or types differ.
-        ValueError: A shape or a device is wrong; the message names the argument and both values, expected and found.
-    """
+    """Check shapes, types and devices of tensors against patterns, as ``means=(means, "N 3")``; return sizes by letter."""
+    # A capital letter is a size that must agree wherever it occurs.
     sizes: dict[str, int] = {}
     first_name, first = "", None
     for name, (tensor, pattern) in tensors.items():
@@ -578,13 +550,7 @@ class Arena(Allocator):
     """An allocator of the tensors that a function requested before: outputs one by one, the others as parts of two blocks."""
 
     def __init__(self, sizes: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
-        """Ask torch for all of the memory.
-
-        Args:
-            sizes: Allocator that the function ran with before.
-            byte: Any tensor of bytes on the device. (`new_empty` takes half the time of `torch.empty`.)
-            workspace: A block that is not in use; None to allocate one.
-        """
+        """Ask torch for all memory of a function that ran with ``sizes``; ``byte`` is any tensor of bytes."""
         self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
         """Output tensors, in the order in which the function asks for them."""
         self.block = byte.new_empty(sizes.saved_bytes) if sizes.saved_bytes else None
@@ -643,14 +609,7 @@ def make_fetch():
 
 
 def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
-    """Copy three tensors into one, from the addresses that a table holds when the kernel runs.
-
-    Args:
-        table: Address of a table of three addresses of float32 numbers, in memory that the device of ``out`` can read.
-        first: Count of numbers at the first address.
-        second: Count of numbers at the first two addresses together; the rest is at the third.
-        out: Result, float32, contiguous, any shape.
-    """
+    """Fill ``out`` from a table of three addresses, read when the kernel runs; ``second`` counts the first two's numbers."""
     launch(make_fetch(), out.numel(), [table, first, second, flat(out, wp.float32)], out.device)
 
 
@@ -674,12 +633,8 @@ def keep(ctx: Any, *tensors: torch.Tensor | None) -> None:
 
 
 def kept(ctx: Any) -> tuple[Any, ...]:
-    """Return the tensors [...] that `keep` saved.
-
-    Raises:
-        RuntimeError: The ``.data`` of a tensor was replaced, which autograd does not track. The gradient would be wrong, and
-            with another shape or type the kernels would read and write out of bounds.
-    """
+    """Return the tensors [...] that `keep` saved; RuntimeError where a ``.data`` was replaced, unseen by autograd."""
+    # The gradient would be wrong, and with another shape or type the kernels would read and write out of bounds.
     tensors = ctx.saved_tensors
     for tensor, place in zip(tensors, ctx.places, strict=True):
         if tensor is None:
@@ -696,14 +651,9 @@ def kept(ctx: Any) -> tuple[Any, ...]:
 
 
 def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap the backward method of an autograd function that has no derivative itself.
-
-    A second derivative with respect to any saved tensor raises an error. torch's `once_differentiable` would report instead
-    that the tensor was not used. Without ``create_graph``, the wrapper adds nothing to the gradients.
-
-    Raises:
-        UsageError: A gradient of a gradient is requested.
-    """
+    """Wrap the backward method of an autograd function, so that a second derivative by any saved tensor is an error."""
+    # torch's `once_differentiable` would report instead that the tensor was not used. Without ``create_graph``, the wrapper
+    # adds nothing.
 
     @functools.wraps(backward)
     def once(ctx: Any, *gradients: torch.Tensor | None) -> Any:
@@ -733,23 +683,13 @@ class _WithoutGradient(torch.autograd.Function):
 
 
 def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
-    """Return values of any shape [...]; a gradient through them is an error where ``source`` [...] requires gradients.
-
-    Args:
-        name: Name of the values in the error.
-        values: Values that were computed from ``source`` without autograd, shape [...].
-        source: Tensor that the gradient would go to, shape [...].
-    """
+    """Return values [...]; a gradient through them is an error where ``source`` [...] requires gradients."""
     found: torch.Tensor = _WithoutGradient.apply(name, values, source)
     return found
 
 
 def refuse_transforms() -> None:
-    """Check that no transform of torch.func is active.
-
-    Raises:
-        UsageError: A transform is active.
-    """
+    """Raise UsageError within a transform of torch.func."""
     if torch._C._are_functorch_transforms_active():
         raise UsageError(
             "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "

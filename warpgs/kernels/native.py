@@ -21,14 +21,7 @@ FOLDER = importlib.resources.files("warpgs") / "kernels" / "cuda"
 
 
 def source(name: str, **numbers: object) -> str:
-    """Return the CUDA text of a file, with names in capitals replaced by numbers.
-
-    A line ``#include "other.cu"`` is replaced by the text of that file of the folder.
-
-    Args:
-        name: Name of the file in the folder; an absolute path names a file elsewhere.
-        numbers: Number, or any other text, that replaces each name.
-    """
+    """Return the CUDA text of a file of `FOLDER`, with its includes, and names in capitals replaced by ``numbers``."""
     text = re.sub(r'^#include "([\w.]+)"\n', lambda found: source(found[1]), (FOLDER / name).read_text("utf-8"), flags=re.M)
     for word, number in numbers.items():
         text = re.sub(rf"\b{word}\b", str(number), text)
@@ -134,10 +127,7 @@ _LISTENERS: list[tuple[Callable[[str], object], list[float]]] = []
 
 @contextlib.contextmanager
 def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]]:
-    """Call ``listener`` within the block with the name of each module that the cache lacks, before it is compiled.
-
-    ``listener`` may be called from any thread. Yields a list, to which the compile time [s] of each module is added.
-    """
+    """Call ``listener``, from any thread, with each module that will be compiled; yield a list of their compile times [s]."""
     entry: tuple[Callable[[str], object], list[float]] = listener, []
     _LISTENERS.append(entry)
     try:
@@ -147,11 +137,9 @@ def told_of_compiling(listener: Callable[[str], object]) -> Iterator[list[float]
 
 
 def load_module(module: wp.Module, device: wp.Device, block_dim: int):
-    """Load a module for blocks of ``block_dim`` threads and return Warp's handle; compile it where the cache lacks it.
-
-    Several fits that start at once on a fresh machine need the same modules. A file lock beside the cache's folders makes one
-    of them compile; the others find the result. Once a module is loaded no lock is taken.
-    """
+    """Load a module for blocks of ``block_dim`` threads and return Warp's handle; compile it where the cache lacks it."""
+    # Fits that start at once on a fresh machine need the same modules: a file lock makes one compile, and the others find the
+    # result.
     key = (module, device.context, block_dim)
     if key in _LOADED:  # Warp's hash shows whether the module has new kernels
         return module.load(device, block_dim=block_dim)
@@ -172,14 +160,9 @@ def load_module(module: wp.Module, device: wp.Device, block_dim: int):
 
 @contextlib.contextmanager
 def exclusive(path: Path) -> Iterator[None]:
-    """Lock a file, which is made if it is missing, so that one thread of one process at a time runs the body.
-
-    The system releases the lock when the process that holds it ends, even if it is killed. On a file system without locks the
-    body runs unlocked: Warp renames a compiled module into place, so two processes that compile it only lose time.
-
-    Raises:
-        ResourceError: The file cannot be opened.
-    """
+    """Lock a file, which is made if missing, so that one thread of one process at a time runs the body."""
+    # The system releases the lock when its process ends, even if killed. On a file system without locks the body runs unlocked:
+    # Warp renames a compiled module into place, so two processes that compile it only lose time.
     try:
         file = path.open("ab")
     except OSError as e:

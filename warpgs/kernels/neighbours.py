@@ -115,19 +115,7 @@ def morton_codes(points: torch.Tensor) -> torch.Tensor:
 
 
 def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
-    """Return the mean squared distance [u^2] of each point to its min(k, N - 1) nearest other points. Not differentiable.
-
-    Args:
-        points: Finite positions [u], shape [N, 3]. Coincident points have distance 0 from each other.
-        k: Number of neighbours, 1 to 8.
-
-    Returns:
-        Shape [N]; 0 for a single point.
-
-    Raises:
-        TypeError: The scalar type is neither float32 nor float64.
-        ValueError: The shape is wrong, k is out of range, or a position is not finite.
-    """
+    """Return the mean squared distance [u^2] of points [N, 3] to their min(k, N - 1) nearest others, [N]; k is 1 to 8."""
     count = launch.check(points=(points, "N 3"))["N"]
     if not 1 <= k <= MAX_NEIGHBORS:
         raise ValueError(f"k must be 1 to {MAX_NEIGHBORS}, not {k}")
@@ -185,20 +173,7 @@ def make_reach_kernel():
 
 
 def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return log(``fraction`` times the distance from each mean to the nearest camera), at least log(`SMALLEST_REACH`).
-
-    Args:
-        means: Positions [u], float32, shape [N, 3]; squared distances do not overflow up to 1e18 u.
-        centers: Positions of at least one camera [u], float32, shape [C, 3].
-        fraction: Positive factor.
-
-    Returns:
-        Logarithms of sizes [u], float32, shape [N].
-
-    Raises:
-        TypeError: An argument is not a tensor, or a scalar type is wrong.
-        ValueError: A shape or a device is wrong.
-    """
+    """Return log(``fraction`` x distance of means [N, 3] to the nearest of centers [C, 3]), from log(`SMALLEST_REACH`)."""
     launch.check(means=(means, "N 3"), centers=(centers, "C 3"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
     inputs = [
@@ -242,23 +217,9 @@ def make_pixel_kernel():
 
 
 def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> torch.Tensor:
-    """Return log(``fraction`` times the smallest pixel size at each mean), at least log(`SMALLEST_PIXEL`).
-
-    The pixel size of a camera is depth / focal length, or distance / focal length for a fisheye (Yu et al. 2024, Mip-Splatting,
-    section 4.1). Cameras that do not see a mean are ignored. A camera sees the points in the cone around its image.
-
-    Args:
-        means: Positions [u], float32, shape [N, 3].
-        cameras: Cameras by `COLUMNS`, float32, shape [C, 9].
-        fraction: Positive factor.
-
-    Returns:
-        Logarithms of sizes [u], float32, shape [N].
-
-    Raises:
-        TypeError: An argument is not a tensor, or a scalar type is wrong.
-        ValueError: A shape or a device is wrong.
-    """
+    """Return log(``fraction`` x smallest pixel size at means [N, 3]) over cameras [C, 9] (`COLUMNS`) that see them, [N]."""
+    # The pixel size of a camera is depth / focal length, or distance / focal length for a fisheye (Yu et al. 2024,
+    # Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
     launch.check(means=(means, "N 3"), cameras=(cameras, "C 9"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
     inputs = [

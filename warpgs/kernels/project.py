@@ -45,16 +45,7 @@ def _threads_each(tensor: torch.Tensor) -> bool:
 def project_tensors(
     inputs: ProjectInputs, settings: ProjectSettings, allocator: Allocator = TORCH
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what `project` returns, for contiguous tensors. Nothing is checked, and no gradient is recorded.
-
-    Args:
-        inputs: The tensors.
-        settings: Everything else.
-        allocator: Provider of the results' memory.
-
-    Returns:
-        Projected Gaussians, shape [C, N, 12], and the number of tiles that each Gaussian touches, int32, shape [C, N].
-    """
+    """Return projected Gaussians [C, N, 12] and tile counts [C, N], int32, of contiguous tensors. Nothing is checked."""
     means, real = inputs.means, launch.real_of(inputs.means)
     cameras, count, rule = len(inputs.viewmats), len(means), settings.rule
     projected = allocator.output((cameras, count, PROJECTED_SIZE), means.dtype, means.device)
@@ -103,20 +94,7 @@ def project_gradients(
     wants_camera: bool,
     allocator: Allocator = TORCH,
 ) -> list[torch.Tensor | None]:
-    """Return the gradients of the first seven inputs. Nothing is checked.
-
-    Args:
-        inputs: Fields of `ProjectInputs` without the opacity factors, contiguous.
-        settings: The settings of the forward pass.
-        projected: First result of `project_tensors`, shape [C, N, 12].
-        tile_counts: Second result of `project_tensors`, int32, shape [C, N].
-        v_projected: Gradient of ``projected``, shape [C, N, 12]; None for zeros.
-        wants_camera: True to compute the gradients of viewmats and Ks; else they are None.
-        allocator: Provider of the gradients' memory.
-
-    Returns:
-        Gradients of the seven inputs, in their shapes [...]; None where not wanted.
-    """
+    """Return the gradients of the first seven inputs, those of viewmats and Ks None unless wanted. Nothing is checked."""
     real, device = launch.real_of(projected), projected.device
     t, (width, height), rule = make_types(real), settings.size, settings.rule
     v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
@@ -165,41 +143,11 @@ def project(
     camera_model: str = "pinhole",
     distortion: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Project N Gaussians into C cameras (EWA, first order).
-
-    Differentiable in the seven tensors. A Gaussian is culled if its depth is below ``rule.near`` or above ``rule.far``, its
-    opacity is below the cut-off, or its box is outside the image. It is also culled if a parameter that is read is non-finite,
-    or outside the ranges of docs/conventions.md (projected mean 1e9 px, axes 1e30 px, coefficients 1e6). Results and gradients
-    of culled Gaussians are zero. Derivation of the backward pass: docs/project.md.
-
-    Args:
-        means: World positions [u], shape [N, 3].
-        quats: Rotations wxyz of any length from 1e-15 to 1e15, shape [N, 4].
-        log_scales: Logarithm of the axis lengths [u], shape [N, 3].
-        logit_opacities: Inverse sigmoid of the opacity, shape [N].
-        sh_coefficients: Spherical-harmonics coefficients of the colour, shape [N, K, 3].
-        viewmats: camera_from_world, shape [C, 4, 4].
-        Ks: Intrinsics [px] with zero skew, shape [C, 3, 3].
-        width: Image width [px].
-        height: Image height [px].
-        degree: Spherical-harmonics degree used, 0 to 4.
-        rule: Cut-offs.
-        tile_size: Side of a tile [px].
-        opacity_factors: Factors of the opacities, at least 0, shape [N]; None for 1. Not differentiable.
-        window: Left, top, width and height [px] of the part of the image to render; left and top are multiples of
-            ``tile_size``. None for the whole image. Gaussians that touch no tile of this part are culled.
-        camera_model: Name of the camera model (`warpgs.kernels.cameras`).
-        distortion: Coefficients of the camera model, shape [C, P]; None if it has no coefficients. Not differentiable.
-
-    Returns:
-        ``projected`` [C, N, 12], with the layout of `PROJECTED_SIZE`, and ``tile_counts`` [C, N] int32, the number of
-        tiles that each Gaussian touches (0 where culled; no gradient).
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The camera model is unknown.
-        ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
-    """
+    """Project Gaussians into C cameras (EWA, first order): return rows [C, N, 12] (`PROJECTED_SIZE`), tile counts [C, N]."""
+    # Differentiable in the seven tensors (docs/project.md). A Gaussian is culled, with results and gradients zero, if its depth
+    # is below ``rule.near`` or above ``rule.far``, its opacity is below the cut-off, its box is outside the image, or a
+    # parameter that is read is non-finite or outside the ranges of docs/conventions.md. ``window`` is left, top, width and
+    # height of the part to render [px].
     if distortion is None:
         distortion = viewmats.new_empty(len(viewmats), 0)
     factors = checked_factors(means, opacity_factors)
@@ -209,20 +157,7 @@ def project(
 
 
 def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[torch.Tensor, torch.Tensor]:
-    """Project as `project` does.
-
-    Args:
-        inputs: The tensors.
-        settings: Everything else.
-
-    Returns:
-        Projected Gaussians, shape [C, N, 12], and the number of tiles that each touches, int32, shape [C, N].
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The camera model is unknown, or the coefficients of its distortion require gradients.
-        ValueError: A shape or device is wrong; the message names the argument and both values, expected and found.
-    """
+    """Return projected Gaussians [C, N, 12] and tile counts [C, N], int32, as `project` does."""
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")
     sizes = launch.check(

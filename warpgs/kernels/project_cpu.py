@@ -16,10 +16,7 @@ LANES = 16
 
 @functools.cache
 def make_lanes(real, camera_model: str, parameters: str, bases: int):
-    """Make the record of a task's Gaussians and its functions; arguments are those of `project_cpu_backward.make_backward`.
-
-    A loop over the lanes vectorises, since each value of all lanes is contiguous.
-    """
+    """Make the record of a task's Gaussians and its functions; a loop over the lanes vectorises."""
     m = make_projection(real, camera_model, parameters)
     basis_of = sh.make_functions(real, bases).basis
     vec3 = m.vec3
@@ -246,16 +243,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
 
 @functools.cache
 def make_backward(real, camera_model: str, parameters: str, antialiased: bool, bases: int, camera_gradients: bool):
-    """Make the kernel. Each task sums over all cameras, so no sum needs atomics.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        antialiased: True where opacities were multiplied by `compensation`.
-        bases: Number of basis values that a colour may have (`sh.bases_for`).
-        camera_gradients: True to compute the gradients of viewmats and Ks.
-    """
+    """Make the kernel; each task sums over all cameras, so no sum needs atomics. Arguments are those of `make_forward`."""
     m = make_projection(real, camera_model, parameters, lanes=True)
     of_one = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)
     f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases, lanes=True)

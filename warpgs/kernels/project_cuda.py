@@ -15,17 +15,8 @@ from warpgs.kernels.native import make_functions as make_native
 def make_forward(
     real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
 ):  # fmt: skip
-    """Make the forward kernel. It computes the colours last, because they need the most data.
-
-    In float32 the first threads of each block compute the colours of the Gaussians that touch a tile.
-
-    Args:
-        real: wp.float32, whose rows and coefficients are moved 16 bytes at a time, or wp.float64.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        antialiased: True to multiply opacities by `compensation`.
-        bases: Number of basis values that a colour may have (`sh.bases_for`).
-    """
+    """Make the forward kernel of one `ProjectSettings.variant`. It computes colours last, because they need the most data."""
+    # In float32 the first threads of each block compute the colours of the Gaussians that touch a tile.
     native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
     s = make_spans(real)
@@ -166,17 +157,8 @@ def make_forward(
 def make_backward(
     real, camera_model: str, parameters: str = "stored", antialiased: bool = False, bases: int = sh.BASES
 ):  # fmt: skip
-    """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics.
-
-    In float32 the Gaussians that some camera sees are assigned to the first threads of each block.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        camera_model: Name of the camera model, whose functions are compiled in.
-        parameters: Kind of the Gaussians' parameters (`ProjectSettings.parameters`).
-        antialiased: True where opacities were multiplied by `compensation`.
-        bases: Number of basis values that a colour may have (`sh.bases_for`).
-    """
+    """Make the backward kernel: one thread per Gaussian, over all cameras, so no sum needs atomics."""
+    # In float32 the Gaussians that some camera sees are assigned to the first threads of each block.
     native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
     f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)

@@ -34,11 +34,7 @@ BASES = 16
 
 
 def coefficient_count(degree: int) -> int:
-    """Return the number of coefficients per channel up to a degree.
-
-    Raises:
-        ValueError: The degree is not 0 to 4.
-    """
+    """Return the number of coefficients per channel up to a degree; ValueError unless it is 0 to 4."""
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical-harmonics degree must be 0 to {MAX_DEGREE}, not {degree}")
     return (degree + 1) ** 2

@@ -116,15 +116,9 @@ def make_functions(real):
 
 @functools.cache
 def make_cpu_kernels(real, summed: bool):
-    """Make the kernels for a CPU, of one task per block of rows.
-
-    The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
-    elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        summed: True for sums over the image instead of a map.
-    """
+    """Make the kernels for a CPU, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
+    # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
+    # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
     vec11 = wp.types.vector(2 * RADIUS + 1, real)
     vec11i = wp.types.vector(2 * RADIUS + 1, wp.int32)
@@ -627,22 +621,8 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
 
 
 def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return the sums over all pixels and channels of 1 - `ssim` and of |image - target|, for photometric losses.
-
-    One pass computes both sums; the backward pass computes their gradient. For tiny images, and for float64 on CUDA, torch sums
-    the map of `ssim`.
-
-    Args:
-        image: Colours in [0, 1], shape [H, W, 3] or [B, H, W, 3].
-        target: Colours of the image to compare with, shape [H, W, 3] or [B, H, W, 3]; no gradient.
-
-    Returns:
-        The two sums, shape [2]. The gradient of |image - target| is 0 where both are equal.
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        ValueError: A shape or device is wrong.
-    """
+    """Return the sums over pixels and channels of 1 - `ssim` and |image - target| [2], for images [H, W, 3] or [B, H, W, 3]."""
+    # One pass computes both sums. For tiny images, and for float64 on CUDA, torch sums the map of `ssim`.
     _check(image, target)
     target = target.detach()
     if not (_native(image) or (image.device.type == "cpu" and image.shape[-2] * CHANNELS >= LANES)):

@@ -98,12 +98,7 @@ def make_depth_kernels():
 
 
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
-    """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola through three costs, float64, shape [H, W].
-
-    Args:
-        costs: Integers, int16, shape [H, W, P] with P at least D.
-        inverses: Inverse depths of the D planes, evenly spaced, at least three, shape [D].
-    """
+    """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola, float64 [H, W], from costs [H, W, P]."""
     height, width, padded = costs.shape
     found = torch.empty(height, width, dtype=torch.float64, device="cpu")
     inputs = [
@@ -125,21 +120,9 @@ def check_round_trip(
     first: Camera, second: Camera, own: np.ndarray, found: np.ndarray, sensitivity: np.ndarray, *, most: float,
     min_parallax: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return a mask of the pixels with enough parallax to which a round trip through another view's depth leads back.
-
-    Args:
-        first: Camera of the view.
-        second: Camera of the other view.
-        own: Inverse depths of the view [1/u], float64, shape [H, W].
-        found: Inverse depths of the other view [1/u], float64, at its size.
-        sensitivity: Change of depth per pixel [u/px], float64, contiguous, shape [H, W]; lowered in place where this pair of
-            views has a smaller value.
-        most: Largest distance [px] between the pixel and the end of the round trip.
-        min_parallax: Smallest angle between the two rays [deg].
-
-    Returns:
-        Mask, bool, shape [H, W].
-    """
+    """Return a mask [H, W] of the pixels whose round trip through another view's inverse depth ends within ``most`` px."""
+    # ``sensitivity`` [H, W], the change of depth per pixel [u/px], is lowered in place where this pair of views has a smaller
+    # value.
     agrees = torch.empty(own.shape, dtype=torch.uint8, device="cpu")
     rotation, translation = geometry.relative_pose(first, second)
     center = -geometry.matmul(rotation.T, translation[:, None])[:, 0]
@@ -400,26 +383,11 @@ def _window_sums(values: np.ndarray, radius: int) -> np.ndarray:
 def plane_costs(
     gray: np.ndarray, others: Sequence[np.ndarray], homographies: np.ndarray, window: int, noise: float, unit: int
 ) -> torch.Tensor:
-    """Return the matching costs of an image against others, which are warped to it by the homographies of D planes.
-
-    The cost of one other image is 0.5 (1 - correlation). The result is half the mean of these costs plus half the smallest: an
-    image that does not see the point contributes, but cannot outvote one that does.
-
-    Args:
-        gray: Brightness in [0, 1], float32, shape [H, W].
-        others: Brightness of N other images, of any size.
-        homographies: Homographies from pixels of the image to pixels of each other image, shape [D, N, 3, 3]. Pixel centres are
-            at integers. The sign makes the third coordinate positive in front of the other camera.
-        window: Side of the square in which pixels are correlated [px], odd, at most 2 `MAX_RADIUS` + 1.
-        noise: Number that is added to the variance of a window.
-        unit: Integer that stands for cost 1, below 2^15.
-
-    Returns:
-        Costs, int16, shape [H, W, P]: P is D rounded up to a multiple of `LANES`, and costs past D are ``unit``.
-
-    Raises:
-        ValueError: The window is too small or too large.
-    """
+    """Return the costs int16 [H, W, P] of an image [H, W] against others, warped by homographies [D, N, 3, 3] of D planes."""
+    # The cost of one other image is 0.5 (1 - correlation), with ``noise`` added to the variance; ``unit`` stands for cost 1.
+    # The result is half the mean of these costs plus half the smallest: an image that does not see the point contributes, but
+    # cannot outvote one that does. Pixel centres are at integers. P is D rounded up to a multiple of `LANES`; costs past D are
+    # ``unit``.
     radius = window // 2
     if not 1 <= radius <= MAX_RADIUS:
         raise ValueError(f"window must be 3 to {2 * MAX_RADIUS + 1} px, not {window}")
@@ -576,23 +544,10 @@ def make_scanline_kernel():
 
 
 def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
-    """Return the sum of the path costs from above, below, left and right.
-
-    A path's cost at pixel k and plane d is L(k, d) = C(k, d) + min(L(k-1, d), L(k-1, d +- 1) + small, min_i L(k-1, i) + limit)
-    - min_i L(k-1, i), with the limit of the step from k - 1 to k (Hirschmüller 2008, eq. 13). Not differentiable.
-
-    Args:
-        costs: C in whole units, at least 0, int16, shape [H, W, D] with D at least 1.
-        down: Limits of the steps from a row to the next, at least 0, int32, shape [H - 1, W].
-        across: Limits of the steps from a column to the next, at least 0, int32, shape [H, W - 1].
-        small: Penalty for a change of one plane, at least 0. Costs and penalties together are at most `LARGEST`.
-
-    Returns:
-        The sums, int16, shape [H, W, D].
-
-    Raises:
-        ValueError: A shape, type or device disagrees.
-    """
+    """Return the sum of the path costs from above, below, left and right, int16 [H, W, D]. Not differentiable."""
+    # A path's cost at pixel k and plane d is L(k, d) = C(k, d) + min(L(k-1, d), L(k-1, d +- 1) + small, min_i L(k-1, i) +
+    # limit) - min_i L(k-1, i), with the limit of the step from k - 1 to k (Hirschmüller 2008, eq. 13). Costs, penalties: at
+    # most `LARGEST`.
     height, width, planes = costs.shape
     for name, tensor, dtype, shape in (
         ("costs", costs, torch.int16, (height, width, planes)),

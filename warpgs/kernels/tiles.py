@@ -35,11 +35,8 @@ EACH = 4
 
 @functools.cache
 def make_find_ranges(slotted: bool, native: bool):
-    """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`.
-
-    A thread takes `EACH` instances on CUDA (``native``), else one. The instances of a thread lie far apart, so that
-    neighbouring threads read neighbouring instances.
-    """
+    """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`."""
+    # A thread's instances lie far apart, so that neighbouring threads read neighbouring instances.
     each = wp.constant(EACH if native else 1)
     ints = wp.types.vector(each, wp.int32)
     module = f"warpgs.kernels.tiles.ranges.{int(slotted)}.{int(native)}"
@@ -105,16 +102,9 @@ def make_write(slotted: bool):
 
 @functools.cache
 def make_emit(real, slotted: bool):
-    """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `tiles_emit_cpu`).
-
-    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile number
-    ``no_tile``.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        slotted: True to write the slot and the Gaussian number of each instance; False to write the number in place of the
-            slot.
-    """
+    """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `make_emit_cpu`)."""
+    # A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile
+    # ``no_tile``. Without ``slotted``, the number of the Gaussian takes the place of the slot.
     s = make_spans(real)
     vec3 = wp.types.vector(3, real)
     vec2i = s.vec2i
@@ -326,10 +316,7 @@ def _of_sum(native: bool) -> tuple[int, int]:
 
 
 def sum_entries(count: int, native: bool) -> tuple[int, int]:
-    """Return the number of running sums for ``count`` items, and the number of threads to launch.
-
-    On CUDA, the number of threads is a multiple of 256, the block size.
-    """
+    """Return the numbers of running sums for ``count`` items, and of threads (on CUDA a multiple of the block size, 256)."""
     width, each = _of_sum(native)
     entries = -(-count // (width * each))
     return entries, -(-entries * width // 256) * 256 if native else entries
@@ -437,16 +424,7 @@ def make_kernels(real, native: bool):
 def running_counts(
     counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
 ) -> torch.Tensor:  # fmt: skip
-    """Return running sums, each of which counts both tiles and visible Gaussians in one number, int64, shape [S].
-
-    A visible Gaussian adds its tile count and 2^`sum_bits`. `split_sum` splits the last sum.
-
-    Args:
-        counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
-        real: Scalar type of the Gaussians, of Warp.
-        allocator: Provider of the sums' memory, which is workspace.
-        out: Result of an earlier call, shape [S], for reuse of its memory; None for new memory.
-    """
+    """Return running sums int64 [S] of counts [C * N]; a visible Gaussian adds its count and 2^`sum_bits` (see `split_sum`)."""
     device, count, native = counts.device, len(counts), counts.is_cuda
     sums, threads = sum_entries(count, native)
     packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
@@ -600,12 +578,9 @@ def _check_total(total: int, visible: int, device: torch.device, tiles: int, bud
 def _depth_order(
     projected: torch.Tensor, counts: torch.Tensor, tiles: int, memory: InstanceMemory
 ) -> tuple[torch.Tensor, int, int]:
-    """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances.
-
-    With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds. Invisible
-    ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the
-    number of tiles of an image.
-    """
+    """Return Gaussian numbers from front to back, int32; how many of them are visible; and the number of instances."""
+    # With a capacity nothing is read from the device: all Gaussians count as visible, or as many as the capacity holds.
+    # Invisible ones come last, and the number of instances is the capacity.
     device, count, real, native = projected.device, len(counts), launch.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
     projected_view, counts_view = launch.view(projected, real), launch.view(counts, wp.int32)
@@ -645,10 +620,7 @@ def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, 
 def _sort_by_tile(
     keys: torch.Tensor, slots: torch.Tensor, owners: torch.Tensor, ranges: torch.Tensor, total: int, slotted: bool
 ) -> torch.Tensor:
-    """Sort the instances stably by tile, fill in the range of each tile, and return the Gaussian numbers, int32, shape [M].
-
-    ``keys`` and ``slots`` are sort buffers [2 M], ``owners`` [M], or [0] without ``slotted``; ``ranges`` [C * tiles, 2].
-    """
+    """Sort the instances stably by tile, fill in the range of each tile, and return the Gaussian numbers, int32, [M]."""
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
     keys_view, slots_view, *others = (launch.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
     sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
@@ -663,26 +635,10 @@ def bin_tiles(
     origin: tuple[int, int] = (0, 0), memory: InstanceMemory = AS_NEEDED, slotted: bool = True,
     listed: torch.Tensor | None = None,
 ) -> Tiles:  # fmt: skip
-    """Return for every tile the Gaussians that touch it, front to back. Not differentiable.
-
-    Args:
-        projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tile_counts: Number of tiles that each Gaussian touches, int32, shape [C, N].
-        width: Width of the image or window [px].
-        height: Height of the image or window [px].
-        rule: Cut-offs, the same as given to `project`.
-        tile_size: Side of a tile [px].
-        origin: Left and top [px] of the window given to `project`, multiples of ``tile_size``.
-        memory: Memory that the (Gaussian, tile) instances may take; if it has a capacity, the lists have this length.
-        slotted: True to return ``slots``, which gradients and `contributions` need; False leaves them empty and is faster.
-        listed: True for the tiles that get instances, bool, shape [C * tiles]; the others stay empty. None for all tiles.
-
-    Raises:
-        ResourceError: The instances, counted in 64 bits before anything is allocated, exceed the budget or 2^30 - 1; or
-            there are 2^31 tiles or more.
-        TypeError: A scalar type is neither float32 nor float64.
-        ValueError: A shape disagrees.
-    """
+    """Return for every tile the Gaussians [C, N, 12] that touch it, front to back. Not differentiable."""
+    # ``origin`` is left and top [px] of the window given to `project`, multiples of ``tile_size``. Without ``slotted``, which
+    # gradients and `contributions` need, slots stay empty. ``listed`` [C * tiles] is True for the tiles that get instances;
+    # None for all.
     counts, (columns, rows) = _checked_counts(projected, tile_counts), grid(width, height, tile_size)
     cameras, per_camera = tile_counts.shape
     no_tile = _checked_tiles(cameras, width, height, tile_size)

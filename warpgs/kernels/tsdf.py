@@ -177,15 +177,7 @@ def make_kernels(real):
 def empty_grid(
     origin: tuple[float, float, float], voxel: float, shape: tuple[int, int, int], truncation: float, like: torch.Tensor
 ) -> DistanceGrid:
-    """Allocate a grid that no view has seen, of the type and on the device of ``like`` [...]: two numbers for each point.
-
-    Args:
-        origin: Position of the first point [u].
-        voxel: Distance from one point to the next [u], above 0.
-        shape: Number of points along each axis.
-        truncation: Largest distance from a surface that is stored [u], above 0.
-        like: Any tensor, of any shape.
-    """
+    """Allocate a grid of points ``shape`` that no view has seen, of the type and on the device of ``like`` [...]."""
     return DistanceGrid(origin, voxel, truncation, like.new_zeros(shape), like.new_zeros(shape))
 
 
@@ -196,18 +188,7 @@ def _pose(camera: Camera, like: torch.Tensor, kernels: SimpleNamespace) -> list[
 
 
 def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
-    """Return the cosine of the angle between each pixel's ray and the normal of the surface that it meets.
-
-    Args:
-        depth: z-depth [u], infinite where there is no surface, 0 where unknown, contiguous, shape [H, W].
-        camera: Pinhole camera of the size of ``depth``, arrays of numpy.
-
-    Returns:
-        Cosines in [0, 1], shape [H, W]: 1 where depth is infinite, and 0 where it is unknown.
-
-    Raises:
-        UsageError: The camera is not a pinhole.
-    """
+    """Return the cosine of each pixel's ray with the surface's normal [H, W]; 1 where depth is infinite, 0 where unknown."""
     check_pinhole(camera)
     real = launch.real_of(depth)
     kernels, cosines = make_kernels(real), torch.empty_like(depth)
@@ -217,21 +198,7 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
 
 
 def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor) -> None:
-    """Add the signed distances of one view to a grid, in place, except at points more than a truncation behind the surface.
-
-    Args:
-        grid: The grid.
-        camera: Pinhole camera, arrays of numpy.
-        depth: z-depth [u], infinite where there is no surface, contiguous, shape [H, W]. It is interpolated between the pixels
-            of a surface, and not across its edges.
-        pixel_weights: Weight of each pixel, at least 0, shape [H, W]; 0 where depth is unknown.
-
-    Raises:
-        ResourceError: The grid has more points than kernels can index.
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The camera is not a pinhole.
-        ValueError: A shape or device is wrong.
-    """
+    """Add one view's signed distances to a grid, in place, except at points more than a truncation behind the surface."""
     check_pinhole(camera)
     launch.check(
         depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(grid.distances, "X Y Z"),
@@ -251,23 +218,7 @@ def gather_colors(
     points: torch.Tensor, tolerance: float, camera: Camera, depth: torch.Tensor, pixel_weights: torch.Tensor,
     image: torch.Tensor, sums: torch.Tensor, weights: torch.Tensor,
 ) -> None:  # fmt: skip
-    """Add the colours of one view, in place, to the points that lie on the surface that the view sees.
-
-    Args:
-        points: Positions [u], shape [N, 3].
-        tolerance: Largest difference between a point's depth and that of the surface [u].
-        camera: Pinhole camera, arrays of numpy.
-        depth: z-depth [u], contiguous, shape [H, W].
-        pixel_weights: Weight of each pixel, at least 0, shape [H, W].
-        image: Colours, contiguous, shape [H, W, 3].
-        sums: Sums of weighted colours so far, shape [N, 3].
-        weights: Sums of weights so far, shape [N].
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        UsageError: The camera is not a pinhole.
-        ValueError: A shape or device is wrong.
-    """
+    """Add one view's weighted colours in place to the points [N, 3] on the surface that it sees, within ``tolerance`` [u]."""
     check_pinhole(camera)
     launch.check(
         points=(points, "N 3"), depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), image=(image, "H W 3"),

@@ -134,12 +134,7 @@ def make_errors():
 
 
 def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Return the sum of squared errors of an image clamped to [0, 1], shape [], the same bits on any number of CPU threads.
-
-    Args:
-        rgb: Colours, shape [H, W, 3].
-        target: Colours in [0, 1], shape [H, W, 3].
-    """
+    """Return the sum of squared errors of an image [H, W, 3] clamped to [0, 1]; the same bits on any number of CPU threads."""
     if rgb.device.type != "cpu" or rgb.dtype != torch.float32:
         return torch.nn.functional.mse_loss(rgb.clamp(0, 1), target, reduction="sum")
     tasks = -(-rgb.numel() // ERROR_SEGMENT)
@@ -153,20 +148,7 @@ def begin_step(
     counter: torch.Tensor, view_rows: torch.Tensor, lr_rows: torch.Tensor, setting_rows: torch.Tensor,
     viewmats: torch.Tensor, Ks: torch.Tensor, targets: torch.Tensor,
 ) -> tuple[torch.Tensor, ...]:  # fmt: skip
-    """Return the inputs of the step whose number is in device memory. Tensors are float32 unless another type is given.
-
-    Args:
-        counter: Number of the step among the B steps that were prepared, int64, shape [1].
-        view_rows: Number of each step's view, int64, shape [B].
-        lr_rows: Learning rates of each step, shape [B, R].
-        setting_rows: Settings of each step (`Setting`), shape [B, S].
-        viewmats: camera_from_world of each view, shape [V, 4, 4].
-        Ks: Intrinsics [px], shape [V, 3, 3].
-        targets: Images, shape [V, H, W, 3].
-
-    Returns:
-        ``lrs`` [R], ``settings`` [S], ``viewmat`` [1, 4, 4], ``K`` [1, 3, 3] and ``target`` [H, W, 3].
-    """
+    """Return lrs [R], settings [S], viewmat [1, 4, 4], K [1, 3, 3] and target [H, W, 3] of the step in the counter [1]."""
     found = (
         lr_rows.new_empty(lr_rows.shape[1]), setting_rows.new_empty(setting_rows.shape[1]),
         viewmats.new_empty(1, 4, 4), Ks.new_empty(1, 3, 3), targets.new_empty(targets.shape[1:]),
@@ -182,18 +164,7 @@ def begin_step(
 def end_step(
     loss: torch.Tensor, mse: torch.Tensor, counter: torch.Tensor, stop: torch.Tensor, history: torch.Tensor
 ) -> torch.Tensor:
-    """Store a step's result, then increase the counter if ``stop`` is 0; else the step is not counted, and can be repeated.
-
-    Args:
-        loss: Loss, float32, shape []. If it is not finite, ``stop`` becomes NOT_FINITE.
-        mse: Mean squared error, float32, shape [].
-        counter: Number of the step, int64, shape [1]; increased by one if ``stop`` is 0.
-        stop: 0, or the reason to stop, int32, shape [1].
-        history: Loss and mean squared error of each step, float32, shape [B, 2].
-
-    Returns:
-        True if ``stop`` is 0, bool, shape [1].
-    """
+    """Store a step's loss and error in ``history`` [B, 2]; count the step if ``stop`` [1] is 0, and return that, bool, [1]."""
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
     inputs = [
         *(launch.view(t.detach().view(1), wp.float32) for t in (loss, mse)), launch.view(counter, wp.int64),
@@ -237,13 +208,7 @@ def make_functions(real):
 
 @functools.cache
 def make_adam_kernel(real, split: bool, lanes: int):
-    """Make the update kernel; each task updates a segment of the flat parameter, ``lanes`` elements at a time.
-
-    Args:
-        real: wp.float32 or wp.float64.
-        split: True where the first numbers of each row have a learning rate of their own, which costs some arithmetic.
-        lanes: Number of elements that are updated at a time.
-    """
+    """Make the update kernel; ``split`` where the first numbers of each row have a learning rate of their own."""
     values = wp.types.vector(lanes, real)
     f = make_functions(real)
 
@@ -328,19 +293,7 @@ def adam_scheduled(
     param: torch.Tensor, grad: torch.Tensor, exp_avg: torch.Tensor, exp_avg_sq: torch.Tensor, lrs: torch.Tensor,
     skip: torch.Tensor, *, head: int, betas: tuple[float, float] = BETAS, eps: float = EPS,
 ) -> None:  # fmt: skip
-    """Update as `adam_step` does, in float32, with learning rates in memory, so that a CUDA graph can replay it.
-
-    Args:
-        param: Parameter, contiguous, shape [N, ...].
-        grad: Its gradient, same shape.
-        exp_avg: Running mean of the gradient, same shape, contiguous.
-        exp_avg_sq: Running mean of the squared gradient, same shape, contiguous.
-        lrs: Result of `scheduled_lrs`, float32, shape [3].
-        skip: Flag, int32, shape [1]; nothing is updated if it is not 0.
-        head: How many numbers, from the start of a row, take the first learning rate; 0 for none.
-        betas: Decay of the two running means.
-        eps: Number added to the square root of the second moment.
-    """
+    """Update as `adam_step` does, in float32, with learning rates [3] in memory, unless ``skip`` [1] is not 0."""
     if param.numel() == 0:
         return
     if param.device.type == "cpu":
@@ -383,24 +336,8 @@ def adam_step(
     head_lr: float | None = None,
     head: int = 0,
 ) -> None:
-    """Update a parameter and its moments in place, with bias correction as in `torch.optim.Adam`.
-
-    Args:
-        param: Parameter, contiguous, shape [N, ...].
-        grad: Its gradient, same shape.
-        exp_avg: Running mean of the gradient, same shape, contiguous.
-        exp_avg_sq: Running mean of the squared gradient, same shape, contiguous.
-        lr: Learning rate.
-        step: Number of this step, from 1.
-        betas: Decay rates of the two moments.
-        eps: Number added to the square root of the second moment.
-        head_lr: Learning rate of the first ``head`` numbers of each of the N rows; None for ``lr``.
-        head: How many numbers, from the start of a row, take ``head_lr``; 0 for none.
-
-    Raises:
-        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
-        ValueError: A shape or device is wrong, a tensor to be updated is not contiguous, or ``step`` is below 1.
-    """
+    """Update a parameter [N, ...] and its moments in place, with bias correction as in `torch.optim.Adam`."""
+    # The first ``head`` numbers of each of the N rows take the learning rate ``head_lr``.
     pattern = " ".join(str(s) for s in param.shape)
     launch.check(param=(param, pattern), grad=(grad, pattern), exp_avg=(exp_avg, pattern), exp_avg_sq=(exp_avg_sq, pattern))
     if not (param.is_contiguous() and exp_avg.is_contiguous() and exp_avg_sq.is_contiguous()):
@@ -447,18 +384,7 @@ def make_decay_kernel():
 
 
 def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
-    """Return the logits after multiplying the opacities by a factor.
-
-    Args:
-        logits: Logits of opacities, float32, shape [N]; a NaN stays NaN.
-        factor: Factor, in (0, 1).
-
-    Returns:
-        Logits, float32, shape [N].
-
-    Raises:
-        ValueError: ``logits`` is not of shape [N], or the factor is out of range.
-    """
+    """Return the logits [N], float32, after multiplying the opacities by a factor in (0, 1); a NaN stays NaN."""
     launch.check(logits=(logits, "N"))
     if not 0 < factor < 1:
         raise ValueError(f"factor must be above 0 and below 1, not {factor}")
@@ -491,22 +417,9 @@ def make_dropout_kernel():
 
 
 def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tensor:
-    """Return factors for the opacities of ``count`` Gaussians: 0 with probability p, else 1 / (1 - p).
-
-    The expected opacity is unchanged. The factors depend only on p, ``seed``, the number of the step or view (`Setting.NUMBER`)
-    and the Gaussian's row, so they are the same on every device and in a resumed fit.
-
-    Args:
-        count: Number of Gaussians N.
-        settings: Settings of the step, float32, shape [7]; `Setting.DROPOUT` is p.
-        seed: Any 32-bit integer.
-
-    Returns:
-        Factors, float32, shape [N], on the device of ``settings``.
-
-    Raises:
-        ValueError: ``settings`` is not of shape [7].
-    """
+    """Return factors [N] for the opacities: 0 with probability p (`Setting.DROPOUT`), else 1 / (1 - p)."""
+    # They depend only on p, ``seed``, the number of the step or view and the Gaussian's row, so they are the same on every
+    # device and in a resumed fit.
     launch.check(settings=(settings, str(len(Setting))))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)
     inputs = [launch.view(settings, wp.float32), seed, launch.view(factors, wp.float32)]

@@ -121,27 +121,9 @@ def make_median_native(tile_size: int):
 def median_depth(
     projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> torch.Tensor:
-    """Return the depth of the Gaussian at which a pixel's transmittance falls to one half or below. Not differentiable.
-
-    This is the weighted median of depth; the weights are those of blending, and the background has the rest. At an edge it does
-    not mix both surfaces, unlike the mean depth of `blend`. A pixel has no median depth if its alpha in `blend` is below 1/2.
-    Results repeat bit for bit with any number of threads.
-
-    Args:
-        projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Result of `bin_tiles` for the same image size.
-        width: Image width [px].
-        height: Image height [px].
-        rule: Cut-offs.
-        origin: Left and top [px] of the window that the tiles were made for.
-
-    Returns:
-        Depth of the Gaussian's mean [u] (z; the distance for a fisheye), 0 where alpha is below 1/2, shape [C, H, W].
-
-    Raises:
-        TypeError: The scalar type is neither float32 nor float64.
-        ValueError: A shape disagrees, or the tiles belong to another image size.
-    """
+    """Return the depth [u] of the Gaussian at which a pixel's transmittance falls to 1/2 or below, else 0, [C, H, W]."""
+    # This is the weighted median of depth; the background has the rest of the weight. At an edge it does not mix both surfaces,
+    # unlike the mean depth of `blend`. Not differentiable. Results repeat bit for bit with any number of threads.
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
     real, device = launch.real_of(projected), projected.device
@@ -277,27 +259,9 @@ def make_heaviest_native(tile_size: int):
 def heaviest(
     projected: torch.Tensor, tiles: Tiles, k: int, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the k Gaussians of largest blending weight alpha * T in each pixel, heaviest first; equal weights nearest first.
-
-    Not differentiable. Results repeat bit for bit with any number of threads.
-
-    Args:
-        projected: Projected Gaussians of `project`, shape [C, N, 12].
-        tiles: Result of `bin_tiles` for the same image size.
-        k: Number of Gaussians, at least 1.
-        width: Image width [px].
-        height: Image height [px].
-        rule: Cut-offs.
-        origin: Left and top [px] of the window that the tiles were made for.
-
-    Returns:
-        Ids of Gaussians from 0 to N - 1, int32, shape [C, H, W, k]; weights, shape [C, H, W, k]; and the number of blended
-        Gaussians, int32, shape [C, H, W]. If fewer than k Gaussians have a weight above 0, the other ids are -1, with weight 0.
-
-    Raises:
-        TypeError: The scalar type is neither float32 nor float64.
-        ValueError: A shape disagrees, the tiles belong to another image size, or ``k`` is below 1.
-    """
+    """Return ids [C, H, W, k] of the Gaussians of largest weight alpha * T in each pixel, the weights, and counts [C, H, W]."""
+    # Heaviest first; equal weights nearest first; id -1 with weight 0 where fewer than k have a weight. The count is of all
+    # that were blended. Not differentiable. Results repeat bit for bit with any number of threads.
     check_tiles(projected, tiles, width, height)
     if k < 1:
         raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
