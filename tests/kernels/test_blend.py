@@ -11,10 +11,11 @@ from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
-from warpgs.kernels.blend import blend, composite, contributions
+from warpgs.kernels.blend import blend, composite
 from warpgs.kernels.falloff import BlendSettings
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.kernels.walk import contributions
 from warpgs.scene import C0
 
 

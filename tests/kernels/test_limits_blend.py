@@ -11,7 +11,7 @@ from tests.reference.blend import blend_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels import blend, tiles
+from warpgs.kernels import blend, tiles, walk
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
@@ -85,7 +85,7 @@ def test_tiles_of_a_smaller_or_larger_picture_are_refused():
     made = tiles.bin_tiles(projected, counts, width=40, height=30, rule=EXACT)
     for count, width, height in ((2, 16, 30), (2, 40, 16), (1, 40, 30)):
         with pytest.raises(ValueError, match="made for another image"):
-            blend.contributions(projected[:count], made, width=width, height=height, rule=EXACT)
+            walk.contributions(projected[:count], made, width=width, height=height, rule=EXACT)
 
 
 def one_a_tile(device, columns=3, rows=3):
@@ -179,7 +179,7 @@ def plain(opacities, device, dtype, rule, side=16):
     )
     black = torch.zeros(1, 3, dtype=dtype, device=device)
     images = blend.blend(projected, made, black, width=side, height=side, rule=rule)
-    fractions = blend.contributions(projected, made, width=side, height=side, rule=rule)
+    fractions = walk.contributions(projected, made, width=side, height=side, rule=rule)
     return projected, images, fractions
 
 
@@ -254,7 +254,7 @@ def test_all_three_passes_draw_the_same_pixels(device, dtype, rule):
     record = projected.detach().requires_grad_()
     rgb, _, _ = blend.blend(record, made, torch.zeros(1, 3, dtype=dtype, device=device), **size)
     (gradient,) = torch.autograd.grad(rgb[..., 0].sum(), record)
-    sums, _ = blend.contributions(projected, made, **size)
+    sums, _ = walk.contributions(projected, made, **size)
     near = 1e-4 if dtype == torch.float32 else 1e-12
     assert float((gradient[..., 6] - sums).abs().max()) <= near * float(sums.max())
     shown = (sums.double() * projected[..., 6].double()).sum()
@@ -275,7 +275,7 @@ def test_blocks_that_are_left_out_draw_nothing(rule, tile_size):
         made = tiles.bin_tiles(projected, counts, tile_size=tile_size, **size)
         record = projected.detach().requires_grad_()
         rgb, alpha, depth = blend.blend(record, made, torch.zeros(2, 3, device=device), **size)
-        fractions = blend.contributions(projected, made, **size)
+        fractions = walk.contributions(projected, made, **size)
         (gradient,) = torch.autograd.grad((rgb.sum(-1) + alpha + depth).sum(), record, retain_graph=True)
         (of_rgb,) = torch.autograd.grad(rgb.square().sum(), record)
         found.append([t.detach().cpu().double() for t in (rgb, alpha, *fractions, gradient[..., :10], of_rgb[..., :10])])

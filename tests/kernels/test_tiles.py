@@ -10,7 +10,7 @@ from tests.reference.tiles import touched_reference
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch
-from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import (
     EACH,
@@ -24,6 +24,7 @@ from warpgs.kernels.tiles import (
     sum_bits,
     sum_entries,
 )
+from warpgs.kernels.walk import contributions
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]

@@ -18,13 +18,13 @@ from warpgs.constants import RULES
 from warpgs.errors import ResourceError
 from warpgs.kernels import launch as interop
 from warpgs.kernels import launch as sorting
-from warpgs.kernels.blend import blend, contributions
+from warpgs.kernels.blend import blend
 from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
 from warpgs.kernels.update import Setting, adam_step, opacity_dropout
-from warpgs.kernels.walk import median_depth
+from warpgs.kernels.walk import contributions, median_depth
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 

@@ -32,8 +32,7 @@ CUDA_FUNCTIONS = {
         "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
     ),
     "warpgs/kernels/update.py": ("make_scheduled_kernel",),
-    "warpgs/kernels/walk.py": ("make_heaviest_native", "make_median_native",),
-    "warpgs/kernels/ssim.py": ("make_kernels", "_Launcher.padded", "_Launcher.launch"),
+    "warpgs/kernels/walk.py": ("make_native", "_launch_native"),
 }  # fmt: skip
 """Code that only a CUDA device runs, in addition to code that `sides` and `ends_cpu` find."""
 

@@ -98,15 +98,6 @@ def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
     launch.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
-def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[launch.View]:
-    """Return the inputs of the generic kernels: projected Gaussians [C, N, 9 + D], and the instances of each tile."""
-    return [
-        launch.rows(projected, real),
-        launch.view(tiles.ranges, wp.int32),
-        launch.view(tiles.gaussian_ids, wp.int32),
-    ]
-
-
 def _span(image: torch.Tensor, real) -> tuple[launch.View, int]:
     """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the stride of its pixels."""
     found = launch.span(image, real)
@@ -136,10 +127,8 @@ def composite(
     transmittances, weights = (allocator.saved(shape, projected.dtype, device) for _ in range(2))
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
-        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, wp.types.vector(9 + channels, real)),
-        launch.view(backgrounds, real), *_span(rgb, real),
-        *(launch.flat(t, real) for t in (alpha, depth, transmittances, weights)),
-        launch.flat(ends, wp.int32),
+        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, backgrounds, *_span(rgb, real),
+        alpha, depth, transmittances, weights, ends,
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size, channels).forward, len(tiles.ranges), inputs, device)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
@@ -157,20 +146,14 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     upstream: list = [*_span(v_rgb, real)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
-        upstream.append(launch.flat(v, real))
-    record = wp.types.vector(projected.shape[-1], real)
+        upstream.append(v)
     inputs = [
-        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, record), launch.view(tiles.slots, wp.int32),
-        launch.view(backgrounds, real),
-        *(launch.flat(t, real) for t in (transmittances, weights, depth)), launch.flat(ends, wp.int32),
-        *upstream, launch.view(v_slots, real),
+        settings.struct(tiles.size, real), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, backgrounds,
+        transmittances, weights, depth, ends, *upstream, v_slots,
     ]  # fmt: skip
     kernels = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep)
     _launch(kernels.backward, len(tiles.ranges), inputs, device)
-    inputs = [
-        launch.rows(v_slots, wp.types.vector(values, real)), launch.view(tiles.starts, wp.int32),
-        launch.view(tiles.counts, wp.int32), launch.rows(v_projected, record),
-    ]  # fmt: skip
+    inputs = [v_slots, tiles.starts, tiles.counts, v_projected]
     tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients
     launch.launch(kernel, tasks, inputs, device, cost=5 * SUMMED)
     return v_projected
@@ -272,34 +255,6 @@ def blend(
     return _Blend.apply(*without_gradients(projected, backgrounds), tiles, settings)
 
 
-def contributions(
-    projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return sum and maximum of each Gaussian's blending weights alpha * T over pixels, [C, N] each. Not differentiable."""
-    check_tiles(projected, tiles, width, height)
-    projected = projected.detach().contiguous()
-    real, device = launch.real_of(projected), projected.device
-    settings = BlendSettings(origin, width, height, rule)
-    check_slots(tiles)
-    ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
-    if is_native(projected):
-        weights = blend_cuda.instance_weights(projected, tiles, settings, ends)
-    else:
-        weights = projected.new_zeros(len(tiles.slots), 2)
-        inputs = [
-            settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), launch.view(tiles.slots, wp.int32),
-            launch.flat(ends, wp.int32), launch.view(weights, real),
-        ]  # fmt: skip
-        _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
-    sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])
-    inputs = [
-        launch.view(weights, real), launch.view(tiles.starts, wp.int32), launch.view(tiles.counts, wp.int32),
-        launch.flat(sums, real), launch.flat(maxima, real),
-    ]  # fmt: skip
-    launch.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
-    return sums, maxima
-
-
 # Compositing of any number of channels: each Gaussian has D values instead of a colour.
 #
 # The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). More channels take several passes over
@@ -399,11 +354,10 @@ def _groups(
     """Yield the groups of ``width`` channels, in order; use each group before you request the next."""
     count, real = colors.shape[-1], launch.real_of(colors)
     colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
-    inputs = [launch.rows(projected, real), launch.view(tiles.counts, wp.int32), launch.rows(colors, real)]
+    inputs = [projected, tiles.counts, colors]
     for first in range(0, count, width):
         channels = slice(first, min(first + width, count))
-        arguments = [*inputs, first, launch.rows(colored, real)]
-        launch.launch(make_kernels(real, width).color, len(tiles.counts), arguments, projected.device, cost=5)
+        launch.launch(make_kernels(real, width).color, len(tiles.counts), [*inputs, first, colored], projected.device, cost=5)
         yield _Group(channels, colored, _padded(backgrounds[:, channels], width).contiguous())
 
 
@@ -442,7 +396,6 @@ class _BlendChannels(torch.autograd.Function):
         v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
         v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))
         real, width = launch.real_of(projected), _width(projected, colors.shape[-1], ctx.settings.absgrad)
-        outputs = [launch.rows(t, real) for t in (v_projected, v_colors)]
         for group in _groups(projected, tiles, colors, backgrounds, width):
             first = group.channels.start
             if v_image is None and first > 0:
@@ -457,9 +410,8 @@ class _BlendChannels(torch.autograd.Function):
             v_rgb = None if v_image is None else _given(v_image[..., group.channels], width, is_native(projected))
             v_images = (v_rgb, v_alpha, v_depth) if first == 0 else (v_rgb, None, None)
             v = composite_gradients(group.projected, tiles, group.backgrounds, ctx.settings, saved, v_images)
-            arguments = [launch.rows(v, real), launch.view(tiles.counts, wp.int32), first, *outputs]
-            count = v_colors.shape[0] * v_colors.shape[1]
-            launch.launch(make_kernels(real, width).add, count, arguments, v.device, cost=5)
+            inputs, count = [v, tiles.counts, first, v_projected, v_colors], v_colors.shape[0] * v_colors.shape[1]
+            launch.launch(make_kernels(real, width).add, count, inputs, v.device, cost=5)
         v_backgrounds = background_gradient(shared[1], v_image, colors.shape[-1]) if ctx.needs_input_grad[2] else None
         return v_projected, v_colors, v_backgrounds, None, None
 

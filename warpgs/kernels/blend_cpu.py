@@ -9,74 +9,6 @@ from warpgs.constants import SMALLEST_WEIGHT
 from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
 from warpgs.kernels.native import ROLLED
 
-
-@functools.cache
-def make_contributions(real, tile_size: int):
-    """Make the contribution kernel for one scalar type and tile size."""
-    f = make_functions(real)
-    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
-    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
-    strip_reals = wp.types.vector(STRIP, real)
-    side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
-    parts = wp.constant(tile_size // STRIP)
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
-    def contributions(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
-        # outputs, zero on entry: sum and maximum of the weight of each instance
-        weights: wp.array2d(dtype=real),
-    ):  # fmt: skip
-        tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        camera = place[0]
-        left = place[1]
-        top = place[2]
-        ramp = strip_reals()
-        t = tile_reals()
-        end = tile_ints()
-        last = int(0)
-        for row in range(wp.min(side, settings.height - top)):
-            for lane in range(wp.min(side, settings.width - left)):
-                p = row * side + lane
-                t[p] = real(1.0)
-                end[p] = ends[(camera * settings.height + top + row) * settings.width + left + lane]
-                last = wp.max(last, end[p])
-        for instance in range(ranges[tile, 0], last):
-            i = gaussian_ids[instance]
-            u11 = projected[i, 2]
-            bounds = f.bounds_of(
-                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
-            )
-            for lane in range(strip):
-                ramp[lane] = f.apart(u11 * real(lane))
-            weight_sum = real(0.0)
-            weight_max = real(0.0)
-            for row in range(side):
-                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
-                e2 = projected[i, 4] * dy
-                e12 = f.apart(projected[i, 3] * dy)
-                e22 = f.apart(e2 * e2)
-                for part in range(parts):
-                    x = real(settings.origin_x + left + part * strip) + real(0.5)
-                    start = f.apart(u11 * (x - projected[i, 0])) + e12
-                    if f.reaches(start, u11, e22, bounds[0], bounds[1]):
-                        for lane in range(strip):
-                            p = row * side + part * strip + lane
-                            e1 = start + ramp[lane]
-                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
-                            if alpha >= settings.alpha_cut and instance < end[p]:
-                                w = alpha * t[p]
-                                t[p] = t[p] * (real(1.0) - alpha)
-                                weight_sum += w
-                                weight_max = wp.max(weight_max, w)
-            weights[slots[instance], 0] = weight_sum
-            weights[slots[instance], 1] = weight_max
-
-    return contributions
-
-
 # The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
 #
 # The kernel walks the Gaussians of its tile back to front. A Gaussian's whole effect on a pixel is one number d = c .
@@ -157,8 +89,8 @@ def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
                 lane = int(0)
                 while lane < wp.min(across - part * strip, strip):
                     q = first + part * strip + lane
-                    if q < 0:
-                        break  # never; but vectorised, these loads would be slow gathers
+                    if f.never(q):
+                        break
                     p = wp.max(base + lane, 0)
                     lane += 1
                     if across < side:
@@ -413,8 +345,8 @@ def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, de
         across = wp.min(side, settings.width - place[1])
         for row in range(side):
             o = corner + wp.min(row, settings.height - place[2] - 1) * settings.width
-            if o < 0:
-                break  # never; but vectorised, these loads would be slow gathers
+            if f.never(o):
+                break
             until[row] = ends[o]
             shades.w[row * (touches + 1) + touches] = transmittances[o]
             for part in range(touches):
@@ -601,8 +533,8 @@ def make_forward(real, tile_size: int, channels: int):
             j = int(0)
             while j < count:  # a loop of its own, so that many loads are under way at once
                 i = gaussian_ids[wp.max(first + j, 0)]
-                if i < 0:
-                    break  # never true; a loop that may end early is not vectorised, which here avoids slow gathers
+                if f.never(i):
+                    break
                 mx[j & bits] = projected[i][0]
                 j += 1
             for j in range(batch):
@@ -610,8 +542,8 @@ def make_forward(real, tile_size: int, channels: int):
             j = int(0)
             while j < count:
                 i = gaussian_ids[wp.max(first + j, 0)]
-                if i < 0:
-                    break  # never
+                if f.never(i):
+                    break
                 my[j] = projected[i][1]
                 u11[j] = projected[i][2]
                 u12[j] = projected[i][3]
@@ -754,8 +686,8 @@ def make_forward(real, tile_size: int, channels: int):
                 lane = int(0)
                 while lane < across:
                     at_pixel = (first_pixel + lane) * pitch
-                    if at_pixel < 0:
-                        break  # never true; it prevents vectorisation, which would make these stores slow scatters
+                    if f.never(at_pixel):
+                        break
                     store_channels(at_pixel, wp.max(p + lane, 0), joined, rgb)
                     lane += 1
 
@@ -764,9 +696,8 @@ def make_forward(real, tile_size: int, channels: int):
 
 @functools.cache
 def make_kernels(real, tile_size: int, channels: int = COLORS, absgrad: bool = False, deep: bool = True):
-    """Make the forward, backward and contribution kernels; arguments are those of `make_backward`."""
+    """Make the forward and backward kernels; arguments are those of `make_backward`."""
     return SimpleNamespace(
         forward=make_forward(real, tile_size, channels),
         backward=make_backward(real, tile_size, channels, absgrad, deep),
-        contributions=make_contributions(real, tile_size),
     )

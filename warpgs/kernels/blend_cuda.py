@@ -16,7 +16,7 @@ from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
 from warpgs.kernels.falloff import COLORS, BlendSettings, make_struct
 from warpgs.kernels.launch import TORCH, Allocator
-from warpgs.kernels.native import source
+from warpgs.kernels.native import cuda_kernel, source
 from warpgs.kernels.tiles import Tiles, grid
 
 CHUNKS = (64, 128, 256)
@@ -61,32 +61,18 @@ def make_forward(tile_size: int, save: bool, per: int, channels: int = COLORS):
     # too long for 32-bit sizes.
     Blending = make_struct(wp.float32)
 
-    @wp.func_native(_source("forward", tile_size, channels, SAVE=str(save).lower(), PER=per))
-    def forward_body(
-        item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
-        order: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
-        backgrounds: wp.array(dtype=float),
-        rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
-        transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
-        states: wp.array2d(dtype=float),
-    ): ...  # fmt: skip
-
     module = f"warpgs.kernels.blend_cuda.forward.{tile_size}.{int(save)}.{per}.{channels}"
 
-    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    @cuda_kernel(_source("forward", tile_size, channels, SAVE=str(save).lower(), PER=per), "wp.tid() // 32", module)
     def forward(
-        begin: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
+        item: int, settings: Blending, chunk: int, projected: wp.array(dtype=float), counts: wp.array(dtype=int),
         order: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int),
         backgrounds: wp.array(dtype=float),
         # outputs
         rgb: wp.array2d(dtype=float), alpha_out: wp.array(dtype=float), depth: wp.array(dtype=float),
         transmittances: wp.array(dtype=float), weights: wp.array(dtype=float), ends: wp.array(dtype=int),
         states: wp.array2d(dtype=float),
-    ):  # fmt: skip
-        forward_body(
-            wp.tid() // 32, settings, chunk, projected, counts, order, ranges, gaussian_ids, backgrounds,
-            rgb, alpha_out, depth, transmittances, weights, ends, states,
-        )  # fmt: skip
+    ): ...  # fmt: skip
 
     return forward
 
@@ -96,39 +82,22 @@ def make_kernels(tile_size: int):
     """Make the kernels that order tiles and find contributions, for one tile size."""
     Blending = make_struct(wp.float32)
 
-    @wp.func_native(source("blend_order.cu", RANKS=RANKS))
-    def order_body(
-        tile: int, ranges: wp.array(dtype=int), count: int, counts: wp.array(dtype=int), order: wp.array(dtype=int)
-    ): ...  # fmt: skip
+    module = f"warpgs.kernels.blend_cuda.{tile_size}"
 
-    @wp.func_native(_source("contributions", tile_size, COLORS))
-    def contributions_body(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
-        instance_weights: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    threads = wp.constant(tile_size * tile_size)
-    options = {"enable_backward": False, "grid_stride": False, "module": f"warpgs.kernels.blend_cuda.{tile_size}"}
-
-    @wp.kernel(**options)
+    @cuda_kernel(source("blend_order.cu", RANKS=RANKS), "begin + wp.tid()", module)
     def order_tiles(
-        begin: int, ranges: wp.array(dtype=int), count: int,
+        tile: int, ranges: wp.array(dtype=int), count: int,
         # outputs; counts are zero on entry
         counts: wp.array(dtype=int), order: wp.array(dtype=int),
-    ):  # fmt: skip
-        order_body(begin + wp.tid(), ranges, count, counts, order)
+    ): ...  # fmt: skip
 
-    @wp.kernel(**options)
+    @cuda_kernel(_source("contributions", tile_size, COLORS), f"wp.tid() // {tile_size * tile_size}", module)
     def contributions(
-        begin: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
         gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
         # outputs, zero on entry
-        weights: wp.array(dtype=float),
-    ):  # fmt: skip
-        contributions_body(
-            wp.tid() // threads, settings, projected, ranges, gaussian_ids, slots, ends, weights
-        )  # fmt: skip
+        instance_weights: wp.array(dtype=float),
+    ): ...  # fmt: skip
 
     return SimpleNamespace(order_tiles=order_tiles, contributions=contributions)
 
@@ -142,64 +111,33 @@ def make_backward(
     flags = {"WITH_DEPTH": with_depth, "ATOMIC": atomic, "ABSGRAD": absgrad}
     numbers = {"CHUNK": chunk, **{name: str(flag).lower() for name, flag in flags.items()}}
 
-    @wp.func_native(_source("backward", tile_size, channels, **numbers))
-    def backward_body(
+    name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
+    name += ".absgrad" * absgrad
+    # for many chunks, many warps at a time matter more than registers, unless channels fill the registers
+    small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
+    registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
+
+    @cuda_kernel(_source("backward", tile_size, channels, **numbers), "wp.tid() // 32", name, **registers)
+    def backward(
         item: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
         keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
         totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
         rgb: wp.array2d(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
         weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
         v_rgb: wp.array2d(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
-        v_slots: wp.array2d(dtype=float),
-    ): ...  # fmt: skip
-
-    @wp.func_native(_source("gather", tile_size, channels, **numbers))
-    def gather_body(
-        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
-        v_slots: wp.array2d(dtype=float), v_projected: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    name = f"warpgs.kernels.blend_cuda.backward.{tile_size}.{int(with_depth)}.{chunk}.{int(atomic)}.{channels}"
-    name += ".absgrad" * absgrad
-    options = {"enable_backward": False, "grid_stride": False, "module": name}
-    # for many chunks, many warps at a time matter more than registers, unless channels fill the registers
-    small = chunk > CHUNKS[0] and not (with_depth or absgrad) and channels == COLORS
-    registers = {"cuda_max_registers": 80} if small else {"launch_bounds": 32 * WARPS}
-
-    @wp.kernel(**registers, **options)
-    def backward(
-        begin: int, settings: Blending, capacity: int, no_tile: int, projected: wp.array(dtype=float),
-        keys: wp.array(dtype=int), ranges: wp.array(dtype=int), gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int),
-        totals: wp.array(dtype=wp.int64), backgrounds: wp.array(dtype=float),
-        rgb: wp.array2d(dtype=float), depth: wp.array(dtype=float), transmittances: wp.array(dtype=float),
-        weights: wp.array(dtype=float), ends: wp.array(dtype=int), states: wp.array2d(dtype=float),
-        v_rgb: wp.array2d(dtype=float), v_alpha: wp.array(dtype=float), v_depth: wp.array(dtype=float),
         # outputs
         v_slots: wp.array2d(dtype=float),
-    ):  # fmt: skip
-        backward_body(
-            wp.tid() // 32, settings, capacity, no_tile, projected, keys, ranges, gaussian_ids, slots, totals, backgrounds,
-            rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
-        )  # fmt: skip
+    ): ...  # fmt: skip
 
-    @wp.kernel(**options)
+    @cuda_kernel(_source("gather", tile_size, channels, **numbers), "wp.tid()", name)
     def gather(
-        begin: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
+        i: int, projected: wp.array(dtype=float), starts: wp.array(dtype=int), counts: wp.array(dtype=int),
         v_slots: wp.array2d(dtype=float),
         # outputs
         v_projected: wp.array(dtype=float),
-    ):  # fmt: skip
-        gather_body(wp.tid(), projected, starts, counts, v_slots, v_projected)
+    ): ...  # fmt: skip
 
     return SimpleNamespace(backward=backward, gather=gather)
-
-
-def _floats(*tensors: torch.Tensor) -> list[launch.View]:
-    return [launch.flat(t, wp.float32) for t in tensors]
-
-
-def _ints(*tensors: torch.Tensor) -> list[launch.View]:
-    return [launch.flat(t, wp.int32) for t in tensors]
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
@@ -246,13 +184,10 @@ def forward(
     counts = allocator.workspace((RANKS,), torch.int32, device).zero_()
     order = allocator.workspace((RANKS, count), torch.int32, device)
     threads = -(-count // ORDER_THREADS) * ORDER_THREADS
-    inputs = [*_ints(tiles.ranges), count, *_ints(counts, order)]
-    launch.launch(k.order_tiles, threads, inputs, device, block_dim=ORDER_THREADS)
+    launch.launch(k.order_tiles, threads, [tiles.ranges, count, counts, order], device, block_dim=ORDER_THREADS)
     inputs = [
-        settings.struct(tiles.size, wp.float32), chunk, *_floats(projected),
-        *_ints(counts, order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
-        launch.rows(rgb, wp.float32), *_floats(alpha, depth, transmittances, weights), *_ints(ends),
-        launch.view(states, wp.float32),
+        settings.struct(tiles.size, wp.float32), chunk, projected, counts, order, tiles.ranges, tiles.gaussian_ids, backgrounds,
+        rgb, alpha, depth, transmittances, weights, ends, states,
     ]  # fmt: skip
     per = 2 if tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
     launch.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
@@ -285,27 +220,22 @@ def backward(
     else:
         v_slots = v_projected.zero_().view(-1, projected.shape[2])
     inputs = [
-        settings.struct(tiles.size, wp.float32), count, tiles.ranges.shape[0], *_floats(projected),
-        *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots), launch.view(tiles.total, wp.int64),
-        *_floats(backgrounds),
-        launch.rows(rgb, wp.float32), *_floats(depth, transmittances, weights), *_ints(ends), launch.view(states, wp.float32),
-        launch.rows(v_rgb, wp.float32), *_floats(v_alpha, v_depth), launch.view(v_slots, wp.float32),
+        settings.struct(tiles.size, wp.float32), count, tiles.ranges.shape[0], projected,
+        tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots, tiles.total, backgrounds,
+        rgb, depth, transmittances, weights, ends, states, v_rgb, v_alpha, v_depth, v_slots,
     ]  # fmt: skip
     launch.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
-    inputs = [*_floats(projected), *_ints(tiles.starts, tiles.counts), launch.view(v_slots, wp.float32), *_floats(v_projected)]
+    inputs = [projected, tiles.starts, tiles.counts, v_slots, v_projected]
     launch.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
     return v_projected
 
 
-def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor) -> torch.Tensor:
-    """Return sum and maximum of each instance's blending weight over its tile's pixels, in slot order [M, 2]."""
-    weights = projected.new_zeros(tiles.slots.shape[0], 2)
+def instance_weights(
+    projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, ends: torch.Tensor, weights: torch.Tensor
+) -> None:
+    """Write sum and maximum of each instance's blending weight over its tile's pixels, in slot order, to ``weights`` [M, 2]."""
     inputs = [
-        settings.struct(tiles.size, wp.float32), *_floats(projected), *_ints(tiles.ranges, tiles.gaussian_ids, tiles.slots),
-        *_ints(ends), *_floats(weights),
+        settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots, ends, weights
     ]  # fmt: skip
-    pixels = tiles.size * tiles.size
-    launch.launch(
-        make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, projected.device, block_dim=pixels
-    )
-    return weights
+    kernel, pixels = make_kernels(tiles.size).contributions, tiles.size * tiles.size
+    launch.launch(kernel, tiles.ranges.shape[0] * pixels, inputs, projected.device, block_dim=pixels)

@@ -145,6 +145,12 @@ def make_functions(real):
         """
         return wp.where(real(1.0e30) < product, real(1.0e30), product)
 
+    @wp.func(inline=True)
+    def never(index: wp.int32) -> bool:
+        """Return False, for an index that is never negative: a loop that may end early is not vectorised."""
+        # Vectorised, loads at such indices would be slow gathers, and stores slow scatters.
+        return index < 0
+
     @wp.func
     def bounds_of(mx: real, my: real, u11: real, u22: real, half_width: real, half_height: real, whole_tiles: wp.int32) -> vec2:
         """Return how much larger |e1| at the middle of a strip may be than its least there, and the ellipse's |U d|^2."""
@@ -160,7 +166,7 @@ def make_functions(real):
         return least * least + e22 <= limit
 
     return SimpleNamespace(
-        Blending=Blending, place_of=place_of, apart=apart, bounds_of=bounds_of, reaches=reaches,
+        Blending=Blending, place_of=place_of, apart=apart, never=never, bounds_of=bounds_of, reaches=reaches,
         falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=wp.types.vector(ABREAST, real),
     )  # fmt: skip
 
@@ -243,15 +249,15 @@ def make_batches(real, tile_size: int, channels: int):
         j = int(0)
         while j < count:  # a loop of its own, so that many loads are under way at once
             i = gaussian_ids[wp.max(last - j, 0)]
-            if i < 0:
-                break  # never true; a loop that may end early is not vectorised, which here avoids slow gathers
+            if f.never(i):
+                break
             b.x[j & bits] = projected[i][0]
             j += 1
         j = int(0)
         while j < count:
             i = gaussian_ids[wp.max(last - j, 0)]
-            if i < 0:
-                break  # never
+            if f.never(i):
+                break
             b.y[j & bits] = projected[i][1]
             b.u11[j & bits] = projected[i][2]
             b.u12[j & bits] = projected[i][3]

@@ -19,7 +19,7 @@ from torch._subclasses.fake_tensor import FakeTensor
 
 from warpgs.device import prepare_kernel_cache
 from warpgs.errors import ResourceError, UsageError
-from warpgs.kernels.native import load_module, source
+from warpgs.kernels.native import cuda_kernel, load_module, source
 from warpgs.openmp import warn_if_spinning
 from warpgs.process import hidden_stderr
 
@@ -408,14 +408,31 @@ class _SharedLaunch:
             self.ended = True
 
 
+@functools.cache
+def _declared(kernel) -> tuple[tuple[object, int] | None, ...]:
+    """Return for each argument after ``begin`` the Warp type of an array's elements and the axes of its tensor; else None."""
+    types = [a.type for a in kernel.adj.args[1:]]
+    return tuple((t.dtype, t.ndim + len(getattr(t.dtype, "_shape_", ()))) if isinstance(t, wp.array) else None for t in types)
+
+
+def arguments(kernel, inputs: Sequence) -> list:
+    """Return inputs with each tensor [...] as the array that the kernel declares: as it is, or flat, or as rows."""
+    return [
+        View(value, array[0], None if value.ndim == array[1] else array[1]) if isinstance(value, torch.Tensor) else value
+        for value, array in zip(inputs, _declared(kernel), strict=True)
+    ]
+
+
 def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
     """Launch ``kernel`` over ``count`` independent items; its first argument is the number of the first item."""
+    # Tensors become the arrays that the kernel declares (`arguments`); they are contiguous, or their rows are.
     # On a CPU, as many threads as torch uses share the items; results repeat, since each item has its own output memory.
     # ``cost`` is the rough work of an item in units of 10 ns, which decides whether threads pay. ``block_dim`` is CUDA's
     # threads per block.
     if count == 0:
         return
     _check_size(count)
+    inputs = arguments(kernel, inputs)
     if device.type == "cuda":
         with _current(device):
             _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
@@ -598,19 +615,15 @@ def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.d
 def make_fetch():
     """Make the kernel of `fetch`."""
 
-    @wp.func_native(source("allocator_fetch.cu"))
-    def body(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
-
-    @wp.kernel(enable_backward=False, module="warpgs.runtime.allocator.fetch")
-    def fetch(begin: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)):
-        body(begin + wp.tid(), table, first, second, out)
+    @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch", grid_stride=True)
+    def fetch(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
 
     return fetch
 
 
 def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
     """Fill ``out`` from a table of three addresses, read when the kernel runs; ``second`` counts the first two's numbers."""
-    launch(make_fetch(), out.numel(), [table, first, second, flat(out, wp.float32)], out.device)
+    launch(make_fetch(), out.numel(), [table, first, second, out], out.device)
 
 
 class _NotTwice(torch.autograd.Function):

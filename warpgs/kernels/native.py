@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import importlib.resources
+import inspect
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -26,6 +27,30 @@ def source(name: str, **numbers: object) -> str:
     for word, number in numbers.items():
         text = re.sub(rf"\b{word}\b", str(number), text)
     return text
+
+
+def cuda_kernel(text: str, item: str, module: str, **options: object) -> Callable[[Callable[..., None]], wp.Kernel]:
+    """Make a decorator that turns the declaration of a body in CUDA into the kernel that calls it.
+
+    The body's first argument is ``item``, an expression in Warp; the others are those of the kernel after ``begin``.
+    """
+
+    def make(stub: Callable[..., None]) -> wp.Kernel:
+        body, types = wp.func_native(text)(stub), inspect.get_annotations(stub, eval_str=True)
+        names = list(types)[1:]
+
+        def kernel():
+            return body  # Warp looks the name up here
+
+        kernel.__name__, kernel.__qualname__ = stub.__name__, stub.__qualname__
+        kernel.__annotations__ = {"begin": int, **{name: types[name] for name in names}}
+        kinds = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in kernel.__annotations__]
+        vars(kernel)["__signature__"] = inspect.Signature(kinds)
+        call = f"def {stub.__name__}(begin, {', '.join(names)}):\n    body({item}, {', '.join(names)})\n"
+        options.setdefault("grid_stride", False)
+        return wp.Kernel(kernel, module=wp.get_module(module), options={"enable_backward": False, **options}, source=call)
+
+    return make
 
 
 _MACHINE = wp.config.cpu_compiler_flags or "-march=native"

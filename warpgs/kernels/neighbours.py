@@ -93,7 +93,7 @@ def make_knn_kernels(real):
             total += nearest[j]
         mean_squares[i] = total / real(k)
 
-    return SimpleNamespace(bounds=bounds, search=search, vec3=vec3)
+    return SimpleNamespace(bounds=bounds, search=search)
 
 
 def _spread(bits: torch.Tensor) -> torch.Tensor:
@@ -138,11 +138,10 @@ def mean_square_distances(points: torch.Tensor, k: int = 3) -> torch.Tensor:
     inside = (ordered, ordered)
     for begin, end in itertools.pairwise(starts):
         level = (lower[begin:end], upper[begin:end])
-        launch.launch(kernels.bounds, end - begin, [launch.view(t, kernels.vec3) for t in (*inside, *level)], device, cost=BOX)
+        launch.launch(kernels.bounds, end - begin, [*inside, *level], device, cost=BOX)
         inside = level
-    inputs = [launch.view(t, kernels.vec3) for t in (ordered, lower, upper)]
-    inputs += [launch.view(torch.tensor(starts, dtype=torch.int32, device=device), wp.int32), min(k, count - 1)]
-    launch.launch(kernels.search, count, [*inputs, launch.view(ordered_result, real)], device, cost=1000)
+    levels = torch.tensor(starts, dtype=torch.int32, device=device)
+    launch.launch(kernels.search, count, [ordered, lower, upper, levels, min(k, count - 1), ordered_result], device, cost=1000)
     result[order] = ordered_result
     return result
 
@@ -176,10 +175,7 @@ def camera_reach(means: torch.Tensor, centers: torch.Tensor, fraction: float) ->
     """Return log(``fraction`` x distance of means [N, 3] to the nearest of centers [C, 3]), from log(`SMALLEST_REACH`)."""
     launch.check(means=(means, "N 3"), centers=(centers, "C 3"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
-    inputs = [
-        launch.view(means, wp.vec3), launch.view(centers, wp.vec3), float(fraction), launch.view(log_sizes, wp.float32)
-    ]  # fmt: skip
-    launch.launch(make_reach_kernel(), len(means), inputs, means.device)
+    launch.launch(make_reach_kernel(), len(means), [means, centers, float(fraction), log_sizes], means.device)
     return log_sizes
 
 
@@ -222,8 +218,5 @@ def pixel_size(means: torch.Tensor, cameras: torch.Tensor, fraction: float) -> t
     # Mip-Splatting, section 4.1). A camera sees the points in the cone around its image.
     launch.check(means=(means, "N 3"), cameras=(cameras, "C 9"))
     log_sizes = torch.empty(len(means), dtype=torch.float32, device=means.device)
-    inputs = [
-        launch.view(means, wp.vec3), launch.view(cameras, wp.float32), float(fraction), launch.view(log_sizes, wp.float32)
-    ]  # fmt: skip
-    launch.launch(make_pixel_kernel(), len(means), inputs, means.device)
+    launch.launch(make_pixel_kernel(), len(means), [means, cameras, float(fraction), log_sizes], means.device)
     return log_sizes

@@ -11,7 +11,7 @@ from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, 
 from warpgs.errors import UsageError
 from warpgs.kernels import launch, project_cpu, project_cuda, sh
 from warpgs.kernels.cameras import CAMERA_MODELS
-from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors, make_types
+from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors
 from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
 from warpgs.kernels.native import BLOCK
 from warpgs.kernels.project_cpu import LANES
@@ -29,14 +29,6 @@ def step_bytes(sizes: StepSizes) -> Needs:
     }  # fmt: skip
 
 
-def _views(inputs: Sequence[torch.Tensor]) -> list[launch.View]:
-    """Return the first eight inputs as the kernels take them."""
-    real = launch.real_of(inputs[0])
-    t = make_types(real)
-    types = (t.vec3, t.vec4, t.vec3, real, t.vec3, t.mat44, t.mat33, real)
-    return [launch.view(tensor, dtype) for tensor, dtype in zip(inputs, types)]
-
-
 def _threads_each(tensor: torch.Tensor) -> bool:
     """Return whether the kernels of `project_cuda` apply, which take a thread for each Gaussian."""
     return tensor.is_cuda
@@ -51,9 +43,8 @@ def project_tensors(
     projected = allocator.output((cameras, count, PROJECTED_SIZE), means.dtype, means.device)
     tile_counts = allocator.output((cameras, count), torch.int32, means.device)
     arguments = [
-        *_views(inputs), launch.view(inputs.opacity_factors, real), *settings.size, *settings.window,
-        settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        launch.rows(projected, real), launch.flat(tile_counts, wp.int32),
+        *inputs, *settings.size, *settings.window, settings.tile_size, settings.sh_count,
+        rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma, projected, tile_counts,
     ]  # fmt: skip
     if _threads_each(means):
         kernel, cost = project_cuda.make_forward(real, *settings.variant()), 5
@@ -96,17 +87,14 @@ def project_gradients(
 ) -> list[torch.Tensor | None]:
     """Return the gradients of the first seven inputs, those of viewmats and Ks None unless wanted. Nothing is checked."""
     real, device = launch.real_of(projected), projected.device
-    t, (width, height), rule = make_types(real), settings.size, settings.rule
+    rule = settings.rule
     v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
     found = [allocator.output(tensor.shape, tensor.dtype, device) for tensor in inputs[:5]]
     cameras, count = len(inputs[5]), len(inputs[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
-    outputs = [launch.view(g, dtype) for g, dtype in zip(found, (t.vec3, t.vec4, t.vec3, real, t.vec3))]
     arguments = [
-        *_views(inputs[:8]), width, height, settings.sh_count, rule.near, rule.low_pass,
-        launch.rows(projected, real), launch.flat(tile_counts, wp.int32),
-        launch.rows(v_projected, real),
+        *inputs[:8], *settings.size, settings.sh_count, rule.near, rule.low_pass, projected, tile_counts, v_projected
     ]  # fmt: skip
     if _threads_each(projected):
         kernel, tasks, cost = project_cuda.make_backward(real, *settings.variant()), -(-count // BLOCK) * BLOCK, 10
@@ -116,7 +104,7 @@ def project_gradients(
     else:
         kernel = project_cpu.make_backward(real, *settings.variant(), wants_camera)
         tasks, cost = -(-count // LANES), 10 * LANES
-    arguments += [*outputs, launch.view(v_viewmats, t.mat44), launch.view(v_Ks, t.mat33)]
+    arguments += [*found, v_viewmats, v_Ks]
     launch.launch(kernel, tasks, arguments, device, cost=cost * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]

@@ -9,9 +9,8 @@ import warp as wp
 
 from warpgs.device import FLOAT, StepSizes
 from warpgs.kernels import launch
-from warpgs.kernels import launch as interop
 from warpgs.kernels.launch import first_order, keep, kept
-from warpgs.kernels.native import ROLLED, source
+from warpgs.kernels.native import ROLLED, cuda_kernel, source
 
 RADIUS = 5
 """Half size of the window [px]."""
@@ -45,7 +44,6 @@ BLOCK = 8
 @functools.cache
 def make_functions(real):
     """Make the functions that the kernels of both kinds of device share, for one scalar type."""
-    vec3 = wp.types.vector(3, real)
     vec4 = wp.types.vector(4, real)
     vec5 = wp.types.vector(5, real)
     w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
@@ -110,13 +108,12 @@ def make_functions(real):
         by_mean = real(2.0) * (structure * (mb - luminance * ma) * r1 - ma * v - (ma - mb) * g)
         return vec4(luminance * structure, by_mean, v, g)
 
-    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, score=score,
-                           vec3=vec3, vec4=vec4, vec5=vec5)  # fmt: skip
+    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, score=score, vec5=vec5)
 
 
 @functools.cache
-def make_cpu_kernels(real, summed: bool):
-    """Make the kernels for a CPU, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
+def make_kernels(real, summed: bool):
+    """Make the generic kernels, of one task per block of rows; ``summed`` for sums over the image instead of a map."""
     # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
     # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
@@ -147,39 +144,22 @@ def make_cpu_kernels(real, summed: bool):
             scratch[o + k] = real(0.0)
             scratch[o + PADDING + columns + k] = real(0.0)
 
-    # The eleven rows are written out: a loop inside the loop over lanes would keep the latter from vectorising.
+    # The loop over the eleven rows is unrolled: inside the loop over lanes it would keep the latter from vectorising.
 
     @wp.func
     def down_pairs(
         a: wp.array(dtype=real), b: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32
     ) -> f.vec5:
         s = f.vec5()
-        s = f.add_pair(s, w[0], a[f.at(o[0] + x, lane)], b[f.at(o[0] + x, lane)])
-        s = f.add_pair(s, w[1], a[f.at(o[1] + x, lane)], b[f.at(o[1] + x, lane)])
-        s = f.add_pair(s, w[2], a[f.at(o[2] + x, lane)], b[f.at(o[2] + x, lane)])
-        s = f.add_pair(s, w[3], a[f.at(o[3] + x, lane)], b[f.at(o[3] + x, lane)])
-        s = f.add_pair(s, w[4], a[f.at(o[4] + x, lane)], b[f.at(o[4] + x, lane)])
-        s = f.add_pair(s, w[5], a[f.at(o[5] + x, lane)], b[f.at(o[5] + x, lane)])
-        s = f.add_pair(s, w[6], a[f.at(o[6] + x, lane)], b[f.at(o[6] + x, lane)])
-        s = f.add_pair(s, w[7], a[f.at(o[7] + x, lane)], b[f.at(o[7] + x, lane)])
-        s = f.add_pair(s, w[8], a[f.at(o[8] + x, lane)], b[f.at(o[8] + x, lane)])
-        s = f.add_pair(s, w[9], a[f.at(o[9] + x, lane)], b[f.at(o[9] + x, lane)])
-        s = f.add_pair(s, w[10], a[f.at(o[10] + x, lane)], b[f.at(o[10] + x, lane)])
+        for k in range(wp.static(2 * RADIUS + 1)):
+            s = f.add_pair(s, w[k], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
         return s
 
     @wp.func
     def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
         s = w[0] * m[f.at(o[0] + x, lane)]
-        s += w[1] * m[f.at(o[1] + x, lane)]
-        s += w[2] * m[f.at(o[2] + x, lane)]
-        s += w[3] * m[f.at(o[3] + x, lane)]
-        s += w[4] * m[f.at(o[4] + x, lane)]
-        s += w[5] * m[f.at(o[5] + x, lane)]
-        s += w[6] * m[f.at(o[6] + x, lane)]
-        s += w[7] * m[f.at(o[7] + x, lane)]
-        s += w[8] * m[f.at(o[8] + x, lane)]
-        s += w[9] * m[f.at(o[9] + x, lane)]
-        s += w[10] * m[f.at(o[10] + x, lane)]
+        for k in range(1, wp.static(2 * RADIUS + 1)):
+            s += w[k] * m[f.at(o[k] + x, lane)]
         return s
 
     @kernel
@@ -324,68 +304,60 @@ def make_cuda_kernels():
     """Make the forward and backward kernels; their argument ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
     numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
 
-    @wp.func_native(source("ssim_forward.cu", **numbers))
-    def forward_body(
-        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
-        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
-        by_gap: wp.array(dtype=float),
-    ): ...  # fmt: skip
+    block, module = f"wp.tid() // {THREADS}", "warpgs.kernels.ssim_cuda"
 
-    @wp.func_native(source("ssim_backward.cu", **numbers))
-    def backward_body(
-        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
-        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
-        height: int, columns: int, summed: int, v_a: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    kernel = functools.partial(wp.kernel, enable_backward=False, grid_stride=False, module="warpgs.kernels.ssim_cuda")
-
-    @kernel
+    @cuda_kernel(source("ssim_forward.cu", **numbers), block, module)
     def forward(
-        begin: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
+        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
         # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
         result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
         by_gap: wp.array(dtype=float),
-    ):  # fmt: skip
-        forward_body(wp.tid() // THREADS, a, b, height, columns, summed, result, by_mean, by_variance, by_gap)
+    ): ...  # fmt: skip
 
-    @kernel
+    @cuda_kernel(source("ssim_backward.cu", **numbers), block, module)
     def backward(
-        begin: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
+        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
         by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
         height: int, columns: int, summed: int,
         # outputs
         v_a: wp.array(dtype=float),
-    ):  # fmt: skip
-        backward_body(wp.tid() // THREADS, a, b, v_result, by_mean, by_variance, by_gap, height, columns, summed, v_a)
+    ): ...  # fmt: skip
 
     return SimpleNamespace(forward=forward, backward=backward)
 
 
-def _shape(image: torch.Tensor) -> tuple[int, int, int]:
-    """Return the number of blocks, and height and row length [elements], of images [B, H, W, 3]."""
-    batch, height, width, channels = image.shape
-    return batch * -(-height // SIDE) * -(-width // SIDE), height, width * channels
+def _forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
+    """Return similarities [B, H, W, 3] or, if ``summed``, two sums per task [tasks, 2]; then three partial derivatives."""
+    native, (batch, height, width, _) = _native(image), image.shape
+    columns, blocks = width * CHANNELS, -(-height // (SIDE if native else BLOCK))
+    tasks = batch * blocks * (-(-width // SIDE) if native else 1)
+    result = image.new_empty(tasks, 2) if summed else torch.empty_like(image)
+    outputs = [result, *(torch.empty_like(image) for _ in range(3))]
+    if native:
+        inputs = [image, target, height, columns, int(summed), *outputs]
+        launch.launch(make_cuda_kernels().forward, tasks * THREADS, inputs, image.device, block_dim=THREADS)
+    else:
+        kernel = make_kernels(launch.real_of(image), summed).forward
+        workspace = image.new_empty(tasks * 5 * (columns + 2 * PADDING))
+        inputs = [image, target, height, blocks, columns, workspace, *outputs]
+        launch.launch(kernel, tasks, inputs, image.device, cost=BLOCK * columns)
+    return tuple(outputs)
 
 
-def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
-    """Return similarities [B, H, W, 3] or, if ``summed``, two sums per block [blocks, 2]; then three partial derivatives."""
-    blocks, height, columns = _shape(image)
-    result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
-    partials = [torch.empty_like(image) for _ in range(3)]
-    arrays = [launch.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
-    inputs = [*arrays[:2], height, columns, int(summed), *arrays[2:]]
-    launch.launch(make_cuda_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
-    return result, *partials
-
-
-def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
+def _backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
     """Return the gradient of the image from the gradient of the similarities [B, H, W, 3] or of the two sums [2]."""
-    blocks, height, columns = _shape(image)
-    v_image = torch.empty_like(image)
-    arrays = [launch.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
-    inputs = [*arrays, height, columns, int(summed), launch.view(v_image.view(-1), wp.float32)]
-    launch.launch(make_cuda_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    batch, height, width, _ = image.shape
+    v_image, v_result, columns = torch.empty_like(image), v_result.contiguous(), width * CHANNELS
+    if _native(image):
+        blocks = batch * -(-height // SIDE) * -(-width // SIDE)
+        inputs = [image, target, v_result, *partials, height, columns, int(summed), v_image]
+        launch.launch(make_cuda_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+        return v_image
+    blocks, kernel = -(-height // BLOCK), make_kernels(launch.real_of(image), summed).backward
+    fields = partials if summed else [v_result * t for t in partials]  # v_result is then not read
+    workspace = image.new_empty(batch * blocks * 3 * (columns + 2 * PADDING))
+    inputs = [image, target, *fields, v_result, height, blocks, columns, workspace, v_image]
+    launch.launch(kernel, batch * blocks, inputs, image.device, cost=BLOCK * columns)
     return v_image
 
 
@@ -401,114 +373,6 @@ def difference_bytes(sizes: StepSizes) -> int:
     return images + (0 if sizes.cuda else 5 * FLOAT * (CHANNELS * sizes.width + 2 * PADDING) * -(-sizes.height // BLOCK))
 
 
-@functools.cache
-def make_kernels(real):
-    """Make the kernels for float64 on CUDA, one thread per element; vertical passes write rows padded with zeros."""
-    f = make_functions(real)
-    kernel = functools.partial(wp.kernel, enable_backward=False, module=f"warpgs.kernels.ssim.{real.__name__}")
-
-    @kernel
-    def vertical(
-        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, columns: int,
-        # outputs, zero on entry
-        m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real), m3: wp.array(dtype=real),
-        m4: wp.array(dtype=real),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        row = i // columns
-        y = row % height
-        s = f.vec5()
-        for k in range(wp.max(-RADIUS, -y), wp.min(RADIUS + 1, height - y)):
-            s = f.add_pair(s, f.tap(k), a[i + k * columns], b[i + k * columns])
-        o = i + (2 * row + 1) * PADDING
-        m0[o] = s[0]
-        m1[o] = s[1]
-        m2[o] = s[2]
-        m3[o] = s[3]
-        m4[o] = s[4]
-
-    @kernel
-    def similarity(
-        begin: int, m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real), m3: wp.array(dtype=real),
-        m4: wp.array(dtype=real), columns: int,
-        # outputs
-        result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_gap: wp.array(dtype=real),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        row = i // columns
-        o = i + 2 * row * PADDING
-        s = f.score(f.across(m0, o, 0), f.across(m1, o, 0), f.across(m2, o, 0), f.across(m3, o, 0), f.across(m4, o, 0))
-        result[i] = s[0]
-        by_mean[i] = s[1]
-        by_variance[i] = s[2]
-        by_gap[i] = s[3]
-
-    @kernel
-    def vertical_backward(
-        begin: int, v_result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
-        by_gap: wp.array(dtype=real), height: int, columns: int,
-        # outputs, zero on entry
-        m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        row = i // columns
-        y = row % height
-        s = f.vec3()
-        for k in range(wp.max(-RADIUS, -y), wp.min(RADIUS + 1, height - y)):
-            j = i + k * columns
-            s += f.tap(k) * v_result[j] * f.vec3(by_mean[j], by_variance[j], by_gap[j])
-        o = i + (2 * row + 1) * PADDING
-        m0[o] = s[0]
-        m1[o] = s[1]
-        m2[o] = s[2]
-
-    @kernel
-    def combine(
-        begin: int, m0: wp.array(dtype=real), m1: wp.array(dtype=real), m2: wp.array(dtype=real),
-        a: wp.array(dtype=real), b: wp.array(dtype=real), columns: int,
-        # outputs
-        v_a: wp.array(dtype=real),
-    ):  # fmt: skip
-        i = begin + wp.tid()
-        row = i // columns
-        o = i + 2 * row * PADDING
-        v_a[i] = f.across(m0, o, 0) + real(2.0) * (a[i] * f.across(m1, o, 0) + (a[i] - b[i]) * f.across(m2, o, 0))
-
-    return SimpleNamespace(vertical=vertical, similarity=similarity, vertical_backward=vertical_backward, combine=combine)
-
-
-class _Launcher:
-    """Sizes, workspace and launches for one image shape [B, H, W, 3]."""
-
-    def __init__(self, image: torch.Tensor, summed: bool = False):
-        self.device, self.real = image.device, interop.real_of(image)
-        batch, self.height, width, _ = image.shape
-        self.rows, self.columns = batch * self.height, width * CHANNELS
-        self.blocks = -(-self.height // BLOCK)
-        self.tasks = batch * self.blocks
-        self.blocked = self.device.type == "cpu"
-        self.kernels = make_cpu_kernels(self.real, summed) if self.blocked else make_kernels(self.real)
-
-    def flat(self, tensor: torch.Tensor) -> interop.View:
-        """Return a tensor as a flat kernel argument."""
-        return interop.view(tensor.view(-1), self.real)
-
-    def padded(self, count: int, like: torch.Tensor) -> list[interop.View]:
-        """Return zeros for ``count`` sums at each element, with padding beside each row."""
-        return [self.flat(m) for m in like.new_zeros(count, self.rows * (self.columns + 2 * PADDING))]
-
-    def launch(self, kernel, inputs: list, outputs: list) -> None:
-        """Launch a kernel of one task per element."""
-        interop.launch(kernel, self.rows * self.columns, [*inputs, self.columns, *outputs], self.device)
-
-    def launch_blocks(self, kernel, inputs: list, sums: int, outputs: list, like: torch.Tensor) -> None:
-        """Launch a kernel of one task per block of rows, with workspace for ``sums`` sums."""
-        workspace = like.new_empty(self.tasks * sums * (self.columns + 2 * PADDING))
-        inputs = [*inputs, self.height, self.blocks, self.columns, self.flat(workspace), *map(self.flat, outputs)]
-        interop.launch(kernel, self.tasks, inputs, self.device, cost=BLOCK * self.columns)
-
-
 def _native(image: torch.Tensor) -> bool:
     """Return whether the CUDA kernels apply."""
     return image.is_cuda and image.dtype == torch.float32
@@ -516,80 +380,24 @@ def _native(image: torch.Tensor) -> bool:
 
 class _Ssim(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image, target):
+    def forward(ctx, image, target, summed):
         image, target = image.contiguous(), target.contiguous()
-        if _native(image):
-            result, *partials = forward(image, target, summed=False)
-            keep(ctx, image, target, *partials)
-            return result
-        launcher = _Launcher(image)
-        result = torch.empty_like(image)
-        partials = [torch.empty_like(image) for _ in range(3)]
-        pair = [launcher.flat(image), launcher.flat(target)]
-        if launcher.blocked:
-            launcher.launch_blocks(launcher.kernels.forward, pair, 5, [result, *partials], image)
-        else:
-            moments = launcher.padded(5, image)
-            with interop.stream_of(launcher.device):
-                launcher.launch(launcher.kernels.vertical, [*pair, launcher.height], moments)
-                launcher.launch(launcher.kernels.similarity, moments, [launcher.flat(t) for t in (result, *partials)])
+        result, *partials = _forward(image, target, summed)
         keep(ctx, image, target, *partials)
-        return result
+        ctx.summed = summed
+        return result.sum(0) if summed else result
 
     @staticmethod
     @first_order
     def backward(ctx, v_result):
         image, target, *partials = kept(ctx)
-        if _native(image):
-            return backward(image, target, partials, v_result, summed=False), None
-        launcher = _Launcher(image)
-        v_image, pair = torch.empty_like(image), [launcher.flat(image), launcher.flat(target)]
-        if launcher.blocked:
-            fields = [launcher.flat(v_result * t) for t in partials]
-            inputs = [*pair, *fields, fields[0]]  # the last is read only for sums
-            launcher.launch_blocks(launcher.kernels.backward, inputs, 3, [v_image], image)
-        else:
-            sums = launcher.padded(3, image)
-            with interop.stream_of(launcher.device):
-                inputs = [launcher.flat(t) for t in (v_result.contiguous(), *partials)]
-                launcher.launch(launcher.kernels.vertical_backward, [*inputs, launcher.height], sums)
-                launcher.launch(launcher.kernels.combine, [*sums, *pair], [launcher.flat(v_image)])
-        return v_image, None
-
-
-class _Differences(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, image, target):
-        image, target = image.contiguous(), target.contiguous()
-        if _native(image):
-            sums, *partials = forward(image, target, summed=True)
-            keep(ctx, image, target, *partials)
-            return sums.sum(0)
-        launcher = _Launcher(image, summed=True)
-        sums = image.new_empty(launcher.tasks, 2)
-        partials = [torch.empty_like(image) for _ in range(3)]
-        pair = [launcher.flat(image), launcher.flat(target)]
-        launcher.launch_blocks(launcher.kernels.forward, pair, 5, [sums, *partials], image)
-        keep(ctx, image, target, *partials)
-        return sums.sum(0)
-
-    @staticmethod
-    @first_order
-    def backward(ctx, v_sums):
-        image, target, *partials = kept(ctx)
-        if _native(image):
-            return backward(image, target, partials, v_sums, summed=True), None
-        launcher = _Launcher(image, summed=True)
-        v_image = torch.empty_like(image)
-        inputs = [launcher.flat(t) for t in (image, target, *partials, v_sums.contiguous())]
-        launcher.launch_blocks(launcher.kernels.backward, inputs, 3, [v_image], image)
-        return v_image, None
+        return _backward(image, target, partials, v_result, ctx.summed), None, None
 
 
 def _check(image: torch.Tensor, target: torch.Tensor) -> None:
     """Check shapes, types and devices of two images or batches."""
     pattern = "B H W 3" if isinstance(image, torch.Tensor) and image.ndim == 4 else "H W 3"
-    interop.check(image=(image, pattern), target=(target, pattern))
+    launch.check(image=(image, pattern), target=(target, pattern))
 
 
 def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -617,14 +425,14 @@ def ssim(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     missing = max(0, -(-LANES // CHANNELS) - a.shape[2])
     if missing:
         a, b = (torch.nn.functional.pad(t, (0, 0, 0, missing)) for t in (a, b))
-    return _Ssim.apply(a, b)[:, :, : image.shape[-2]].reshape(image.shape)
+    return _Ssim.apply(a, b, False)[:, :, : image.shape[-2]].reshape(image.shape)
 
 
 def differences(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Return the sums over pixels and channels of 1 - `ssim` and |image - target| [2], for images [H, W, 3] or [B, H, W, 3]."""
-    # One pass computes both sums. For tiny images, and for float64 on CUDA, torch sums the map of `ssim`.
+    # One pass computes both sums; for tiny images, torch sums the map of `ssim`.
     _check(image, target)
     target = target.detach()
-    if not (_native(image) or (image.device.type == "cpu" and image.shape[-2] * CHANNELS >= LANES)):
+    if not (_native(image) or image.shape[-2] * CHANNELS >= LANES):
         return torch.stack([(1 - ssim(image, target)).sum(), (image - target).abs().sum()])
-    return _Differences.apply(*(t.reshape(-1, *t.shape[-3:]) for t in (image, target)))
+    return _Ssim.apply(*(t.reshape(-1, *t.shape[-3:]) for t in (image, target)), True)

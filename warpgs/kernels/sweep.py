@@ -99,12 +99,9 @@ def make_depth_kernels():
 
 def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
     """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola, float64 [H, W], from costs [H, W, P]."""
-    height, width, padded = costs.shape
+    height, width, _ = costs.shape
     found = torch.empty(height, width, dtype=torch.float64, device="cpu")
-    inputs = [
-        launch.view(costs.reshape(-1, padded), wp.int16), len(inverses), float(inverses[0]),
-        float(inverses[1] - inverses[0]), launch.view(found.view(-1), wp.float64),
-    ]  # fmt: skip
+    inputs = [costs.contiguous(), len(inverses), float(inverses[0]), float(inverses[1] - inverses[0]), found]
     launch.launch(make_depth_kernels().best, height * width, inputs, costs.device, cost=max(1, len(inverses) // 10))
     return found.numpy()
 
@@ -126,10 +123,10 @@ def check_round_trip(
     agrees = torch.empty(own.shape, dtype=torch.uint8, device="cpu")
     rotation, translation = geometry.relative_pose(first, second)
     center = -geometry.matmul(rotation.T, translation[:, None])[:, 0]
-    maps = [launch.view(torch.from_numpy(np.ascontiguousarray(a)), wp.float64) for a in (own, found, sensitivity)]
+    maps = [torch.from_numpy(np.ascontiguousarray(a)) for a in (own, found, sensitivity)]
     inputs = [
         *maps[:2], *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()),
-        wp.vec3d(*center), most, math.cos(math.radians(min_parallax)), maps[2], launch.view(agrees, wp.uint8),
+        wp.vec3d(*center), most, math.cos(math.radians(min_parallax)), maps[2], agrees,
     ]  # fmt: skip
     launch.launch(make_depth_kernels().check, own.size, inputs, agrees.device, cost=5)
     return agrees.numpy().astype(bool)
@@ -411,13 +408,10 @@ def plane_costs(
     totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32, device="cpu")
     found = torch.empty(tasks * ROWS * PLANES * pitch, dtype=torch.int16, device="cpu")
     costs = torch.empty(height, width, padded, dtype=torch.int16, device="cpu")
-    h = torch.from_numpy(homographies.astype(np.float32).ravel())
-    view = launch.view
+    h = torch.from_numpy(np.ascontiguousarray(homographies, np.float32))
     inputs = [
-        view(own, wp.int32), view(sums, wp.int32), view(roots, wp.float32),
-        view(torch.from_numpy(np.concatenate(images)), wp.int32), view(torch.from_numpy(shapes.ravel()), wp.int32),
-        view(h, wp.float32), height, width, pitch, len(others), len(homographies), padded, radius, added, unit,
-        view(ring, wp.int32), view(totals, wp.float32), view(found, wp.int16), view(costs.view(-1), wp.int16),
+        own, sums, roots, torch.from_numpy(np.concatenate(images)), torch.from_numpy(shapes), h, height, width, pitch,
+        len(others), len(homographies), padded, radius, added, unit, ring, totals, found, costs,
     ]  # fmt: skip
     launch.launch(make_costs_kernel(), tasks, inputs, costs.device, cost=ROWS * PLANES * pitch * len(others) // 2)
     return costs
@@ -561,13 +555,10 @@ def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor
     if costs.device.type == "cpu":
         return _on_cpu(costs, down, across, small)
     total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
-    flat = [launch.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
+    costs = costs.contiguous()
     for lines, length, steps, bounds, edges in _ways(height, width, down, across):
         path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
-        inputs = [
-            flat[0], launch.view(bounds.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
-            launch.view(path, wp.int32), flat[1],
-        ]  # fmt: skip
+        inputs = [costs, bounds.contiguous(), small, planes, *steps, length, *edges, path, total]
         launch.launch(make_scanline_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
     return total
 
@@ -584,12 +575,9 @@ def _on_cpu(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small
     if more:  # extra planes with the worst cost, which no path prefers
         costs = torch.nn.functional.pad(costs, (0, more), value=int(costs.max()))
     total, padded = torch.empty_like(costs, memory_format=torch.contiguous_format), planes + more
-    flat = [launch.view(t.contiguous().view(-1), wp.int16) for t in (costs, total)]
+    costs = costs.contiguous()
     for fresh, (lines, length, steps, bounds, edges) in zip((1, 0), _ways(height, width, down, across)):
         path = torch.empty(lines * 2 * (padded + 2 * LANES), dtype=torch.int16, device="cpu")
-        inputs = [
-            flat[0], launch.view(bounds.contiguous().view(-1), wp.int32), small, padded, *steps, length, *edges, fresh,
-            launch.view(path, wp.int16), flat[1],
-        ]  # fmt: skip
+        inputs = [costs, bounds.contiguous(), small, padded, *steps, length, *edges, fresh, path, total]
         launch.launch(make_scanline_kernel_cpu(), lines, inputs, costs.device, cost=max(1, length * padded // 20))
     return total[..., :planes]

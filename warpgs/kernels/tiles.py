@@ -429,7 +429,7 @@ def running_counts(
     sums, threads = sum_entries(count, native)
     packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
     kernel = make_kernels(real, native).pack_counts
-    launch.launch(kernel, threads, [launch.view(counts, wp.int32), sum_bits(count), launch.view(packed, wp.int64)], device)
+    launch.launch(kernel, threads, [counts, sum_bits(count), packed], device)
     return torch.cumsum(packed, 0, out=packed)
 
 
@@ -583,7 +583,6 @@ def _depth_order(
     # Invisible ones come last, and the number of instances is the capacity.
     device, count, real, native = projected.device, len(counts), launch.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
-    projected_view, counts_view = launch.view(projected, real), launch.view(counts, wp.int32)
     packed = None
     if memory.capacity is not None:
         visible, total = count, memory.capacity
@@ -598,22 +597,19 @@ def _depth_order(
         visible, total = split_sum(int(packed[-1]), count)
         _check_total(total, visible, device, tiles, memory.budget)
     depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
-    depths_view, order_view = launch.view(depths, real), launch.view(order, wp.int32)
     if packed is None:
-        launch.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
+        launch.launch(k.depth_keys, count, [projected, counts, depths, order], device)
     else:
-        sums_view, bits = launch.view(packed, wp.int64), sum_bits(count)
-        inputs = [projected_view, counts_view, sums_view, bits, visible, depths_view, order_view]
+        inputs = [projected, counts, packed, sum_bits(count), visible, depths, order]
         launch.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
-    sort_pairs(depths_view, order_view, visible)
+    sort_pairs(launch.view(depths, real), launch.view(order, wp.int32), visible)
     return order, visible, total
 
 
 def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, allocator: Allocator) -> torch.Tensor:
     """Return the slot after the last slot of each visible Gaussian, front to back, int64, shape [max(visible, 1)]."""
     ends = allocator.saved((max(visible, 1),), torch.int64, counts.device)
-    inputs = [launch.view(order, wp.int32), launch.view(counts, wp.int32), launch.view(ends, wp.int64)]
-    launch.launch(kernel, visible, inputs, counts.device)
+    launch.launch(kernel, visible, [order, counts, ends], counts.device)
     return torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
 
 
@@ -622,9 +618,8 @@ def _sort_by_tile(
 ) -> torch.Tensor:
     """Sort the instances stably by tile, fill in the range of each tile, and return the Gaussian numbers, int32, [M]."""
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
-    keys_view, slots_view, *others = (launch.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
-    sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
-    inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
+    sort_pairs(launch.view(keys, wp.int32), launch.view(slots, wp.int32), total, end_bit=no_tile.bit_length())
+    inputs = [keys, slots, owners, total, no_tile, ids, ranges]
     native = keys.is_cuda
     launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)
     return ids
@@ -657,10 +652,8 @@ def bin_tiles(
             keys[:total].fill_(no_tile)
         overflow = starts if memory.capacity is None else memory.overflow
         inputs = [
-            launch.view(projected, real), launch.view(order, wp.int32), launch.view(counts, wp.int32),
-            launch.view(ends, wp.int64), visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
-            rule.square_sigma, columns, columns * rows, no_tile, total,
-            *(launch.view(t, wp.int32) for t in (starts, keys, slots, owners, overflow)),
+            projected, order, counts, ends, visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
+            rule.square_sigma, columns, columns * rows, no_tile, total, starts, keys, slots, owners, overflow,
         ]  # fmt: skip
         if native:
             launch.launch(make_emit(real, slotted), -(-visible // 256) * 256, inputs, device, cost=10)

@@ -171,7 +171,7 @@ def make_kernels(real):
                     sums[i] = sums[i] + w * ((real(1.0) - fy) * upper + fy * lower)
                     weights[i] = weights[i] + w
 
-    return SimpleNamespace(face=face, integrate=integrate, gather=gather, vec3=vec3, mat33=mat33, mat44=mat44)
+    return SimpleNamespace(face=face, integrate=integrate, gather=gather)
 
 
 def empty_grid(
@@ -181,19 +181,17 @@ def empty_grid(
     return DistanceGrid(origin, voxel, truncation, like.new_zeros(shape), like.new_zeros(shape))
 
 
-def _pose(camera: Camera, like: torch.Tensor, kernels: SimpleNamespace) -> list[launch.View]:
-    """Return viewmat and intrinsics of a numpy camera as kernel arguments."""
-    views = (camera.viewmat, kernels.mat44), (camera.K, kernels.mat33)
-    return [launch.view(torch.as_tensor(a[None], dtype=like.dtype, device=like.device), kind) for a, kind in views]
+def _pose(camera: Camera, like: torch.Tensor) -> list[torch.Tensor]:
+    """Return viewmat [1, 4, 4] and intrinsics [1, 3, 3] of a numpy camera, of the type and on the device of ``like`` [...]."""
+    return [torch.as_tensor(a[None], dtype=like.dtype, device=like.device) for a in (camera.viewmat, camera.K)]
 
 
 def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
     """Return the cosine of each pixel's ray with the surface's normal [H, W]; 1 where depth is infinite, 0 where unknown."""
     check_pinhole(camera)
-    real = launch.real_of(depth)
-    kernels, cosines = make_kernels(real), torch.empty_like(depth)
-    inputs = [launch.view(depth, real), _pose(camera, depth, kernels)[1], launch.view(cosines, real)]
-    launch.launch(kernels.face, depth.numel(), inputs, depth.device, cost=5)
+    cosines = torch.empty_like(depth)
+    inputs = [depth, _pose(camera, depth)[1], cosines]
+    launch.launch(make_kernels(launch.real_of(depth)).face, depth.numel(), inputs, depth.device, cost=5)
     return cosines
 
 
@@ -204,13 +202,11 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
         depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(grid.distances, "X Y Z"),
         weights=(grid.weights, "X Y Z"),
     )  # fmt: skip
-    real = launch.real_of(depth)
-    kernels, shape = make_kernels(real), grid.distances.shape
     inputs = [
-        launch.view(depth.new_tensor([grid.origin]), kernels.vec3), grid.voxel, grid.truncation, shape[1], shape[2],
-        *_pose(camera, depth, kernels),
-        *(launch.view(t, real) for t in (depth, pixel_weights, grid.distances.view(-1), grid.weights.view(-1))),
+        depth.new_tensor([grid.origin]), grid.voxel, grid.truncation, *grid.distances.shape[1:], *_pose(camera, depth),
+        depth, pixel_weights, grid.distances, grid.weights,
     ]  # fmt: skip
+    kernels = make_kernels(launch.real_of(depth))
     launch.launch(kernels.integrate, grid.distances.numel(), inputs, depth.device, cost=3)
 
 
@@ -224,11 +220,6 @@ def gather_colors(
         points=(points, "N 3"), depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), image=(image, "H W 3"),
         sums=(sums, "N 3"), weights=(weights, "N"),
     )  # fmt: skip
-    real = launch.real_of(points)
-    kernels = make_kernels(real)
-    inputs = [
-        launch.view(points, kernels.vec3), tolerance, *_pose(camera, points, kernels),
-        launch.view(depth, real), launch.view(pixel_weights, real), launch.view(image, kernels.vec3),
-        launch.view(sums, kernels.vec3), launch.view(weights, real),
-    ]  # fmt: skip
+    inputs = [points, tolerance, *_pose(camera, points), depth, pixel_weights, image, sums, weights]
+    kernels = make_kernels(launch.real_of(points))
     launch.launch(kernels.gather, len(points), inputs, points.device, cost=5)

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from warpgs.kernels import launch
-from warpgs.kernels.native import ROLLED, source
+from warpgs.kernels.native import ROLLED, cuda_kernel, source
 
 # Bookkeeping of a captured step: its settings are read at the start, and its loss is stored at the end.
 #
@@ -139,8 +139,7 @@ def squared_error(rgb: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         return torch.nn.functional.mse_loss(rgb.clamp(0, 1), target, reduction="sum")
     tasks = -(-rgb.numel() // ERROR_SEGMENT)
     sums = rgb.new_empty(tasks)
-    inputs = [*(launch.flat(t.contiguous(), wp.float32) for t in (rgb, target)), launch.view(sums, wp.float32)]
-    launch.launch(make_errors(), tasks, inputs, rgb.device, cost=ERROR_SEGMENT // 10)
+    launch.launch(make_errors(), tasks, [rgb.contiguous(), target.contiguous(), sums], rgb.device, cost=ERROR_SEGMENT // 10)
     return sums.sum()
 
 
@@ -153,11 +152,9 @@ def begin_step(
         lr_rows.new_empty(lr_rows.shape[1]), setting_rows.new_empty(setting_rows.shape[1]),
         viewmats.new_empty(1, 4, 4), Ks.new_empty(1, 3, 3), targets.new_empty(targets.shape[1:]),
     )  # fmt: skip
-    rows = [launch.view(t.view(len(t), -1), wp.float32) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
-    numbers = [launch.view(t, wp.int64) for t in (counter, view_rows)]
-    outputs = [launch.view(t.view(-1), wp.float32) for t in found]
+    rows = [t.view(len(t), -1) for t in (lr_rows, setting_rows, viewmats, Ks, targets)]
     count = max(16, *(t.numel() for t in found))
-    launch.launch(make_step_kernels().begin_step, count, [*numbers, *rows, *outputs], counter.device)
+    launch.launch(make_step_kernels().begin_step, count, [counter, view_rows, *rows, *found], counter.device)
     return found
 
 
@@ -166,11 +163,7 @@ def end_step(
 ) -> torch.Tensor:
     """Store a step's loss and error in ``history`` [B, 2]; count the step if ``stop`` [1] is 0, and return that, bool, [1]."""
     going = torch.empty(1, dtype=torch.bool, device=loss.device)
-    inputs = [
-        *(launch.view(t.detach().view(1), wp.float32) for t in (loss, mse)), launch.view(counter, wp.int64),
-        launch.view(stop, wp.int32), launch.view(history, wp.float32), launch.view(going, wp.bool),
-    ]  # fmt: skip
-    launch.launch(make_step_kernels().end_step, 1, inputs, loss.device)
+    launch.launch(make_step_kernels().end_step, 1, [loss, mse, counter, stop, history, going], loss.device)
     return going
 
 
@@ -262,23 +255,13 @@ def make_adam_kernel(real, split: bool, lanes: int):
 def make_scheduled_kernel():
     """Make the CUDA update kernel in float32: four elements per thread, learning rates in memory, so a graph can replay it."""
 
-    @wp.func_native(source("adam_update.cu"))
-    def update_body(
-        four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
-        beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
-        parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    @wp.kernel(enable_backward=False, grid_stride=False, module="warpgs.kernels.adam.scheduled")
+    @cuda_kernel(source("adam_update.cu"), "wp.tid()", "warpgs.kernels.adam.scheduled")
     def update(
-        begin: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
+        four: int, gradient: wp.array(dtype=float), row: int, head: int, lrs: wp.array(dtype=float),
         beta1: float, beta2: float, rest1: float, rest2: float, eps: float, skip: wp.array(dtype=int),
         # outputs
         parameter: wp.array(dtype=float), mean: wp.array(dtype=float), square: wp.array(dtype=float),
-    ):  # fmt: skip
-        update_body(
-            wp.tid(), gradient, row, head, lrs, beta1, beta2, rest1, rest2, eps, skip, parameter, mean, square
-        )  # fmt: skip
+    ): ...  # fmt: skip
 
     return update
 
@@ -301,9 +284,8 @@ def adam_scheduled(
             _update(param, grad, exp_avg, exp_avg_sq, lrs.tolist(), head, betas, eps)
         return
     inputs = [
-        launch.view(grad.contiguous().view(-1), wp.float32), param[0].numel(), head, launch.view(lrs, wp.float32),
-        *betas, 1 - betas[0], 1 - betas[1], eps, launch.view(skip, wp.int32),
-        *(launch.view(t.view(-1), wp.float32) for t in (param, exp_avg, exp_avg_sq)),
+        grad.contiguous(), param[0].numel(), head, lrs, *betas, 1 - betas[0], 1 - betas[1], eps, skip,
+        param, exp_avg, exp_avg_sq,
     ]  # fmt: skip
     launch.launch(make_scheduled_kernel(), -(-param.numel() // 4), inputs, param.device)
 
@@ -312,12 +294,11 @@ def _update(param, grad, exp_avg, exp_avg_sq, lrs: list[float], head: int, betas
     """Launch the generic kernel, which is used on a CPU and for float64."""
     real, device = launch.real_of(param), param.device
     length, lanes = (SEGMENT, LANES) if device.type == "cpu" else (1, 1)
-    flat = [launch.view(t.view(-1), real) for t in (param, exp_avg, exp_avg_sq)]
     head_lr, lr, root_correction2 = lrs
     with launch.stream_of(device):
         inputs = [
-            launch.view(grad.contiguous().view(-1), real), length, param[0].numel(), head, head_lr, lr,
-            *betas, 1 - betas[0], 1 - betas[1], root_correction2, eps, *flat,
+            grad.contiguous(), length, param[0].numel(), head, head_lr, lr, *betas, 1 - betas[0], 1 - betas[1],
+            root_correction2, eps, param, exp_avg, exp_avg_sq,
         ]  # fmt: skip
         kernel = make_adam_kernel(real, head > 0, lanes)
         launch.launch(kernel, -(-param.numel() // length), inputs, device, cost=max(1, length // 16))
@@ -389,8 +370,7 @@ def opacity_decay(logits: torch.Tensor, factor: float) -> torch.Tensor:
     if not 0 < factor < 1:
         raise ValueError(f"factor must be above 0 and below 1, not {factor}")
     decayed = torch.empty_like(logits)
-    inputs = [launch.view(logits, wp.float32), float(factor), launch.view(decayed, wp.float32)]
-    launch.launch(make_decay_kernel(), len(logits), inputs, logits.device)
+    launch.launch(make_decay_kernel(), len(logits), [logits, float(factor), decayed], logits.device)
     return decayed
 
 
@@ -422,6 +402,5 @@ def opacity_dropout(count: int, settings: torch.Tensor, seed: int) -> torch.Tens
     # device and in a resumed fit.
     launch.check(settings=(settings, str(len(Setting))))
     factors = torch.empty(count, dtype=torch.float32, device=settings.device)
-    inputs = [launch.view(settings, wp.float32), seed, launch.view(factors, wp.float32)]
-    launch.launch(make_dropout_kernel(), count, inputs, settings.device)
+    launch.launch(make_dropout_kernel(), count, [settings, seed, factors], settings.device)
     return factors

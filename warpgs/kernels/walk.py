@@ -1,43 +1,40 @@
-"""Walks along the rays: the median depth, and the Gaussian with the largest weight."""
+"""Walks along the rays over binned Gaussians: the median depth, the heaviest Gaussians, and the contributions."""
 
 import functools
+from types import SimpleNamespace
 
 import torch
 import warp as wp
 
 from warpgs.constants import Rule
-from warpgs.kernels import launch
-from warpgs.kernels.blend import check_tiles, is_native, tile_inputs
+from warpgs.kernels import blend_cuda, launch
+from warpgs.kernels.blend import check_slots, check_tiles, composite, is_native, make_segments
 from warpgs.kernels.blend_cuda import SCALE
 from warpgs.kernels.ellipse import PROJECTED_SIZE
 from warpgs.kernels.falloff import STRIP, BlendSettings, make_functions, make_struct
-from warpgs.kernels.native import ROLLED, source
+from warpgs.kernels.native import ROLLED, cuda_kernel, source
 from warpgs.kernels.tiles import Tiles
 
-# Median depth of binned Gaussians: where the transmittance of a pixel falls to one half.
-#
-# This is a separate pass, so that `blend` does not become slower. The pass over a tile ends as soon as each pixel is
-# half covered. It computes alpha by the same operations as `blend`, so that both agree exactly on the Gaussian at which
-# a pixel becomes half covered.
+# These are separate passes, so that `blend` does not become slower. Alpha comes from the same operations as in `blend`, so that
+# all agree exactly on what is blended.
 
 
 @functools.cache
-def make_median_kernel(real, tile_size: int):
-    """Make the generic kernel, one task per tile, for one scalar type and tile size."""
-    f = make_functions(real)
-    tile_reals = wp.types.vector(tile_size * tile_size, real)
+def make_walk(real, tile_size: int, make_visit):
+    """Make the generic kernel, one task per tile; it calls a visitor for each blended (Gaussian, pixel)."""
+    f, visit = make_functions(real), make_visit(real)
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
     strip_reals = wp.types.vector(STRIP, real)
     side = wp.constant(tile_size)
     strip = wp.constant(STRIP)
     parts = wp.constant(tile_size // STRIP)
-    half = wp.constant(real(0.5))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
-    def median(
+    def walk(
         begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int),
-        # outputs
-        depths: wp.array(dtype=real),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), per_camera: int, k: int,
+        # outputs of the visitor
+        reals: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
     ):  # fmt: skip
         tile = begin + wp.tid()
         place = f.place_of(tile, side, settings)
@@ -47,7 +44,6 @@ def make_median_kernel(real, tile_size: int):
         rows = wp.min(side, settings.height - top)
         lanes = wp.min(side, settings.width - left)
         ramp = strip_reals()
-        found = tile_reals()
         t = tile_reals()  # transmittance; 0 once a pixel is finished, and outside the image
         for row in range(rows):
             for lane in range(lanes):
@@ -56,7 +52,6 @@ def make_median_kernel(real, tile_size: int):
         instance = ranges[tile, 0]
         while instance < ranges[tile, 1] and unfinished > 0:
             i = gaussian_ids[instance]
-            instance += 1
             u11 = projected[i, 2]
             bounds = f.bounds_of(
                 projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
@@ -78,44 +73,120 @@ def make_median_kernel(real, tile_size: int):
                             alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
                             if alpha >= settings.alpha_cut and t[p] > real(0.0):
                                 after = t[p] * (real(1.0) - alpha)
-                                blended = settings.inclusive != 0 or after >= settings.stop
-                                if blended and after <= half:
-                                    found[p] = projected[i, 9]
-                                finished = after <= half or after < settings.stop
+                                finished = after < settings.stop
+                                if settings.inclusive != 0 or not finished:
+                                    pixel = (camera * settings.height + top + row) * settings.width + left + part * strip + lane
+                                    ended = visit(
+                                        pixel, instance, i - camera * per_camera, alpha * t[p], after, projected[i, 9],
+                                        slots, k, reals, ids, counts,
+                                    )  # fmt: skip
+                                    finished = finished or ended
                                 t[p] = wp.where(finished, real(0.0), after)
                                 unfinished -= wp.where(finished, 1, 0)
-        for row in range(rows):
-            for lane in range(lanes):
-                depths[(camera * settings.height + top + row) * settings.width + left + lane] = found[row * side + lane]
+            instance += 1
 
-    return median
+    return walk
 
 
 @functools.cache
-def make_median_native(tile_size: int):
-    """Make the CUDA kernel in float32 for one tile size, a thread block per tile."""
+def make_median(real):
+    """Make the visitor that writes the depth at which a pixel has lost half of its light, and finishes the pixel there."""
+
+    @wp.func
+    def visit(
+        pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
+        depths: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+    ) -> bool:  # fmt: skip
+        if after <= real(0.5):
+            depths[pixel] = depth
+        return after <= real(0.5)
+
+    return visit
+
+
+@functools.cache
+def make_heaviest(real):
+    """Make the visitor that puts a Gaussian into its pixel's sorted list of k, behind those of equal weight."""
+
+    @wp.func
+    def visit(
+        pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
+        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+    ) -> bool:  # fmt: skip
+        counts[pixel] += 1
+        first = pixel * k
+        if weight > weights[first + k - 1]:
+            j = first + k - 1
+            while j > first and weights[j - 1] < weight:
+                weights[j] = weights[j - 1]
+                ids[j] = ids[j - 1]
+                j -= 1
+            weights[j] = weight
+            ids[j] = i
+        return False
+
+    return visit
+
+
+@functools.cache
+def make_contributions(real):
+    """Make the visitor that adds to the sum and maximum of an instance's weight, in slot order."""
+
+    @wp.func
+    def visit(
+        pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
+        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+    ) -> bool:  # fmt: skip
+        slot = 2 * slots[instance]
+        weights[slot] += weight
+        weights[slot + 1] = wp.max(weights[slot + 1], weight)
+        return False
+
+    return visit
+
+
+def _walk(make_visit, projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, k: int, *outputs: torch.Tensor) -> None:
+    """Launch the generic kernel of a visitor over projected Gaussians [C, N, 12]; outputs may be fewer than its three."""
+    ints = tiles.ranges.new_empty(0)
+    inputs = [
+        settings.struct(tiles.size, launch.real_of(projected)), projected, tiles.ranges, tiles.gaussian_ids, tiles.slots,
+        projected.shape[1], k, *outputs, *[ints] * (3 - len(outputs)),
+    ]  # fmt: skip
+    kernel = make_walk(launch.real_of(projected), tiles.size, make_visit)
+    launch.launch(kernel, len(tiles.ranges), inputs, projected.device, cost=10_000, block_dim=32)
+
+
+@functools.cache
+def make_native(tile_size: int):
+    """Make the CUDA kernels in float32 for one tile size, a thread block per tile."""
     Blending = make_struct(wp.float32)
+    numbers = {"SIDE": tile_size, "SCALE": SCALE, "STRIDE": PROJECTED_SIZE}
+    tile = f"wp.tid() // {tile_size * tile_size}"
 
-    @wp.func_native(source("median_depth.cu", SIDE=tile_size, SCALE=SCALE, STRIDE=PROJECTED_SIZE))
-    def body(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), depths: wp.array(dtype=float),
-    ): ...  # fmt: skip
-
-    threads = wp.constant(tile_size * tile_size)
-
-    @wp.kernel(enable_backward=False, grid_stride=False, module=f"warpgs.kernels.median_depth.{tile_size}")
+    @cuda_kernel(source("median_depth.cu", **numbers), tile, f"warpgs.kernels.median_depth.{tile_size}")
     def median(
-        begin: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
         gaussian_ids: wp.array(dtype=int),
         # outputs
         depths: wp.array(dtype=float),
-    ):  # fmt: skip
-        body(
-            wp.tid() // threads, settings, projected, ranges, gaussian_ids, depths,
-        )  # fmt: skip
+    ): ...  # fmt: skip
 
-    return median
+    @cuda_kernel(source("heaviest.cu", **numbers), tile, f"warpgs.kernels.heaviest.{tile_size}")
+    def heaviest(
+        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
+        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
+        # outputs
+        weights: wp.array(dtype=float), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
+    ): ...  # fmt: skip
+
+    return SimpleNamespace(median=median, heaviest=heaviest)
+
+
+def _launch_native(kernel, projected: torch.Tensor, tiles: Tiles, settings: BlendSettings, *rest: object) -> None:
+    """Launch a kernel of `make_native`."""
+    inputs = [settings.struct(tiles.size, wp.float32), projected, tiles.ranges, tiles.gaussian_ids, *rest]
+    pixels = tiles.size * tiles.size
+    launch.launch(kernel, len(tiles.ranges) * pixels, inputs, projected.device, block_dim=pixels)
 
 
 def median_depth(
@@ -126,134 +197,12 @@ def median_depth(
     # unlike the mean depth of `blend`. Not differentiable. Results repeat bit for bit with any number of threads.
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
-    real, device = launch.real_of(projected), projected.device
-    settings, count = BlendSettings(origin, width, height, rule), len(tiles.ranges)
-    depths = projected.new_empty(len(projected), height, width)
-    own, output = settings.struct(tiles.size, real), launch.flat(depths, real)
-    native = projected.is_cuda and projected.dtype == torch.float32
-    if native:
-        lists = [launch.flat(t, wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
-        inputs, pixels = [own, launch.flat(projected, real), *lists, output], tiles.size * tiles.size
-        launch.launch(make_median_native(tiles.size), count * pixels, inputs, device, block_dim=pixels)
-        return depths
-    inputs = [own, *tile_inputs(projected, tiles, real), output]
-    launch.launch(make_median_kernel(real, tiles.size), count, inputs, device, cost=10_000, block_dim=32)
+    settings, depths = BlendSettings(origin, width, height, rule), projected.new_zeros(len(projected), height, width)
+    if is_native(projected):
+        _launch_native(make_native(tiles.size).median, projected, tiles, settings, depths)
+    else:
+        _walk(make_median, projected, tiles, settings, 0, depths)
     return depths
-
-
-# The k heaviest Gaussians of each pixel with their blending weights, and the number of Gaussians that were blended.
-#
-# This is a separate pass, so that `blend` does not become slower. It computes alpha by the same operations as `blend`.
-# The list of a pixel is kept sorted in the result itself. A Gaussian is inserted if it is heavier than the k-th entry
-# of the list.
-
-
-@functools.cache
-def make_heaviest_kernel(real, tile_size: int):
-    """Make the generic kernel, one task per tile, for one scalar type and tile size."""
-    f = make_functions(real)
-    tile_reals = wp.types.vector(tile_size * tile_size, real)
-    strip_reals = wp.types.vector(STRIP, real)
-    side = wp.constant(tile_size)
-    strip = wp.constant(STRIP)
-    parts = wp.constant(tile_size // STRIP)
-
-    @wp.func
-    def insert(
-        weight: real, i: wp.int32, first: wp.int32, k: wp.int32, weights: wp.array(dtype=real), ids: wp.array(dtype=wp.int32)
-    ):
-        """Put a Gaussian into the list of k that begins at ``first``, behind those of equal weight."""
-        if weight > weights[first + k - 1]:
-            j = first + k - 1
-            while j > first and weights[j - 1] < weight:
-                weights[j] = weights[j - 1]
-                ids[j] = ids[j - 1]
-                j -= 1
-            weights[j] = weight
-            ids[j] = i
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
-    def heaviest(
-        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
-        # outputs
-        weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ):  # fmt: skip
-        tile = begin + wp.tid()
-        place = f.place_of(tile, side, settings)
-        camera = place[0]
-        left = place[1]
-        top = place[2]
-        rows = wp.min(side, settings.height - top)
-        lanes = wp.min(side, settings.width - left)
-        ramp = strip_reals()
-        t = tile_reals()  # transmittance; 0 once a pixel is finished, and outside the image
-        for row in range(rows):
-            for lane in range(lanes):
-                t[row * side + lane] = real(1.0)
-        unfinished = rows * lanes
-        instance = ranges[tile, 0]
-        while instance < ranges[tile, 1] and unfinished > 0:
-            i = gaussian_ids[instance]
-            instance += 1
-            u11 = projected[i, 2]
-            bounds = f.bounds_of(
-                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
-            )
-            for lane in range(strip):
-                ramp[lane] = f.apart(u11 * real(lane))
-            for row in range(side):
-                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
-                e2 = projected[i, 4] * dy
-                e12 = f.apart(projected[i, 3] * dy)
-                e22 = f.apart(e2 * e2)
-                for part in range(parts):
-                    x = real(settings.origin_x + left + part * strip) + real(0.5)
-                    start = f.apart(u11 * (x - projected[i, 0])) + e12
-                    if f.reaches(start, u11, e22, bounds[0], bounds[1]):
-                        for lane in range(strip):
-                            p = row * side + part * strip + lane
-                            e1 = start + ramp[lane]
-                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
-                            if alpha >= settings.alpha_cut and t[p] > real(0.0):
-                                after = t[p] * (real(1.0) - alpha)
-                                if settings.inclusive != 0 or after >= settings.stop:
-                                    pixel = (camera * settings.height + top + row) * settings.width + left + part * strip + lane
-                                    counts[pixel] += 1
-                                    insert(alpha * t[p], i - camera * per_camera, pixel * k, k, weights, ids)
-                                finished = after < settings.stop
-                                t[p] = wp.where(finished, real(0.0), after)
-                                unfinished -= wp.where(finished, 1, 0)
-
-    return heaviest
-
-
-@functools.cache
-def make_heaviest_native(tile_size: int):
-    """Make the CUDA kernel in float32 for one tile size, a thread block per tile."""
-    Blending = make_struct(wp.float32)
-
-    @wp.func_native(source("heaviest.cu", SIDE=tile_size, SCALE=SCALE, STRIDE=PROJECTED_SIZE))
-    def body(
-        tile: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int, weights: wp.array(dtype=float), ids: wp.array(dtype=int),
-        counts: wp.array(dtype=int),
-    ): ...  # fmt: skip
-
-    threads = wp.constant(tile_size * tile_size)
-
-    @wp.kernel(enable_backward=False, grid_stride=False, module=f"warpgs.kernels.heaviest.{tile_size}")
-    def heaviest(
-        begin: int, settings: Blending, projected: wp.array(dtype=float), ranges: wp.array(dtype=int),
-        gaussian_ids: wp.array(dtype=int), per_camera: int, k: int,
-        # outputs
-        weights: wp.array(dtype=float), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
-    ):  # fmt: skip
-        body(
-            wp.tid() // threads, settings, projected, ranges, gaussian_ids, per_camera, k, weights, ids, counts,
-        )  # fmt: skip
-
-    return heaviest
 
 
 def heaviest(
@@ -266,18 +215,32 @@ def heaviest(
     if k < 1:
         raise ValueError(f"the number of heaviest Gaussians must be at least 1, not {k}")
     projected = projected.detach().contiguous()
-    real, device, (cameras, per_camera) = launch.real_of(projected), projected.device, projected.shape[:2]
-    settings, shape = BlendSettings(origin, width, height, rule), (cameras, height, width)
+    settings, shape = BlendSettings(origin, width, height, rule), (len(projected), height, width)
     weights = projected.new_zeros(*shape, k)
-    ids = torch.full((*shape, k), -1, dtype=torch.int32, device=device)
-    counts = torch.zeros(shape, dtype=torch.int32, device=device)
-    outputs = [launch.flat(weights, real), *(launch.flat(t, wp.int32) for t in (ids, counts))]
-    own, rest = settings.struct(tiles.size, real), [per_camera, k, *outputs]
+    ids = torch.full((*shape, k), -1, dtype=torch.int32, device=projected.device)
+    counts = torch.zeros(shape, dtype=torch.int32, device=projected.device)
     if is_native(projected):
-        lists = [launch.flat(t, wp.int32) for t in (tiles.ranges, tiles.gaussian_ids)]
-        inputs, pixels = [own, launch.flat(projected, real), *lists, *rest], tiles.size * tiles.size
-        launch.launch(make_heaviest_native(tiles.size), len(tiles.ranges) * pixels, inputs, device, block_dim=pixels)
+        rest = projected.shape[1], k, weights, ids, counts
+        _launch_native(make_native(tiles.size).heaviest, projected, tiles, settings, *rest)
     else:
-        inputs = [own, *tile_inputs(projected, tiles, real), *rest]
-        launch.launch(make_heaviest_kernel(real, tiles.size), len(tiles.ranges), inputs, device, cost=10_000, block_dim=32)
+        _walk(make_heaviest, projected, tiles, settings, k, weights, ids, counts)
     return ids, weights, counts
+
+
+def contributions(
+    projected: torch.Tensor, tiles: Tiles, *, width: int, height: int, rule: Rule, origin: tuple[int, int] = (0, 0)
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return sum and maximum of each Gaussian's blending weights alpha * T over pixels, [C, N] each. Not differentiable."""
+    check_tiles(projected, tiles, width, height)
+    check_slots(tiles)
+    projected = projected.detach().contiguous()
+    settings, weights = BlendSettings(origin, width, height, rule), projected.new_zeros(len(tiles.slots), 2)
+    if is_native(projected):
+        ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
+        blend_cuda.instance_weights(projected, tiles, settings, ends, weights)
+    else:
+        _walk(make_contributions, projected, tiles, settings, 0, weights)
+    sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])
+    kernel = make_segments(launch.real_of(projected)).gather_weights
+    launch.launch(kernel, len(tiles.counts), [weights, tiles.starts, tiles.counts, sums, maxima], projected.device)
+    return sums, maxima

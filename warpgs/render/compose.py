@@ -11,12 +11,12 @@ import torch
 from warpgs.constants import Rule
 from warpgs.kernels import blend as blending
 from warpgs.kernels import launch, sh
-from warpgs.kernels.blend import blend, blend_channels, contributions
+from warpgs.kernels.blend import blend, blend_channels
 from warpgs.kernels.ellipse import ProjectInputs, ProjectSettings, checked_factors, nothing, packed_covariances
 from warpgs.kernels.falloff import BlendSettings
 from warpgs.kernels.project import project_inputs
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
-from warpgs.kernels.walk import heaviest, median_depth
+from warpgs.kernels.walk import contributions, heaviest, median_depth
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
 
 Window = tuple[int, int, int, int]

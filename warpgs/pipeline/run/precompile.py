@@ -28,6 +28,7 @@ from warpgs.kernels import (
     sweep,
     tiles,
     update,
+    walk,
 )
 from warpgs.kernels.falloff import COLORS, VALUES
 from warpgs.kernels.native import BLOCK, load_module
@@ -57,14 +58,15 @@ def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
     if not cuda:
         blending, scoring = (
             blend_cpu.make_kernels(real, TILE_SIZE),
-            [ssim.make_cpu_kernels(real, summed) for summed in (True, False)],
+            [ssim.make_kernels(real, summed) for summed in (True, False)],
         )
         without_depth = blend_cpu.make_kernels(real, TILE_SIZE, deep=False)
         updates = [update.make_adam_kernel(real, split, update.LANES) for split in (True, False)]
         variant = CAMERA_MODEL, "stored", False, sh.BASES
         own = [
             project_cpu.make_forward(real, *variant), project_cpu.make_backward(real, *variant, False),
-            blending.forward, blending.backward, without_depth.backward, blending.contributions,
+            blending.forward, blending.backward, without_depth.backward,
+            walk.make_walk(real, TILE_SIZE, walk.make_contributions),
             blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
             update.make_errors(),
             sweep.make_costs_kernel(), sweep.make_depth_kernels().best, sweep.make_scanline_kernel_cpu(),

@@ -135,9 +135,7 @@ def perturb(
     """
     g = {n: t.detach() for n, t in gaussians.tensors().items()}
     inputs = [
-        launch.view(settings, wp.float32), seed, noise_lr, launch.view(going, wp.bool), launch.view(g["quats"], wp.vec4),
-        launch.view(g["log_scales"], wp.vec3), launch.view(g["logit_opacities"], wp.float32),
-        launch.view(g["means"], wp.vec3),
+        settings, seed, noise_lr, going, g["quats"], g["log_scales"], g["logit_opacities"], g["means"],
     ]  # fmt: skip
     launch.launch(make_kernel(), len(gaussians), inputs, settings.device)
 
