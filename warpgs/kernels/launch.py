@@ -123,8 +123,8 @@ class View(NamedTuple):
         if self.axes == 0:
             last = sum((n - 1) * step for n, step in zip(self.tensor.shape, self.tensor.stride()))
             return (last + 1 if self.tensor.numel() else 0,)
-        count, width = self.tensor.numel(), self.tensor.shape[-1]
-        return (count,) if self.axes == 1 else (count // max(width, 1), width)
+        count = self.tensor.numel()
+        return (count,) if self.axes == 1 else (count // max(self.tensor.shape[-1], 1), self.tensor.shape[-1])
 
     def array(self) -> wp.array:
         """Return the tensor's memory as a Warp array of the shape [...], without a copy and without gradient."""
@@ -615,7 +615,7 @@ def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.d
 def make_fetch():
     """Make the kernel of `fetch`."""
 
-    @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch", grid_stride=True)
+    @cuda_kernel(source("allocator_fetch.cu"), "begin + wp.tid()", "warpgs.runtime.allocator.fetch")
     def fetch(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
 
     return fetch

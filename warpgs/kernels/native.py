@@ -47,8 +47,8 @@ def cuda_kernel(text: str, item: str, module: str, **options: object) -> Callabl
         kinds = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in kernel.__annotations__]
         vars(kernel)["__signature__"] = inspect.Signature(kinds)
         call = f"def {stub.__name__}(begin, {', '.join(names)}):\n    body({item}, {', '.join(names)})\n"
-        options.setdefault("grid_stride", False)
-        return wp.Kernel(kernel, module=wp.get_module(module), options={"enable_backward": False, **options}, source=call)
+        fixed = {"enable_backward": False, "grid_stride": False}
+        return wp.Kernel(kernel, module=wp.get_module(module), options=fixed | options, source=call)
 
     return make
 

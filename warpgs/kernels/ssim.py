@@ -14,6 +14,8 @@ from warpgs.kernels.native import ROLLED, cuda_kernel, source
 
 RADIUS = 5
 """Half size of the window [px]."""
+TAPS = 2 * RADIUS + 1
+"""Side of the window [px]."""
 SIGMA = 1.5
 """Standard deviation of the window [px]."""
 C1 = 0.01**2
@@ -117,8 +119,8 @@ def make_kernels(real, summed: bool):
     # The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
     # elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
     f = make_functions(real)
-    vec11 = wp.types.vector(2 * RADIUS + 1, real)
-    vec11i = wp.types.vector(2 * RADIUS + 1, wp.int32)
+    vec11 = wp.types.vector(TAPS, real)
+    vec11i = wp.types.vector(TAPS, wp.int32)
     values = wp.types.vector(LANES, real)
     kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
 
@@ -126,14 +128,14 @@ def make_kernels(real, summed: bool):
     def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
         """Return the first elements of the rows in the window of row y; rows outside the image are replaced, and weigh 0."""
         o = vec11i()
-        for k in range(2 * RADIUS + 1):
+        for k in range(TAPS):
             o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
         return o
 
     @wp.func
     def taps_of(y: wp.int32, height: wp.int32) -> vec11:
         w = vec11()
-        for k in range(2 * RADIUS + 1):
+        for k in range(TAPS):
             inside = y + k >= RADIUS and y + k < height + RADIUS
             w[k] = wp.where(inside, f.tap(k - RADIUS), real(0.0))
         return w
@@ -144,22 +146,22 @@ def make_kernels(real, summed: bool):
             scratch[o + k] = real(0.0)
             scratch[o + PADDING + columns + k] = real(0.0)
 
-    # The loop over the eleven rows is unrolled: inside the loop over lanes it would keep the latter from vectorising.
+    # Warp unrolls loops that hold a `wp.static`: inside the loop over lanes, they would keep the latter from vectorising.
 
     @wp.func
     def down_pairs(
         a: wp.array(dtype=real), b: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32
     ) -> f.vec5:
         s = f.vec5()
-        for k in range(wp.static(2 * RADIUS + 1)):
-            s = f.add_pair(s, w[k], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
+        for k in range(TAPS):
+            s = f.add_pair(s, w[wp.static(k)], a[f.at(o[k] + x, lane)], b[f.at(o[k] + x, lane)])
         return s
 
     @wp.func
     def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
         s = w[0] * m[f.at(o[0] + x, lane)]
-        for k in range(1, wp.static(2 * RADIUS + 1)):
-            s += w[k] * m[f.at(o[k] + x, lane)]
+        for k in range(1, TAPS):
+            s += w[wp.static(k)] * m[f.at(o[k] + x, lane)]
         return s
 
     @kernel
