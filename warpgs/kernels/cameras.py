@@ -84,7 +84,8 @@ def check_camera(camera: Camera) -> type[CameraModel]:
 
 @functools.cache
 def make_linear(real: type) -> SimpleNamespace:
-    """Make the structs and products for one scalar type, wp.float32 or wp.float64."""
+    """Make the structs, products and functions that models share, for one scalar type, wp.float32 or wp.float64."""
+    vec2 = wp.types.vector(2, real)
     vec3 = wp.types.vector(3, real)
     mat33 = wp.types.matrix((3, 3), real)
 
@@ -110,17 +111,48 @@ def make_linear(real: type) -> SimpleNamespace:
         return rows
 
     @wp.func
-    def times_axes(jacobian: Rows, axes: mat33) -> Rows:
-        turned = wp.transpose(axes)
-        return rows_of(turned * jacobian.first, turned * jacobian.second)
+    def in_front(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+        # phrased so that a NaN gives False
+        return position[2] >= near and position[2] <= real(FAR)
 
     @wp.func
-    def transposed_times(jacobian: Rows, v_first: vec3, v_second: vec3) -> mat33:
-        return wp.outer(jacobian.first, v_first) + wp.outer(jacobian.second, v_second)
+    def z_of(position: vec3) -> real:
+        return position[2]
+
+    @wp.func
+    def unclamped(pixel: vec2, width: real, height: real) -> vec2:
+        return pixel
+
+    @wp.func
+    def clamped(pixel: vec2, width: real, height: real) -> vec2:
+        margin = real(FRUSTUM_MARGIN)
+        return vec2(
+            wp.clamp(pixel[0], -margin * width, width + margin * width),
+            wp.clamp(pixel[1], -margin * height, height + margin * height),
+        )
+
+    def products(jacobian) -> dict[str, object]:
+        """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
+
+        @wp.func
+        def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> Rows:
+            j = jacobian(position, K, lens, point)
+            turned = wp.transpose(axes)
+            return rows_of(turned * j.first, turned * j.second)
+
+        @wp.func
+        def axes_backward(
+            position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
+        ) -> mat33:
+            j = jacobian(position, K, lens, point)
+            return wp.outer(j.first, v_first) + wp.outer(j.second, v_second)
+
+        return {"project_axes": project_axes, "axes_backward": axes_backward}
 
     return SimpleNamespace(
-        Rows=Rows, Gradients=Gradients, rows_of=rows_of, times_axes=times_axes, transposed_times=transposed_times
-    )
+        Rows=Rows, Gradients=Gradients, rows_of=rows_of, in_front=in_front, z_of=z_of, unclamped=unclamped, clamped=clamped,
+        products=products,
+    )  # fmt: skip
 
 
 @register("pinhole")
@@ -128,134 +160,102 @@ class Pinhole(CameraModel):
     """The pinhole camera."""
 
     @staticmethod
+    @functools.cache
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
-        return _make_pinhole(real)
+        linear = make_linear(real)
+        vec2 = wp.types.vector(2, real)
+        vec3 = wp.types.vector(3, real)
+        mat33 = wp.types.matrix((3, 3), real)
 
+        @wp.func
+        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+            return vec2(K[0, 0] * position[0] / position[2] + K[0, 2], K[1, 1] * position[1] / position[2] + K[1, 2])
 
-@functools.cache
-def _make_pinhole(real: type) -> SimpleNamespace:
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
+        @wp.func
+        def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> linear.Rows:
+            z = position[2]
+            jx = K[0, 0] / z
+            jy = K[1, 1] / z
+            jxz = (K[0, 2] - point[0]) / z
+            jyz = (K[1, 2] - point[1]) / z
+            first = vec3(
+                jx * axes[0, 0] + jxz * axes[2, 0],
+                jx * axes[0, 1] + jxz * axes[2, 1],
+                jx * axes[0, 2] + jxz * axes[2, 2],
+            )
+            second = vec3(
+                jy * axes[1, 0] + jyz * axes[2, 0],
+                jy * axes[1, 1] + jyz * axes[2, 1],
+                jy * axes[1, 2] + jyz * axes[2, 2],
+            )
+            return linear.rows_of(first, second)
 
-    @wp.struct
-    class Rows:
-        """The two rows of Jacobian times axes [px]."""
+        @wp.func
+        def axes_backward(
+            position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
+        ) -> mat33:
+            inv_z = real(1.0) / position[2]
+            jx = K[0, 0] * inv_z
+            jy = K[1, 1] * inv_z
+            jxz = (K[0, 2] - point[0]) * inv_z
+            jyz = (K[1, 2] - point[1]) * inv_z
+            g0 = jx * v_first
+            g1 = jy * v_second
+            g2 = jxz * v_first + jyz * v_second
+            return mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
 
-        first: vec3
-        second: vec3
+        @wp.func
+        def position_backward(
+            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
+        ) -> linear.Gradients:  # fmt: skip
+            x = position[0]
+            y = position[1]
+            inv_z = real(1.0) / position[2]
+            jx = K[0, 0] * inv_z
+            jy = K[1, 1] * inv_z
+            jxz = (K[0, 2] - point[0]) * inv_z
+            jyz = (K[1, 2] - point[1]) * inv_z
+            axes0 = vec3(axes[0, 0], axes[0, 1], axes[0, 2])
+            axes1 = vec3(axes[1, 0], axes[1, 1], axes[1, 2])
+            axes2 = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
+            v_jx = wp.dot(v_first, axes0)
+            v_jxz = wp.dot(v_first, axes2)
+            v_jy = wp.dot(v_second, axes1)
+            v_jyz = wp.dot(v_second, axes2)
+            v_K = mat33()
+            v_x = v_pixel[0] * jx
+            v_y = v_pixel[1] * jy
+            v_z = (
+                -(v_pixel[0] * jx * x + v_pixel[1] * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z
+                + v_depth
+            )
+            v_K[0, 0] = (v_pixel[0] * x + v_jx) * inv_z
+            v_K[1, 1] = (v_pixel[1] * y + v_jy) * inv_z
+            v_K[0, 2] = v_pixel[0]
+            v_K[1, 2] = v_pixel[1]
+            if point[0] == pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
+                v_x -= v_jxz * jx * inv_z
+                v_z += v_jxz * jx * x * inv_z * inv_z
+                v_K[0, 0] = v_K[0, 0] - v_jxz * x * inv_z * inv_z
+            else:
+                v_K[0, 2] = v_K[0, 2] + v_jxz * inv_z
+            if point[1] == pixel[1]:
+                v_y -= v_jyz * jy * inv_z
+                v_z += v_jyz * jy * y * inv_z * inv_z
+                v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
+            else:
+                v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
+            g = linear.Gradients()
+            g.v_position = vec3(v_x, v_y, v_z)
+            g.v_K = v_K
+            return g
 
-    @wp.struct
-    class Gradients:
-        """Gradients of the position in the camera and of the intrinsics."""
-
-        v_position: vec3
-        v_K: mat33
-
-    @wp.func
-    def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
-        # phrased so that a NaN gives False
-        return position[2] >= near and position[2] <= real(FAR)
-
-    @wp.func
-    def depth_of(position: vec3) -> real:
-        return position[2]
-
-    @wp.func
-    def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
-        return vec2(K[0, 0] * position[0] / position[2] + K[0, 2], K[1, 1] * position[1] / position[2] + K[1, 2])
-
-    @wp.func
-    def expansion_point(pixel: vec2, width: real, height: real) -> vec2:
-        margin = real(FRUSTUM_MARGIN)
-        return vec2(
-            wp.clamp(pixel[0], -margin * width, width + margin * width),
-            wp.clamp(pixel[1], -margin * height, height + margin * height),
-        )
-
-    @wp.func
-    def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> Rows:
-        z = position[2]
-        jx = K[0, 0] / z
-        jy = K[1, 1] / z
-        jxz = (K[0, 2] - point[0]) / z
-        jyz = (K[1, 2] - point[1]) / z
-        rows = Rows()
-        rows.first = vec3(
-            jx * axes[0, 0] + jxz * axes[2, 0],
-            jx * axes[0, 1] + jxz * axes[2, 1],
-            jx * axes[0, 2] + jxz * axes[2, 2],
-        )
-        rows.second = vec3(
-            jy * axes[1, 0] + jyz * axes[2, 0],
-            jy * axes[1, 1] + jyz * axes[2, 1],
-            jy * axes[1, 2] + jyz * axes[2, 2],
-        )
-        return rows
-
-    @wp.func
-    def axes_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-    ) -> mat33:
-        inv_z = real(1.0) / position[2]
-        jx = K[0, 0] * inv_z
-        jy = K[1, 1] * inv_z
-        jxz = (K[0, 2] - point[0]) * inv_z
-        jyz = (K[1, 2] - point[1]) * inv_z
-        g0 = jx * v_first
-        g1 = jy * v_second
-        g2 = jxz * v_first + jyz * v_second
-        return mat33(g0[0], g0[1], g0[2], g1[0], g1[1], g1[2], g2[0], g2[1], g2[2])
-
-    @wp.func
-    def position_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
-        v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
-    ) -> Gradients:  # fmt: skip
-        x = position[0]
-        y = position[1]
-        inv_z = real(1.0) / position[2]
-        jx = K[0, 0] * inv_z
-        jy = K[1, 1] * inv_z
-        jxz = (K[0, 2] - point[0]) * inv_z
-        jyz = (K[1, 2] - point[1]) * inv_z
-        axes0 = vec3(axes[0, 0], axes[0, 1], axes[0, 2])
-        axes1 = vec3(axes[1, 0], axes[1, 1], axes[1, 2])
-        axes2 = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
-        v_jx = wp.dot(v_first, axes0)
-        v_jxz = wp.dot(v_first, axes2)
-        v_jy = wp.dot(v_second, axes1)
-        v_jyz = wp.dot(v_second, axes2)
-        v_K = mat33()
-        v_x = v_pixel[0] * jx
-        v_y = v_pixel[1] * jy
-        v_z = -(v_pixel[0] * jx * x + v_pixel[1] * jy * y + v_jx * jx + v_jy * jy + v_jxz * jxz + v_jyz * jyz) * inv_z + v_depth
-        v_K[0, 0] = (v_pixel[0] * x + v_jx) * inv_z
-        v_K[1, 1] = (v_pixel[1] * y + v_jy) * inv_z
-        v_K[0, 2] = v_pixel[0]
-        v_K[1, 2] = v_pixel[1]
-        if point[0] == pixel[0]:  # the Jacobian moves with the mean: cx - px = -fx x / z
-            v_x -= v_jxz * jx * inv_z
-            v_z += v_jxz * jx * x * inv_z * inv_z
-            v_K[0, 0] = v_K[0, 0] - v_jxz * x * inv_z * inv_z
-        else:
-            v_K[0, 2] = v_K[0, 2] + v_jxz * inv_z
-        if point[1] == pixel[1]:
-            v_y -= v_jyz * jy * inv_z
-            v_z += v_jyz * jy * y * inv_z * inv_z
-            v_K[1, 1] = v_K[1, 1] - v_jyz * y * inv_z * inv_z
-        else:
-            v_K[1, 2] = v_K[1, 2] + v_jyz * inv_z
-        g = Gradients()
-        g.v_position = vec3(v_x, v_y, v_z)
-        g.v_K = v_K
-        return g
-
-    return SimpleNamespace(
-        in_range=in_range, depth_of=depth_of, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
-        axes_backward=axes_backward, position_backward=position_backward,
-    )  # fmt: skip
+        return SimpleNamespace(
+            in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
+            position_backward=position_backward, project_axes=project_axes, axes_backward=axes_backward,
+        )  # fmt: skip
 
 
 @register("orthographic")
@@ -263,69 +263,42 @@ class Orthographic(CameraModel):
     """The orthographic camera."""
 
     @staticmethod
+    @functools.cache
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
-        return _make_orthographic(real)
+        linear = make_linear(real)
+        vec2 = wp.types.vector(2, real)
+        vec3 = wp.types.vector(3, real)
+        mat33 = wp.types.matrix((3, 3), real)
 
+        @wp.func
+        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+            return vec2(K[0, 0] * position[0] + K[0, 2], K[1, 1] * position[1] + K[1, 2])
 
-@functools.cache
-def _make_orthographic(real: type) -> SimpleNamespace:
-    linear = make_linear(real)
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
+        @wp.func
+        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+            zero = real(0.0)
+            return linear.rows_of(vec3(K[0, 0], zero, zero), vec3(zero, K[1, 1], zero))
 
-    @wp.func
-    def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
-        # phrased so that a NaN gives False
-        return position[2] >= near and position[2] <= real(FAR)
+        @wp.func
+        def position_backward(
+            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
+        ) -> linear.Gradients:  # fmt: skip
+            v_K = mat33()
+            v_K[0, 0] = v_pixel[0] * position[0] + wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
+            v_K[1, 1] = v_pixel[1] * position[1] + wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
+            v_K[0, 2] = v_pixel[0]
+            v_K[1, 2] = v_pixel[1]
+            g = linear.Gradients()
+            g.v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
+            g.v_K = v_K
+            return g
 
-    @wp.func
-    def depth_of(position: vec3) -> real:
-        return position[2]
-
-    @wp.func
-    def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
-        return vec2(K[0, 0] * position[0] + K[0, 2], K[1, 1] * position[1] + K[1, 2])
-
-    @wp.func
-    def expansion_point(pixel: vec2, width: real, height: real) -> vec2:
-        return pixel
-
-    @wp.func
-    def jacobian(K: mat33) -> linear.Rows:
-        zero = real(0.0)
-        return linear.rows_of(vec3(K[0, 0], zero, zero), vec3(zero, K[1, 1], zero))
-
-    @wp.func
-    def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> linear.Rows:
-        return linear.times_axes(jacobian(K), axes)
-
-    @wp.func
-    def axes_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-    ) -> mat33:
-        return linear.transposed_times(jacobian(K), v_first, v_second)
-
-    @wp.func
-    def position_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
-        v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
-    ) -> linear.Gradients:  # fmt: skip
-        v_K = mat33()
-        v_K[0, 0] = v_pixel[0] * position[0] + wp.dot(v_first, vec3(axes[0, 0], axes[0, 1], axes[0, 2]))
-        v_K[1, 1] = v_pixel[1] * position[1] + wp.dot(v_second, vec3(axes[1, 0], axes[1, 1], axes[1, 2]))
-        v_K[0, 2] = v_pixel[0]
-        v_K[1, 2] = v_pixel[1]
-        g = linear.Gradients()
-        g.v_position = vec3(v_pixel[0] * K[0, 0], v_pixel[1] * K[1, 1], v_depth)
-        g.v_K = v_K
-        return g
-
-    return SimpleNamespace(
-        in_range=in_range, depth_of=depth_of, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
-        axes_backward=axes_backward, position_backward=position_backward,
-    )  # fmt: skip
+        return SimpleNamespace(
+            in_range=linear.in_front, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.unclamped,
+            position_backward=position_backward, **linear.products(jacobian),
+        )  # fmt: skip
 
 
 @register("opencv")
@@ -335,9 +308,116 @@ class OpenCV(CameraModel):
     coefficients = 8
 
     @staticmethod
+    @functools.cache
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
-        return _make_opencv(real)
+        linear = make_linear(real)
+        lensed = _make_distortion(real)
+        vec2 = wp.types.vector(2, real)
+        vec3 = wp.types.vector(3, real)
+        mat33 = wp.types.matrix((3, 3), real)
+        one = real(1.0)
+
+        @wp.func
+        def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+            # phrased so that a NaN gives False
+            if not (position[2] >= near and position[2] <= real(FAR)):
+                return False
+            a = position[0] / position[2]
+            b = position[1] / position[2]
+            count = int(RIM_SAMPLES)  # a loop, not sixteen copies
+            for i in range(count):  # several samples, since the map may rise again beyond a fold
+                part = real(i + 1) / real(RIM_SAMPLES)
+                s = wp.sqrt(part / (one + (one - part) * (a * a + b * b)))  # evenly spaced in the squared sine of the angle
+                d = lensed.distort(s * a, s * b, lens)
+                if d.folded:
+                    return False
+            return True
+
+        @wp.func
+        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+            d = lensed.distort(position[0] / position[2], position[1] / position[2], lens)
+            return vec2(K[0, 0] * d.a + K[0, 2], K[1, 1] * d.b + K[1, 2])
+
+        @wp.func
+        def scale_to(limit: real, offset: real) -> real:
+            """Return the factor from a pixel's offset to that of the expansion point; 1 where no factor leads to the axis."""
+            s = limit / offset
+            if offset != limit and s >= real(0.0) and s < one:
+                return s
+            return one
+
+        @wp.func
+        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+            pixel = pixel_of(position, K, lens)
+            inv_z = one / position[2]
+            a = position[0] * inv_z * scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
+            b = position[1] * inv_z * scale_to(point[1] - K[1, 2], pixel[1] - K[1, 2])
+            d = lensed.distort(a, b, lens)
+            first = K[0, 0] * inv_z * vec3(d.aa, d.ab, -(d.aa * a + d.ab * b))
+            second = K[1, 1] * inv_z * vec3(d.ab, d.bb, -(d.ab * a + d.bb * b))
+            return linear.rows_of(first, second)
+
+        @wp.func
+        def position_backward(
+            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
+        ) -> linear.Gradients:  # fmt: skip
+            inv_z = one / position[2]
+            jx = K[0, 0] * inv_z
+            jy = K[1, 1] * inv_z
+            a0 = position[0] * inv_z
+            b0 = position[1] * inv_z
+            mean = lensed.distort(a0, b0, lens)
+            sx = one
+            sy = one
+            if point[0] != pixel[0]:
+                sx = scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
+            if point[1] != pixel[1]:
+                sy = scale_to(point[1] - K[1, 2], pixel[1] - K[1, 2])
+            a = sx * a0
+            b = sy * b0
+            d = lensed.distort(a, b, lens)
+            g = axes * v_first  # gradients of the rows of J
+            h = axes * v_second
+            u_aa = g[0] - a * g[2]
+            u_ab = g[1] - b * g[2]
+            w_ab = h[0] - a * h[2]
+            w_bb = h[1] - b * h[2]
+            first = d.aa * u_aa + d.ab * u_ab  # by jx and jy
+            second = d.ab * w_ab + d.bb * w_bb
+            bent = lensed.curved(a, b, jx * u_aa, jx * u_ab + jy * w_ab, jy * w_bb, lens)
+            v_ea = bent[0] - jx * g[2] * d.aa - jy * h[2] * d.ab  # of the expansion point
+            v_eb = bent[1] - jx * g[2] * d.ab - jy * h[2] * d.bb
+            v_a = v_pixel[0] * K[0, 0] * mean.aa + v_pixel[1] * K[1, 1] * mean.ab
+            v_b = v_pixel[0] * K[0, 0] * mean.ab + v_pixel[1] * K[1, 1] * mean.bb
+            v_a += v_ea * sx
+            v_b += v_eb * sy
+            v_K = mat33()
+            v_K[0, 0] = v_pixel[0] * mean.a + first * inv_z
+            v_K[1, 1] = v_pixel[1] * mean.b + second * inv_z
+            v_K[0, 2] = v_pixel[0]
+            v_K[1, 2] = v_pixel[1]
+            if sx < one:  # a = a0 (limit - cx) / (fx distorted a0)
+                v_a -= v_ea * a / mean.a * mean.aa
+                v_b -= v_ea * a / mean.a * mean.ab
+                v_K[0, 0] = v_K[0, 0] - v_ea * a / K[0, 0]
+                v_K[0, 2] = v_K[0, 2] - v_ea * a0 / (K[0, 0] * mean.a)
+            if sy < one:
+                v_a -= v_eb * b / mean.b * mean.ab
+                v_b -= v_eb * b / mean.b * mean.bb
+                v_K[1, 1] = v_K[1, 1] - v_eb * b / K[1, 1]
+                v_K[1, 2] = v_K[1, 2] - v_eb * b0 / (K[1, 1] * mean.b)
+            v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
+            gradients = linear.Gradients()
+            gradients.v_position = vec3(v_a * inv_z, v_b * inv_z, v_z)
+            gradients.v_K = v_K
+            return gradients
+
+        return SimpleNamespace(
+            in_range=in_range, depth_of=linear.z_of, pixel_of=pixel_of, expansion_point=linear.clamped,
+            position_backward=position_backward, **linear.products(jacobian),
+        )  # fmt: skip
 
 
 @functools.cache
@@ -419,139 +499,6 @@ def _make_distortion(real: type) -> SimpleNamespace:
     return SimpleNamespace(distort=distort, curved=curved)
 
 
-@functools.cache
-def _make_opencv(real: type) -> SimpleNamespace:
-    linear = make_linear(real)
-    lensed = _make_distortion(real)
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
-    one = real(1.0)
-
-    @wp.func
-    def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
-        # phrased so that a NaN gives False
-        if not (position[2] >= near and position[2] <= real(FAR)):
-            return False
-        a = position[0] / position[2]
-        b = position[1] / position[2]
-        count = int(RIM_SAMPLES)  # a loop, not sixteen copies
-        for i in range(count):  # several samples, since the map may rise again beyond a fold
-            part = real(i + 1) / real(RIM_SAMPLES)
-            s = wp.sqrt(part / (one + (one - part) * (a * a + b * b)))  # evenly spaced in the squared sine of the angle
-            d = lensed.distort(s * a, s * b, lens)
-            if d.folded:
-                return False
-        return True
-
-    @wp.func
-    def depth_of(position: vec3) -> real:
-        return position[2]
-
-    @wp.func
-    def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
-        d = lensed.distort(position[0] / position[2], position[1] / position[2], lens)
-        return vec2(K[0, 0] * d.a + K[0, 2], K[1, 1] * d.b + K[1, 2])
-
-    @wp.func
-    def expansion_point(pixel: vec2, width: real, height: real) -> vec2:
-        margin = real(FRUSTUM_MARGIN)
-        return vec2(
-            wp.clamp(pixel[0], -margin * width, width + margin * width),
-            wp.clamp(pixel[1], -margin * height, height + margin * height),
-        )
-
-    @wp.func
-    def scale_to(limit: real, offset: real) -> real:
-        """Return the factor from a pixel's offset to that of the expansion point; 1 where no factor leads to the axis."""
-        s = limit / offset
-        if offset != limit and s >= real(0.0) and s < one:
-            return s
-        return one
-
-    @wp.func
-    def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
-        pixel = pixel_of(position, K, lens)
-        inv_z = one / position[2]
-        a = position[0] * inv_z * scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
-        b = position[1] * inv_z * scale_to(point[1] - K[1, 2], pixel[1] - K[1, 2])
-        d = lensed.distort(a, b, lens)
-        first = K[0, 0] * inv_z * vec3(d.aa, d.ab, -(d.aa * a + d.ab * b))
-        second = K[1, 1] * inv_z * vec3(d.ab, d.bb, -(d.ab * a + d.bb * b))
-        return linear.rows_of(first, second)
-
-    @wp.func
-    def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> linear.Rows:
-        return linear.times_axes(jacobian(position, K, lens, point), axes)
-
-    @wp.func
-    def axes_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-    ) -> mat33:
-        return linear.transposed_times(jacobian(position, K, lens, point), v_first, v_second)
-
-    @wp.func
-    def position_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
-        v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
-    ) -> linear.Gradients:  # fmt: skip
-        inv_z = one / position[2]
-        jx = K[0, 0] * inv_z
-        jy = K[1, 1] * inv_z
-        a0 = position[0] * inv_z
-        b0 = position[1] * inv_z
-        mean = lensed.distort(a0, b0, lens)
-        sx = one
-        sy = one
-        if point[0] != pixel[0]:
-            sx = scale_to(point[0] - K[0, 2], pixel[0] - K[0, 2])
-        if point[1] != pixel[1]:
-            sy = scale_to(point[1] - K[1, 2], pixel[1] - K[1, 2])
-        a = sx * a0
-        b = sy * b0
-        d = lensed.distort(a, b, lens)
-        g = axes * v_first  # gradients of the rows of J
-        h = axes * v_second
-        u_aa = g[0] - a * g[2]
-        u_ab = g[1] - b * g[2]
-        w_ab = h[0] - a * h[2]
-        w_bb = h[1] - b * h[2]
-        first = d.aa * u_aa + d.ab * u_ab  # by jx and jy
-        second = d.ab * w_ab + d.bb * w_bb
-        bent = lensed.curved(a, b, jx * u_aa, jx * u_ab + jy * w_ab, jy * w_bb, lens)
-        v_ea = bent[0] - jx * g[2] * d.aa - jy * h[2] * d.ab  # of the expansion point
-        v_eb = bent[1] - jx * g[2] * d.ab - jy * h[2] * d.bb
-        v_a = v_pixel[0] * K[0, 0] * mean.aa + v_pixel[1] * K[1, 1] * mean.ab
-        v_b = v_pixel[0] * K[0, 0] * mean.ab + v_pixel[1] * K[1, 1] * mean.bb
-        v_a += v_ea * sx
-        v_b += v_eb * sy
-        v_K = mat33()
-        v_K[0, 0] = v_pixel[0] * mean.a + first * inv_z
-        v_K[1, 1] = v_pixel[1] * mean.b + second * inv_z
-        v_K[0, 2] = v_pixel[0]
-        v_K[1, 2] = v_pixel[1]
-        if sx < one:  # a = a0 (limit - cx) / (fx distorted a0)
-            v_a -= v_ea * a / mean.a * mean.aa
-            v_b -= v_ea * a / mean.a * mean.ab
-            v_K[0, 0] = v_K[0, 0] - v_ea * a / K[0, 0]
-            v_K[0, 2] = v_K[0, 2] - v_ea * a0 / (K[0, 0] * mean.a)
-        if sy < one:
-            v_a -= v_eb * b / mean.b * mean.ab
-            v_b -= v_eb * b / mean.b * mean.bb
-            v_K[1, 1] = v_K[1, 1] - v_eb * b / K[1, 1]
-            v_K[1, 2] = v_K[1, 2] - v_eb * b0 / (K[1, 1] * mean.b)
-        v_z = -(v_a * a0 + v_b * b0 + first * jx + second * jy) * inv_z + v_depth
-        gradients = linear.Gradients()
-        gradients.v_position = vec3(v_a * inv_z, v_b * inv_z, v_z)
-        gradients.v_K = v_K
-        return gradients
-
-    return SimpleNamespace(
-        in_range=in_range, depth_of=depth_of, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
-        axes_backward=axes_backward, position_backward=position_backward,
-    )  # fmt: skip
-
-
 ANTIPODE = 1e-3
 """Smallest sine of the angle from the backward axis that is rendered: on that axis, the image of a point is a circle."""
 NEAR_AXIS = 0.04
@@ -567,9 +514,90 @@ class Fisheye(CameraModel):
     coefficients = 4
 
     @staticmethod
+    @functools.cache
     def make_functions(real: type) -> SimpleNamespace:
         """Make the functions of `CameraModel.make_functions`."""
-        return _make_fisheye(real)
+        linear = make_linear(real)
+        radial = _make_profile(real)
+        vec2 = wp.types.vector(2, real)
+        vec3 = wp.types.vector(3, real)
+        mat33 = wp.types.matrix((3, 3), real)
+
+        @wp.func
+        def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
+            # phrased so that a NaN gives False
+            distance = radial.distance(position)
+            if not (distance >= near and distance <= real(FAR)):
+                return False
+            unit = position / distance
+            r = wp.sqrt(unit[0] * unit[0] + unit[1] * unit[1])
+            if not (unit[2] > real(0.0) or r >= real(ANTIPODE)):
+                return False
+            angle = wp.atan2(r, unit[2])
+            count = int(RIM_SAMPLES)  # a loop, not sixteen copies
+            for i in range(count):  # several samples, since the polynomial may rise again beyond a fold
+                t = angle * (real(i + 1) / real(RIM_SAMPLES))
+                if not (radial.slope(t * t, lens) > real(0.0)):
+                    return False
+            return True
+
+        @wp.func
+        def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
+            unit = position / radial.distance(position)
+            p = radial.profile(unit, lens)
+            return vec2(K[0, 0] * unit[0] * p.G + K[0, 2], K[1, 1] * unit[1] * p.G + K[1, 2])
+
+        @wp.func
+        def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2) -> linear.Rows:
+            distance = radial.distance(position)
+            unit = position / distance
+            x = unit[0]
+            y = unit[1]
+            p = radial.profile(unit, lens)
+            jx = K[0, 0] / distance
+            jy = K[1, 1] / distance
+            first = vec3(jx * (p.G + x * x * p.H), jx * x * y * p.H, jx * x * p.E)
+            second = vec3(jy * x * y * p.H, jy * (p.G + y * y * p.H), jy * y * p.E)
+            return linear.rows_of(first, second)
+
+        @wp.func
+        def position_backward(
+            position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
+            v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
+        ) -> linear.Gradients:  # fmt: skip
+            two = real(2.0)
+            distance = radial.distance(position)
+            unit = position / distance
+            x = unit[0]
+            y = unit[1]
+            p = radial.profile(unit, lens)
+            v_row0 = axes * v_first / distance  # gradients of the rows of J, at unit distance
+            v_row1 = axes * v_second / distance
+            g = K[0, 0] * v_row0
+            h = K[1, 1] * v_row1
+            u = K[0, 0] * v_pixel[0]
+            v = K[1, 1] * v_pixel[1]
+            v_G = g[0] + h[1] + u * x + v * y
+            v_H = g[0] * x * x + (g[1] + h[0]) * x * y + h[1] * y * y
+            v_E = g[2] * x + h[2] * y
+            v_r = v_G * p.H + v_H * p.L + v_E * p.N  # over r
+            v_x = two * g[0] * x * p.H + (g[1] + h[0]) * y * p.H + g[2] * p.E + u * p.G + v_r * x
+            v_y = (g[1] + h[0]) * x * p.H + two * h[1] * y * p.H + h[2] * p.E + v * p.G + v_r * y
+            v_z = v_G * p.E + v_H * p.N + v_E * p.P
+            v_K = mat33()
+            v_K[0, 0] = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
+            v_K[1, 1] = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
+            v_K[0, 2] = v_pixel[0]
+            v_K[1, 2] = v_pixel[1]
+            gradients = linear.Gradients()
+            gradients.v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
+            gradients.v_K = v_K
+            return gradients
+
+        return SimpleNamespace(
+            in_range=in_range, depth_of=radial.distance, pixel_of=pixel_of, expansion_point=linear.unclamped,
+            position_backward=position_backward, **linear.products(jacobian),
+        )  # fmt: skip
 
 
 @functools.cache
@@ -649,106 +677,3 @@ def _make_profile(real: type) -> SimpleNamespace:
         return largest * wp.length(position / largest)
 
     return SimpleNamespace(slope=slope, profile=profile, distance=distance)
-
-
-@functools.cache
-def _make_fisheye(real: type) -> SimpleNamespace:
-    linear = make_linear(real)
-    radial = _make_profile(real)
-    vec2 = wp.types.vector(2, real)
-    vec3 = wp.types.vector(3, real)
-    mat33 = wp.types.matrix((3, 3), real)
-
-    @wp.func
-    def in_range(position: vec3, lens: wp.array(dtype=real), near: real) -> wp.bool:
-        # phrased so that a NaN gives False
-        distance = radial.distance(position)
-        if not (distance >= near and distance <= real(FAR)):
-            return False
-        unit = position / distance
-        r = wp.sqrt(unit[0] * unit[0] + unit[1] * unit[1])
-        if not (unit[2] > real(0.0) or r >= real(ANTIPODE)):
-            return False
-        angle = wp.atan2(r, unit[2])
-        count = int(RIM_SAMPLES)  # a loop, not sixteen copies
-        for i in range(count):  # several samples, since the polynomial may rise again beyond a fold
-            t = angle * (real(i + 1) / real(RIM_SAMPLES))
-            if not (radial.slope(t * t, lens) > real(0.0)):
-                return False
-        return True
-
-    @wp.func
-    def depth_of(position: vec3) -> real:
-        return radial.distance(position)
-
-    @wp.func
-    def pixel_of(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> vec2:
-        unit = position / radial.distance(position)
-        p = radial.profile(unit, lens)
-        return vec2(K[0, 0] * unit[0] * p.G + K[0, 2], K[1, 1] * unit[1] * p.G + K[1, 2])
-
-    @wp.func
-    def expansion_point(pixel: vec2, width: real, height: real) -> vec2:
-        return pixel
-
-    @wp.func
-    def jacobian(position: vec3, K: mat33, lens: wp.array(dtype=real)) -> linear.Rows:
-        distance = radial.distance(position)
-        unit = position / distance
-        x = unit[0]
-        y = unit[1]
-        p = radial.profile(unit, lens)
-        jx = K[0, 0] / distance
-        jy = K[1, 1] / distance
-        first = vec3(jx * (p.G + x * x * p.H), jx * x * y * p.H, jx * x * p.E)
-        second = vec3(jy * x * y * p.H, jy * (p.G + y * y * p.H), jy * y * p.E)
-        return linear.rows_of(first, second)
-
-    @wp.func
-    def project_axes(position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, axes: mat33) -> linear.Rows:
-        return linear.times_axes(jacobian(position, K, lens), axes)
-
-    @wp.func
-    def axes_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), point: vec2, v_first: vec3, v_second: vec3
-    ) -> mat33:
-        return linear.transposed_times(jacobian(position, K, lens), v_first, v_second)
-
-    @wp.func
-    def position_backward(
-        position: vec3, K: mat33, lens: wp.array(dtype=real), pixel: vec2, point: vec2, axes: mat33,
-        v_first: vec3, v_second: vec3, v_pixel: vec2, v_depth: real,
-    ) -> linear.Gradients:  # fmt: skip
-        two = real(2.0)
-        distance = radial.distance(position)
-        unit = position / distance
-        x = unit[0]
-        y = unit[1]
-        p = radial.profile(unit, lens)
-        v_row0 = axes * v_first / distance  # gradients of the rows of J, at unit distance
-        v_row1 = axes * v_second / distance
-        g = K[0, 0] * v_row0
-        h = K[1, 1] * v_row1
-        u = K[0, 0] * v_pixel[0]
-        v = K[1, 1] * v_pixel[1]
-        v_G = g[0] + h[1] + u * x + v * y
-        v_H = g[0] * x * x + (g[1] + h[0]) * x * y + h[1] * y * y
-        v_E = g[2] * x + h[2] * y
-        v_r = v_G * p.H + v_H * p.L + v_E * p.N  # over r
-        v_x = two * g[0] * x * p.H + (g[1] + h[0]) * y * p.H + g[2] * p.E + u * p.G + v_r * x
-        v_y = (g[1] + h[0]) * x * p.H + two * h[1] * y * p.H + h[2] * p.E + v * p.G + v_r * y
-        v_z = v_G * p.E + v_H * p.N + v_E * p.P
-        v_K = mat33()
-        v_K[0, 0] = v_pixel[0] * x * p.G + v_row0[0] * (p.G + x * x * p.H) + v_row0[1] * x * y * p.H + v_row0[2] * x * p.E
-        v_K[1, 1] = v_pixel[1] * y * p.G + v_row1[0] * x * y * p.H + v_row1[1] * (p.G + y * y * p.H) + v_row1[2] * y * p.E
-        v_K[0, 2] = v_pixel[0]
-        v_K[1, 2] = v_pixel[1]
-        gradients = linear.Gradients()
-        gradients.v_position = vec3(v_x, v_y, v_z) / distance + v_depth * unit
-        gradients.v_K = v_K
-        return gradients
-
-    return SimpleNamespace(
-        in_range=in_range, depth_of=depth_of, pixel_of=pixel_of, expansion_point=expansion_point, project_axes=project_axes,
-        axes_backward=axes_backward, position_backward=position_backward,
-    )  # fmt: skip

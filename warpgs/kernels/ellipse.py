@@ -210,6 +210,7 @@ def make_rotations(real):
     """Make the quaternion and rotation functions for one scalar type (docs/project.md, section 2)."""
     vec4 = wp.types.vector(4, real)
     mat33 = wp.types.matrix((3, 3), real)
+    mat44 = wp.types.matrix((4, 4), real)
 
     @wp.func
     def quat_length(q: vec4) -> real:
@@ -257,7 +258,14 @@ def make_rotations(real):
         )  # fmt: skip
         return vec4(v_w, v_x, v_y, v_z)
 
-    return SimpleNamespace(quat_length=quat_length, rotation=rotation, rotation_backward=rotation_backward)
+    @wp.func
+    def rotation_of(view: mat44) -> mat33:
+        """Return the rotation of a view matrix."""
+        return mat33(view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2])
+
+    return SimpleNamespace(
+        quat_length=quat_length, rotation=rotation, rotation_backward=rotation_backward, rotation_of=rotation_of
+    )
 
 
 @functools.cache
@@ -340,9 +348,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
     ) -> Ellipse:  # fmt: skip
         e = Ellipse()
         e.valid = 0
-        rotation = mat33(
-            view[0, 0], view[0, 1], view[0, 2], view[1, 0], view[1, 1], view[1, 2], view[2, 0], view[2, 1], view[2, 2]
-        )
+        rotation = r.rotation_of(view)
         e.position = rotation * mean + vec3(view[0, 3], view[1, 3], view[2, 3])
         # Guards are phrased so that a NaN fails them.
         before = camera.in_range(e.position, lens, near)
@@ -463,7 +469,7 @@ def make_projection(real, camera_model: str, parameters: str = "stored", lanes: 
         Ellipse=Ellipse, ellipse=ellipse, factor_of=factor_of, compensation=compensation,
         sigmoid=sigmoid, opacity_of=opacity_of, scales_of=scales_of,
         direction=direction, finite3=finite3, project_axes=camera.project_axes,
-        rotation=r.rotation, rotation_backward=r.rotation_backward,
+        rotation=r.rotation, rotation_backward=r.rotation_backward, rotation_of=r.rotation_of,
         depth_of=camera.depth_of, axes_backward=camera.axes_backward, position_backward=camera.position_backward,
         vec2=vec2, vec3=vec3, vec4=vec4, mat33=mat33, mat44=mat44,
     )  # fmt: skip
@@ -629,11 +635,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
     ) -> ShapeGradient:  # fmt: skip
         g = ShapeGradient()
         e = m.ellipse(mean, quat, log_scale, view, K, lens, width, height, near, low_pass)
-        rotation = mat33(
-            view[0, 0], view[0, 1], view[0, 2],
-            view[1, 0], view[1, 1], view[1, 2],
-            view[2, 0], view[2, 1], view[2, 2],
-        )  # fmt: skip
+        rotation = m.rotation_of(view)
 
         # factor -> projected axes (section 4); v_u and u are both per shrunk pixel
         inv_c = real(1.0) / wp.sqrt(e.c)
@@ -663,17 +665,9 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
 
         # projected axes -> camera axes (section 3)
         v_axes = m.axes_backward(e.position, K, lens, e.expansion_point, v_m1, v_m2)
-        axes0 = vec3(e.axes[0, 0], e.axes[0, 1], e.axes[0, 2])
-        axes1 = vec3(e.axes[1, 0], e.axes[1, 1], e.axes[1, 2])
-        axes2 = vec3(e.axes[2, 0], e.axes[2, 1], e.axes[2, 2])
-        g0 = vec3(v_axes[0, 0], v_axes[0, 1], v_axes[0, 2])
-        g1 = vec3(v_axes[1, 0], v_axes[1, 1], v_axes[1, 2])
-        g2 = vec3(v_axes[2, 0], v_axes[2, 1], v_axes[2, 2])
+        axes = e.axes
         if wp.static(parameters == "activated"):  # the axes divided by the scales, which may be 0
-            turned = rotation * m.rotation(e.quat)
-            axes0 = vec3(turned[0, 0], turned[0, 1], turned[0, 2])
-            axes1 = vec3(turned[1, 0], turned[1, 1], turned[1, 2])
-            axes2 = vec3(turned[2, 0], turned[2, 1], turned[2, 2])
+            axes = rotation * m.rotation(e.quat)
         v_turned = v_axes  # gradient of camera rotation times Gaussian rotation, or of camera rotation times factor
         if wp.static(parameters == "covariances"):
             V = covariance_2d(e, projected, v_projected, i, low_pass)
@@ -682,7 +676,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
             g.quat = packed.off
             g.log_scale = packed.diagonal
         else:
-            g.log_scale = wp.cw_mul(g0, axes0) + wp.cw_mul(g1, axes1) + wp.cw_mul(g2, axes2)
+            g.log_scale = wp.cw_mul(v_axes[0], axes[0]) + wp.cw_mul(v_axes[1], axes[1]) + wp.cw_mul(v_axes[2], axes[2])
             v_turned = v_axes * wp.diag(e.scales)
             v_unit = m.rotation_backward(e.quat, wp.transpose(rotation) * v_turned)
             g.quat = (v_unit - e.quat * wp.dot(e.quat, v_unit)) / e.quat_length
@@ -733,11 +727,7 @@ def make_functions(real, camera_model: str, parameters: str, antialiased: bool, 
         view: m.mat44, mean: vec3, quat: vec4, log_scale: vec3, position: vec3, turned: mat33, unit: vec4, v_centered: vec3
     ) -> m.mat44:  # fmt: skip
         """Return the gradient of the view matrix; arguments are a Gaussian, fields of its ShapeGradient, and `centered`."""
-        rotation = mat33(
-            view[0, 0], view[0, 1], view[0, 2],
-            view[1, 0], view[1, 1], view[1, 2],
-            view[2, 0], view[2, 1], view[2, 2],
-        )  # fmt: skip
+        rotation = m.rotation_of(view)
         t = vec3(view[0, 3], view[1, 3], view[2, 3])
         if wp.static(parameters == "covariances"):
             turning = c.factor(quat, log_scale)
