@@ -15,30 +15,11 @@ LANES = 16
 
 
 @functools.cache
-def make_lanes(real, camera_model: str, parameters: str, bases: int):
-    """Make the record of a task's Gaussians and its functions; a loop over the lanes vectorises."""
-    m = make_projection(real, camera_model, parameters)
-    basis_of = sh.make_functions(real, bases).basis
-    vec3 = m.vec3
-    vec4 = m.vec4
-    lane_reals = wp.types.vector(LANES, real)
-    lane_bases = wp.types.vector(bases * LANES, real)
-    lanes = wp.constant(LANES)
-
-    @wp.struct
-    class Shapes:
-        """Parameters of the Gaussians; lanes beyond the last hold zeros."""
-
-        mean_x: lane_reals  # [u]
-        mean_y: lane_reals
-        mean_z: lane_reals
-        quat_w: lane_reals
-        quat_x: lane_reals
-        quat_y: lane_reals
-        quat_z: lane_reals
-        scale_x: lane_reals  # activated [u]
-        scale_y: lane_reals
-        scale_z: lane_reals
+def make_lanes(real, size: int):
+    """Make the type of vectors of ``size`` numbers for all lanes, and its functions; a loop over the lanes vectorises."""
+    vector = wp.types.vector(size, real)
+    lane_vectors = wp.types.vector(size * LANES, real)  # each number of all lanes is contiguous
+    count = wp.constant(size)
 
     @wp.func(inline=True)
     def at(entry: wp.ref[real]) -> real:
@@ -46,46 +27,52 @@ def make_lanes(real, camera_model: str, parameters: str, bases: int):
         return entry
 
     @wp.func(inline=True)
+    def put(v: vector, lane: wp.int32, to: wp.ref[lane_vectors]):
+        """Store the vector of a lane."""
+        for k in range(count):  # Warp unrolls loops that hold a `wp.static`
+            to[wp.static(k * LANES) + lane] = v[k]
+
+    @wp.func(inline=True)
+    def add(hit: bool, v: vector, lane: wp.int32, to: wp.ref[lane_vectors]):
+        """Add to the vector of a lane if it is hit."""
+        for k in range(count):
+            to[wp.static(k * LANES) + lane] = at(to[wp.static(k * LANES) + lane]) + wp.where(hit, v[k], real(0.0))
+
+    @wp.func(inline=True)
+    def get(vectors: wp.ref[lane_vectors], lane: wp.int32) -> vector:
+        """Return the vector of a lane."""
+        v = vector()
+        for k in range(count):
+            v[k] = at(vectors[wp.static(k * LANES) + lane])
+        return v
+
+    return SimpleNamespace(vectors=lane_vectors, put=put, add=add, get=get)
+
+
+@functools.cache
+def make_shapes(real, parameters: str):
+    """Make the record of a task's Gaussians, and the function that stores one; lanes beyond the last hold zeros."""
+    scales_of = make_projection(real, "pinhole", parameters).scales_of
+    three, four = make_lanes(real, 3), make_lanes(real, 4)
+    vec3 = wp.types.vector(3, real)
+    vec4 = wp.types.vector(4, real)
+
+    @wp.struct
+    class Shapes:
+        """Parameters of the Gaussians, or their gradients."""
+
+        mean: three.vectors  # [u]
+        quat: four.vectors
+        scale: three.vectors  # activated [u]
+
+    @wp.func(inline=True)
     def store(mean: vec3, quat: vec4, log_scale: vec3, lane: wp.int32, shapes: wp.ref[Shapes]):
         """Store a Gaussian in its lane."""
-        scale = m.scales_of(log_scale)
-        shapes.mean_x[lane] = mean[0]
-        shapes.mean_y[lane] = mean[1]
-        shapes.mean_z[lane] = mean[2]
-        shapes.quat_w[lane] = quat[0]
-        shapes.quat_x[lane] = quat[1]
-        shapes.quat_y[lane] = quat[2]
-        shapes.quat_z[lane] = quat[3]
-        shapes.scale_x[lane] = scale[0]
-        shapes.scale_y[lane] = scale[1]
-        shapes.scale_z[lane] = scale[2]
+        three.put(mean, lane, shapes.mean)
+        four.put(quat, lane, shapes.quat)
+        three.put(scales_of(log_scale), lane, shapes.scale)
 
-    @wp.func(inline=True)
-    def mean_of(s: wp.ref[Shapes], lane: wp.int32) -> vec3:
-        """Return the mean of a lane [u]."""
-        return vec3(at(s.mean_x[lane]), at(s.mean_y[lane]), at(s.mean_z[lane]))
-
-    @wp.func(inline=True)
-    def quat_of(s: wp.ref[Shapes], lane: wp.int32) -> vec4:
-        """Return the quaternion of a lane."""
-        return vec4(at(s.quat_w[lane]), at(s.quat_x[lane]), at(s.quat_y[lane]), at(s.quat_z[lane]))
-
-    @wp.func(inline=True)
-    def scales_of(s: wp.ref[Shapes], lane: wp.int32) -> vec3:
-        """Return the activated scales of a lane [u]."""
-        return vec3(at(s.scale_x[lane]), at(s.scale_y[lane]), at(s.scale_z[lane]))
-
-    @wp.func(inline=True)
-    def store_basis(d: vec4, lane: wp.int32, basis: wp.ref[lane_bases]):
-        """Store the basis at a direction."""
-        y = basis_of(vec3(d[0], d[1], d[2]))
-        for k in range(wp.static(bases)):
-            basis[k * lanes + lane] = y[k]
-
-    return SimpleNamespace(
-        Shapes=Shapes, lane_bases=lane_bases, at=at, store=store, mean_of=mean_of, quat_of=quat_of, scales_of=scales_of,
-        store_basis=store_basis,
-    )  # fmt: skip
+    return SimpleNamespace(Shapes=Shapes, store=store)
 
 
 # The forward kernel of `project` for the CPU, in plain Warp.
@@ -100,11 +87,13 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
     one = make_projection(real, camera_model, parameters)
     m = make_projection(real, camera_model, parameters, lanes=True)
     s = make_spans(real, lanes=True)
-    g = make_lanes(real, camera_model, parameters, bases)
+    g = make_shapes(real, parameters)
+    three, four, basis = make_lanes(real, 3), make_lanes(real, 4), make_lanes(real, bases)
+    basis_of = sh.make_functions(real, bases).basis
     vec3 = m.vec3
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lane_bases = g.lane_bases
+    lane_bases = basis.vectors
     lanes = wp.constant(LANES)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
@@ -152,7 +141,7 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         c = lane_reals()
         for lane in range(lanes):
             e = m.ellipse(
-                g.mean_of(shapes, lane), g.quat_of(shapes, lane), g.scales_of(shapes, lane),
+                three.get(shapes.mean, lane), four.get(shapes.quat, lane), three.get(shapes.scale, lane),
                 view, K, lens, real(width), real(height), near, low_pass,
             )  # fmt: skip
             if wp.static(antialiased):
@@ -206,7 +195,8 @@ def make_forward(real, camera_model: str, parameters: str, antialiased: bool, ba
         # last, since it reads the most
         values = lane_bases()
         for lane in range(lanes):
-            g.store_basis(m.direction(g.mean_of(shapes, lane), view), lane, values)
+            d = m.direction(three.get(shapes.mean, lane), view)
+            basis.put(basis_of(vec3(d[0], d[1], d[2])), lane, values)
         for lane in range(used):
             n = first + lane
             i = camera * count + n
@@ -247,82 +237,35 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
     m = make_projection(real, camera_model, parameters, lanes=True)
     of_one = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)
     f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases, lanes=True)
-    gaussians = make_lanes(real, camera_model, parameters, bases)
-    values = sh.make_functions(real, bases).values
+    gaussians = make_shapes(real, parameters)
+    three, four, nine, row, basis = (make_lanes(real, size) for size in (3, 4, 9, PROJECTED_SIZE, bases))
+    basis_of = sh.make_functions(real, bases).basis
     vec3 = m.vec3
-    vec4 = m.vec4
     mat33 = m.mat33
-    vec12 = wp.types.vector(PROJECTED_SIZE, real)
+    vec9 = wp.types.vector(9, real)
     lane_reals = wp.types.vector(LANES, real)
     lane_ints = wp.types.vector(LANES, wp.int32)
-    lane_vec3 = wp.types.vector(3 * LANES, real)
-    lane_vec4 = wp.types.vector(4 * LANES, real)
-    lane_mat33 = wp.types.vector(9 * LANES, real)
-    lane_rows = wp.types.vector(PROJECTED_SIZE * LANES, real)
-    lane_bases = gaussians.lane_bases
-    at = gaussians.at
+    lane_rows = row.vectors
+    lane_centers = three.vectors
+    lane_bases = basis.vectors
     lanes = wp.constant(LANES)
 
     @wp.struct
     class CameraParts:
-        """Values of each lane for the gradients of the cameras; the entries of one lane lie `LANES` apart."""
+        """Values of each lane for the gradients of the cameras."""
 
-        position: lane_vec3
-        turned: lane_mat33
-        unit: lane_vec4
-        K: lane_mat33
+        position: three.vectors
+        turned: nine.vectors
+        unit: four.vectors
+        K: nine.vectors
 
-    @wp.func(inline=True)
-    def row_of(rows: wp.ref[lane_rows], lane: wp.int32) -> vec12:
-        """Return the row of a lane."""
-        found = vec12()
-        for k in range(wp.static(PROJECTED_SIZE)):
-            found[k] = at(rows[k * lanes + lane])
-        return found
+    @wp.func
+    def flat(a: mat33) -> vec9:
+        return vec9(a[0, 0], a[0, 1], a[0, 2], a[1, 0], a[1, 1], a[1, 2], a[2, 0], a[2, 1], a[2, 2])
 
-    @wp.func(inline=True)
-    def weights_of(weights: wp.ref[lane_bases], lane: wp.int32) -> values:
-        """Return the gradient of the basis of a lane."""
-        found = values()
-        for k in range(wp.static(bases)):
-            found[k] = at(weights[k * lanes + lane])
-        return found
-
-    @wp.func(inline=True)
-    def store_parts(g: f.ShapeGradient, lane: wp.int32, parts: wp.ref[CameraParts]):
-        """Store the data for the gradients of the cameras."""
-        for j in range(wp.static(3)):
-            parts.position[j * lanes + lane] = g.position[j]
-            for k in range(wp.static(3)):
-                parts.turned[(3 * j + k) * lanes + lane] = g.turned[j, k]
-                parts.K[(3 * j + k) * lanes + lane] = g.K[j, k]
-        for k in range(wp.static(4)):
-            parts.unit[k * lanes + lane] = g.unit[k]
-
-    @wp.func(inline=True)
-    def matrix_of(matrices: wp.ref[lane_mat33], lane: wp.int32) -> mat33:
-        """Return the matrix of a lane."""
-        found = mat33()
-        for j in range(wp.static(3)):
-            for k in range(wp.static(3)):
-                found[j, k] = at(matrices[(3 * j + k) * lanes + lane])
-        return found
-
-    @wp.func(inline=True)
-    def vec4_of(vectors: wp.ref[lane_vec4], lane: wp.int32) -> vec4:
-        """Return the vector of a lane."""
-        found = vec4()
-        for k in range(wp.static(4)):
-            found[k] = at(vectors[k * lanes + lane])
-        return found
-
-    @wp.func(inline=True)
-    def vec3_of(vectors: wp.ref[lane_vec3], lane: wp.int32) -> vec3:
-        """Return the vector of a lane."""
-        found = vec3()
-        for k in range(wp.static(3)):
-            found[k] = at(vectors[k * lanes + lane])
-        return found
+    @wp.func
+    def square(v: vec9) -> mat33:
+        return mat33(v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8])
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
     def backward(
@@ -346,26 +289,15 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
             gaussians.store(means[n], quats[n], log_scales[n], lane, shapes)
 
         # sums over the cameras; the number of cameras that saw a lane; whether this one does
-        v_mean_x = lane_reals()
-        v_mean_y = lane_reals()
-        v_mean_z = lane_reals()
-        v_quat_w = lane_reals()
-        v_quat_x = lane_reals()
-        v_quat_y = lane_reals()
-        v_quat_z = lane_reals()
-        v_scale_x = lane_reals()
-        v_scale_y = lane_reals()
-        v_scale_z = lane_reals()
+        sums = gaussians.Shapes()
         v_logit = lane_reals()
         views = lane_ints()
         seen = lane_ints()
         rows = lane_rows()
         v_rows = lane_rows()
-        basis = lane_bases()
+        values = lane_bases()
         weights = lane_bases()
-        centered_x = lane_reals()
-        centered_y = lane_reals()
-        centered_z = lane_reals()
+        centered = lane_centers()
         parts = CameraParts()
         for camera in range(viewmats.shape[0]):
             view = viewmats[camera]
@@ -380,25 +312,21 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                         v_rows[k * lanes + lane] = v_projected[i, k]
             for lane in range(lanes):
                 g = f.shape(
-                    gaussians.mean_of(shapes, lane), gaussians.quat_of(shapes, lane), gaussians.scales_of(shapes, lane),
-                    view, K, lens, real(width), real(height), near, low_pass, row_of(rows, lane), row_of(v_rows, lane), 0,
+                    three.get(shapes.mean, lane), four.get(shapes.quat, lane), three.get(shapes.scale, lane),
+                    view, K, lens, real(width), real(height), near, low_pass, row.get(rows, lane), row.get(v_rows, lane), 0,
                 )  # fmt: skip
                 hit = seen[lane] != 0
-                none = real(0.0)
-                v_mean_x[lane] = v_mean_x[lane] + wp.where(hit, g.mean[0], none)
-                v_mean_y[lane] = v_mean_y[lane] + wp.where(hit, g.mean[1], none)
-                v_mean_z[lane] = v_mean_z[lane] + wp.where(hit, g.mean[2], none)
-                v_quat_w[lane] = v_quat_w[lane] + wp.where(hit, g.quat[0], none)
-                v_quat_x[lane] = v_quat_x[lane] + wp.where(hit, g.quat[1], none)
-                v_quat_y[lane] = v_quat_y[lane] + wp.where(hit, g.quat[2], none)
-                v_quat_z[lane] = v_quat_z[lane] + wp.where(hit, g.quat[3], none)
-                v_scale_x[lane] = v_scale_x[lane] + wp.where(hit, g.log_scale[0], none)
-                v_scale_y[lane] = v_scale_y[lane] + wp.where(hit, g.log_scale[1], none)
-                v_scale_z[lane] = v_scale_z[lane] + wp.where(hit, g.log_scale[2], none)
+                three.add(hit, g.mean, lane, sums.mean)
+                four.add(hit, g.quat, lane, sums.quat)
+                three.add(hit, g.log_scale, lane, sums.scale)
                 if wp.static(camera_gradients):
-                    store_parts(g, lane, parts)
+                    three.put(g.position, lane, parts.position)
+                    nine.put(flat(g.turned), lane, parts.turned)
+                    four.put(g.unit, lane, parts.unit)
+                    nine.put(flat(g.K), lane, parts.K)
             for lane in range(lanes):
-                gaussians.store_basis(m.direction(gaussians.mean_of(shapes, lane), view), lane, basis)
+                d = m.direction(three.get(shapes.mean, lane), view)
+                basis.put(basis_of(vec3(d[0], d[1], d[2])), lane, values)
             for lane in range(used):
                 if seen[lane] != 0:
                     n = wp.max(first + lane, 0)
@@ -409,38 +337,33 @@ def make_backward(real, camera_model: str, parameters: str, antialiased: bool, b
                     while k < sh_count:
                         o = wp.max(k, 0)
                         weights[o * lanes + lane] = wp.dot(coefficients[n, o], v_color)
-                        v_coefficient = basis[o * lanes + lane] * v_color
+                        v_coefficient = values[o * lanes + lane] * v_color
                         if views[lane] > 0:
                             v_coefficient += v_coefficients[n, o]
                         v_coefficients[n, o] = v_coefficient
                         k += 1
                     views[lane] = views[lane] + 1
             for lane in range(lanes):
-                d = m.direction(gaussians.mean_of(shapes, lane), view)
-                v_centered = f.centered(d, weights_of(weights, lane))
+                d = m.direction(three.get(shapes.mean, lane), view)
+                v_centered = f.centered(d, basis.get(weights, lane))
                 hit = seen[lane] != 0
-                none = real(0.0)
-                centered_x[lane] = wp.where(hit, v_centered[0], none)
-                centered_y[lane] = wp.where(hit, v_centered[1], none)
-                centered_z[lane] = wp.where(hit, v_centered[2], none)
-                v_mean_x[lane] = v_mean_x[lane] + centered_x[lane]
-                v_mean_y[lane] = v_mean_y[lane] + centered_y[lane]
-                v_mean_z[lane] = v_mean_z[lane] + centered_z[lane]
+                three.put(v_centered, lane, centered)
+                three.add(hit, v_centered, lane, sums.mean)
             if wp.static(camera_gradients):
                 for lane in range(used):
                     if seen[lane] != 0:
                         n = first + lane
-                        v_centered = vec3(centered_x[lane], centered_y[lane], centered_z[lane])
+                        v_centered = three.get(centered, lane)
                         v_viewmats[camera, n] = f.view_gradient(
-                            view, means[n], quats[n], log_scales[n], vec3_of(parts.position, lane),
-                            matrix_of(parts.turned, lane), vec4_of(parts.unit, lane), v_centered,
+                            view, means[n], quats[n], log_scales[n], three.get(parts.position, lane),
+                            square(nine.get(parts.turned, lane)), four.get(parts.unit, lane), v_centered,
                         )  # fmt: skip
-                        v_Ks[camera, n] = matrix_of(parts.K, lane)
+                        v_Ks[camera, n] = square(nine.get(parts.K, lane))
         for lane in range(used):
             n = first + lane
-            v_means[n] = vec3(v_mean_x[lane], v_mean_y[lane], v_mean_z[lane])
-            v_quats[n] = vec4(v_quat_w[lane], v_quat_x[lane], v_quat_y[lane], v_quat_z[lane])
-            v_log_scales[n] = vec3(v_scale_x[lane], v_scale_y[lane], v_scale_z[lane])
+            v_means[n] = three.get(sums.mean, lane)
+            v_quats[n] = four.get(sums.quat, lane)
+            v_log_scales[n] = three.get(sums.scale, lane)
             v_logit_opacities[n] = v_logit[lane]
             k = wp.where(views[lane] > 0, sh_count, 0)
             while k < v_coefficients.shape[1]:
