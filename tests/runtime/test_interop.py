@@ -482,19 +482,17 @@ def test_arguments_of_one_and_two_axes_share_the_memory_of_any_tensor():
         image = memory.view(-1, 2, width)[:3]  # as of two rows of pixels
         part = image[..., :3]
         found = torch.zeros(6)
-        arguments = [interop.rows(part, wp.float32), interop.flat(image, wp.float32), interop.flat(found, wp.float32)]
-        interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
+        interop.launch(tell_apart, 6, [part, image, found], torch.device("cpu"))
         wanted = 603 + 1000 * part.reshape(6, 3)[:, 1] + 1e6 * image.reshape(-1)[:6]
         assert torch.equal(found, wanted), width
     column = memory.view(1, 6, 10).transpose(0, 1)  # of images one pixel wide; its stride there is that of no row
     for image in (column, column[..., :4]):
         found = torch.zeros(6)
-        arguments = [interop.rows(image, wp.float32), interop.flat(memory, wp.float32), interop.flat(found, wp.float32)]
-        interop.launch(tell_apart, 6, arguments, torch.device("cpu"))
+        interop.launch(tell_apart, 6, [image, memory, found], torch.device("cpu"))
         wanted = 600 + image.shape[-1] + 1000 * image[:, 0, 1] + 1e6 * memory[:6]
         assert torch.equal(found, wanted), image.shape
-    empty = [interop.rows(part[..., :0], wp.float32), interop.rows(part[:0], wp.float32)]
-    assert [v.array().shape for v in empty] == [(0, 0), (0, 3)]
+    for none, shape in ((part[..., :0], (0, 0)), (part[:0], (0, 3))):
+        assert [v.array().shape for v in interop.arguments(tell_apart, [none, none, found])] == [shape, (0,), (6,)]
 
 
 @wp.kernel(enable_backward=False)
@@ -508,7 +506,7 @@ def test_an_argument_of_one_axis_spans_what_lies_between_rows():
     memory = torch.arange(60, dtype=torch.float32)
     for width in (5, 10, 5):
         part, found = memory.view(-1, 2, width)[:3][..., :3], torch.zeros(6)
-        arguments = [interop.span(part, wp.float32), part.stride(-2), interop.flat(found, wp.float32)]
+        arguments = [interop.span(part, wp.float32), part.stride(-2), found]
         interop.launch(second_of_row, 6, arguments, torch.device("cpu"))
         assert torch.equal(found, 5 * width + 3 + 1000 * part.reshape(6, 3)[:, 1]), width
     assert interop.span(part[:0], wp.float32).array().shape == (0,)
@@ -519,7 +517,7 @@ def test_pairs_are_sorted_in_place_where_they_lie():
     for seed in range(3):
         keys = torch.randint(4, (40,), dtype=torch.int32, generator=torch.Generator().manual_seed(seed))
         values, wanted = torch.arange(40, dtype=torch.int32), keys[:20].sort(stable=True)
-        sorting.sort_pairs(interop.view(keys, wp.int32), interop.view(values, wp.int32), 20, end_bit=2)
+        sorting.sort_pairs(keys, values, 20, end_bit=2)
         assert torch.equal(keys[:20], wanted.values) and torch.equal(values[:20].long(), wanted.indices)
 
 

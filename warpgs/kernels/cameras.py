@@ -1,6 +1,7 @@
 """Camera models: the interface, and the Warp functions of each model with their gradients."""
 
 import functools
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import ClassVar
 
@@ -131,7 +132,7 @@ def make_linear(real: type) -> SimpleNamespace:
             wp.clamp(pixel[1], -margin * height, height + margin * height),
         )
 
-    def products(jacobian) -> dict[str, object]:
+    def products(jacobian: Callable[..., object]) -> dict[str, object]:
         """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func

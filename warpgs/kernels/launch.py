@@ -149,16 +149,6 @@ def view(tensor: torch.Tensor, dtype) -> View:
     return View(tensor, dtype)
 
 
-def flat(tensor: torch.Tensor, dtype) -> View:
-    """Return a contiguous tensor of any shape [...] as an argument of one axis, without the cost of ``tensor.view(-1)``."""
-    return View(tensor, dtype, 1)
-
-
-def rows(tensor: torch.Tensor, dtype) -> View:
-    """Return a tensor [..., K] as an argument of two axes. Each row must be contiguous, and all rows the same stride apart."""
-    return View(tensor, dtype, 2)
-
-
 def span(tensor: torch.Tensor, dtype) -> View:
     """Return a tensor [..., K] of contiguous rows as an argument of one axis, including gaps between rows (`Vi."""
     return View(tensor, dtype, 0)
@@ -716,10 +706,8 @@ def _array_at(address: int, size: int, dtype: object, device: torch.device) -> w
     return wp.array(ptr=address, shape=size, dtype=dtype, device=warp_device(device))
 
 
-def sort_pairs(keys: View, values: View, count: int, **bits: int) -> None:
-    """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace.
-
-    On a GPU the sort runs on the stream of `stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
-    """
-    arrays = (_array_at(t.data_ptr(), t.numel(), dtype, t.device) for t, dtype, _ in (keys, values))
+def sort_pairs(keys: torch.Tensor, values: torch.Tensor, count: int, **bits: int) -> None:
+    """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace."""
+    # On a GPU the sort runs on the stream of `stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
+    arrays = (_array_at(t.data_ptr(), t.numel(), wp.dtype_from_torch(t.dtype), t.device) for t in (keys, values))
     wp.utils.radix_sort_pairs(*arrays, count, **bits)

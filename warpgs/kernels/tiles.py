@@ -602,7 +602,7 @@ def _depth_order(
     else:
         inputs = [projected, counts, packed, sum_bits(count), visible, depths, order]
         launch.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
-    sort_pairs(launch.view(depths, real), launch.view(order, wp.int32), visible)
+    sort_pairs(depths, order, visible)
     return order, visible, total
 
 
@@ -618,7 +618,7 @@ def _sort_by_tile(
 ) -> torch.Tensor:
     """Sort the instances stably by tile, fill in the range of each tile, and return the Gaussian numbers, int32, [M]."""
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
-    sort_pairs(launch.view(keys, wp.int32), launch.view(slots, wp.int32), total, end_bit=no_tile.bit_length())
+    sort_pairs(keys, slots, total, end_bit=no_tile.bit_length())
     inputs = [keys, slots, owners, total, no_tile, ids, ranges]
     native = keys.is_cuda
     launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)
