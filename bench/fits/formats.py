@@ -14,20 +14,32 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from bench.lib.scorer import Scorer
+from warpgs.coordinates import convert_gaussians
 from warpgs.export import spz
 from warpgs.export.arrays import arrays_of
 from warpgs.export.formats import read_gaussians, suffixes
+from warpgs.pipeline.runs.commands import scene_of
 from warpgs.pipeline.runs.export_filters import Filters
 from warpgs.pipeline.runs.export_model import export
+from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.scene import Gaussians
 
 WHAT = "file size, and loss of PSNR on held-out views, of each file format"
 
 
 def rows_of(folder: Path) -> list[dict]:
     """Return a row for each format of a run whole and cleaned, and one for each version of SPZ."""
-    scorer, rows = Scorer(folder), []
-    known = {"run": folder.name, "of": len(scorer.run.gaussians()), "psnr": scorer.own}
+    run, rows = open_run(folder, "cpu"), []
+    _, *views = scene_of(run)
+
+    def psnr(gaussians: Gaussians) -> float:
+        return float(evaluate_run(None, gaussians, *views, run.options())["test"]["psnr"])
+
+    def loss(gaussians: Gaussians) -> float:
+        return known["psnr"] - psnr(convert_gaussians(gaussians, run.normalization, "file", "scene"))
+
+    known = {"run": folder.name, "of": len(run.gaussians()), "psnr": psnr(run.gaussians())}
     with tempfile.TemporaryDirectory() as name:
         for suffix in suffixes():
             for clean in (False, True):
@@ -38,7 +50,7 @@ def rows_of(folder: Path) -> list[dict]:
                 back = read_gaussians(file)
                 rows.append(known | {
                     "format": suffix, "clean": clean, "gaussians": len(back), "degree": back.sh_degree,
-                    "bytes": file.stat().st_size, "write_s": round(written, 2), "loss_db": scorer.loss(back),
+                    "bytes": file.stat().st_size, "write_s": round(written, 2), "loss_db": loss(back),
                     "said": lines[:-1],
                 })  # fmt: skip
         export(folder, whole := Path(name) / "whole.ply", Filters(clean=False))
@@ -47,7 +59,7 @@ def rows_of(folder: Path) -> list[dict]:
             file.write_bytes(b"".join(spz.encode(arrays_of(read_gaussians(whole)), version)))
             rows.append(known | {
                 "format": f".spz version {version}", "clean": False, "gaussians": known["of"], "bytes": file.stat().st_size,
-                "loss_db": scorer.loss(read_gaussians(file)),
+                "loss_db": loss(read_gaussians(file)),
             })  # fmt: skip
     return rows
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 
 WORDS = {
     "arms": "methods to compare: the first so many of the set, or their names where the default is a list",
@@ -69,7 +68,3 @@ def parse(
             how |= {"default": default, "type": type(default)}
         parser.add_argument(f"--{name.replace('_', '-')}", **how)
     return parser.parse_args(given)
-
-
-SCENE = {"scene": Path}
-"""Positional argument of most programs: one scene folder."""
