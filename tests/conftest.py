@@ -74,7 +74,7 @@ def dtype(request) -> torch.dtype:
 def no_overview_in_reports():
     """Leave the 3D overview out of reports: it starts a process of its own, which tests/report/test_overview.py looks at."""
     patch = pytest.MonkeyPatch()
-    patch.setattr("warpgs.pipeline.runs.results.render_overview", lambda *_: (None, "no overview image: this is a test"))
+    patch.setattr("warpgs.pipeline.run.results.render_overview", lambda *_: (None, "no overview image: this is a test"))
     yield
     patch.undo()
 

@@ -6,10 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from warpgs.colors import C0
 from warpgs.geometry import look_at
 from warpgs.render.rasterize import rasterize
-from warpgs.scene import Camera, Gaussians, PointCloud, Prior, View
+from warpgs.scene import C0, Camera, Gaussians, PointCloud, Prior, View
 
 
 def three_gaussians() -> Gaussians:

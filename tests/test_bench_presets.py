@@ -17,7 +17,7 @@ from bench.lib.preset_table import rival, sizes_table, tables
 from bench.lib.scenes import ROWS, Row, folds, left_out, row_of, scene_at
 from tests.test_bench_gsplat import gsplat  # noqa: F401
 from warpgs.errors import UsageError
-from warpgs.io.splits import split_views
+from warpgs.io.load import split_views
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.synthetic.demo import split_spec, write_demo
 

@@ -10,8 +10,8 @@ from bench.lib.results_page import arms_table, other_steps_table
 from tests.scenes import photos
 from tests.test_bench_presets import results
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.background import mean_color
-from warpgs.pipeline.train.by_views import settings_by_views
+from warpgs.pipeline.train.schedule import mean_color
+from warpgs.pipeline.train.settings import settings_by_views
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 
 

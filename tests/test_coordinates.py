@@ -9,10 +9,10 @@ import torch
 import warpgs
 from tests.gaussians import camera, cloud
 from warpgs import Normalization, load, rasterize, read_ply, save, write_ply
-from warpgs.coordinates import convert_camera, convert_gaussians
 from warpgs.errors import DataError, UsageError
-from warpgs.export.formats import write_gaussians
-from warpgs.io.normalize import normalize_view
+from warpgs.export.base import write_gaussians
+from warpgs.geometry import convert_camera, convert_gaussians
+from warpgs.io.load import normalize_view
 from warpgs.scene import Camera, View
 
 N = Normalization(np.array([3.0, -2.0, 0.5]), 0.25)

@@ -11,12 +11,12 @@ import torch
 from tests.scenes import photos, seeds
 from warpgs import rasterize
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.presets import preset_settings
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 
 CPU = torch.device("cpu")

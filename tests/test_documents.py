@@ -10,9 +10,8 @@ from typing import get_type_hints
 from bench.lib import result_file
 from tests.scenes import view_stub
 from warpgs import PRESETS
-from warpgs.pipeline.train import by_views
-from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train import settings as by_views
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -14,8 +14,8 @@ import torch
 from PIL import Image
 
 import warpgs
-from warpgs.app.commands.fit import request_of
-from warpgs.rules import rule_named
+from warpgs.app.fit import request_of
+from warpgs.constants import rule_named
 from warpgs.synthetic.demo import write_demo
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

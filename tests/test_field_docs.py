@@ -6,7 +6,7 @@ import pydoc
 import pytest
 
 import warpgs
-from warpgs.field_docs import document_fields, field_docs
+from warpgs.errors import document_fields, field_docs
 
 DOCUMENTED = ("ActivatedGaussians", "Camera", "CovarianceGaussians", "Gaussians", "RasterizeOptions", "Render", "Scene", "View")
 

@@ -183,26 +183,23 @@ WRITERS = {
 }  # fmt: skip
 """Functions of other modules that write to a path they are given."""
 ELSEWHERE = {
-    ("app/failures.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
+    ("app/cli.py", "NamedTemporaryFile"): "details of a defect, in the folder for temporary files",
     ("report/film.py", "VideoWriter"): "into the temporary file of `replacing`, which decodes it",
     ("report/overview.py", "savez"): "into a temporary folder",
-    ("report/scene_plot.py", "savez"): "the same",
-    ("poses/matcher.py", "savez"): "into the file of `writing`",
-    ("pipeline/runs/fit_steps.py", "save"): "writes a checkpoint by warpgs.files",
-    ("report/sheet.py", "save"): "Pillow, into memory",
-    ("report/animation.py", "save"): "the same",
+    ("poses/matching.py", "savez"): "into the file of `writing`",
+    ("pipeline/run/fit.py", "save"): "writes a checkpoint by warpgs.files",
+    ("report/images.py", "save"): "Pillow, into memory",
+    ("report/film.py", "save"): "the same",
     ("export/sog.py", "save"): "the same",
-    ("poses/heic.py", "save"): "the same",
+    ("poses/photographs.py", "save"): "the same",
     ("files.py", "open wb"): "the temporary file of `writing`",
     ("files.py", "open ab"): "a file that grows by lines: metrics.jsonl, the log of a job",
-    ("output_folders.py", "os.open"): "folders and files by descriptor, for the functions of `warpgs.files`",
-    ("input_files.py", "os.open"): "files by descriptor, to read",
+    ("folders.py", "os.open"): "folders and files by descriptor, for the functions of `warpgs.files`",
+    ("files.py", "os.open"): "files by descriptor, to read",
     ("pipeline/farm/worker.py", "open w"): "a copy of stdout",
-    ("runtime/load_module.py", "open ab"): "a lock beside compiled kernels",
-    ("runtime/folder_lock.py", "open r+b"): "the lock of a folder",
-    ("runtime/native_output.py", "os.open"): "the null device",
-    ("runtime/output_streams.py", "os.open"): "the same",
-    ("runtime/file_names.py", "os.open"): "a folder or a file, to read it",
+    ("kernels/native.py", "open ab"): "a lock beside compiled kernels",
+    ("locks.py", "open r+b"): "the lock of a folder",
+    ("process.py", "os.open"): "the null device; a folder or a file, to read it",
 }
 """Every other way of writing in the package, and what is written there: no result of the user's."""
 

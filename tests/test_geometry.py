@@ -11,7 +11,8 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed
 from tests.lens_cameras import LENSES, lens_camera
 from warpgs import geometry
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera
 
 

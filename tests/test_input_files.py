@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import warpgs
-from warpgs import input_files
-from warpgs.input_files import input_digest, open_input, read_input, read_start, unread_reason
+from warpgs import files
+from warpgs.files import input_digest, open_input, read_input, read_start, unread_reason
 
 PACKAGE = Path(warpgs.__file__).parent
 
@@ -48,7 +48,7 @@ def test_a_pipe_that_takes_the_place_of_a_file_does_not_block(tmp_path, monkeypa
     pipe, file = special("pipe", tmp_path / "p"), tmp_path / "f"
     file.write_bytes(b"x")
     ordinary = os.stat(file)
-    monkeypatch.setattr(input_files.os, "stat", lambda path: ordinary)
+    monkeypatch.setattr(files.os, "stat", lambda path: ordinary)
     with pytest.raises(OSError, match="is not a regular file"):
         open_input(pipe)
 

@@ -6,9 +6,8 @@ import threading
 import pytest
 
 from warpgs.errors import ResourceError
-from warpgs.files import appending, filling, make_folder, move_folder, remove_file, replacing, write_bytes
-from warpgs.input_files import open_input
-from warpgs.output_folders import RefusedError, open_file, open_folder, output_folder
+from warpgs.files import appending, filling, make_folder, move_folder, open_input, remove_file, replacing, write_bytes
+from warpgs.folders import RefusedError, open_file, open_folder, output_folder
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")
 WAYS = {

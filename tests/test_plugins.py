@@ -7,9 +7,9 @@ import pytest
 
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.pipeline.runs.folder import check_same
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.run.folder import check_same
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
 from warpgs.plugins import Registry, load_object
 from warpgs.synthetic.demo import split_spec, write_demo

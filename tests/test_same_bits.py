@@ -14,10 +14,9 @@ from bench.lib import result_file, same_bits
 from tests.example_terms import DepthCorrelation, NormalSmoothness
 from tests.gaussians import camera
 from warpgs import geometry
-from warpgs.io.pose_matrices import rigid
-from warpgs.pipeline.train.loss import LossInputs, Target
-from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
-from warpgs.runtime.interop import set_threads
+from warpgs.io.folder import rigid
+from warpgs.kernels.launch import set_threads
+from warpgs.pipeline.train.loss import LossInputs, Target, photometric_loss
 
 ROOT = Path(__file__).parent.parent
 X86_64 = pytest.mark.skipif(platform.machine() != "x86_64", reason="chooses between code for processors of this kind")

@@ -7,17 +7,25 @@ import tempfile
 
 import pytest
 
-from warpgs import temporary
+from warpgs import folders
 from warpgs.files import filling, remove_leftovers, replacing
-from warpgs.output_folders import open_folder
-from warpgs.runtime.folder_lock import hold_folder
-from warpgs.temporary import NAMES, TemporaryFile, TemporaryFolder, shared_locks, sweep, system_folder, temporary_folder
+from warpgs.folders import (
+    NAMES,
+    TemporaryFile,
+    TemporaryFolder,
+    open_folder,
+    shared_locks,
+    sweep,
+    system_folder,
+    temporary_folder,
+)
+from warpgs.locks import hold_folder
 
 HOLDS = """
 import sys
 from pathlib import Path
 from warpgs.files import filling, replacing
-from warpgs.temporary import temporary_folder
+from warpgs.folders import temporary_folder
 with temporary_folder(), filling(Path(sys.argv[1]) / "scene") as folder, replacing(Path(sys.argv[1]) / "a.ply") as file:
     (folder / "photo.jpg").touch()
     file.touch()
@@ -26,7 +34,7 @@ with temporary_folder(), filling(Path(sys.argv[1]) / "scene") as folder, replaci
 """
 ORPHAN = """
 import subprocess, sys
-from warpgs.temporary import shared_locks, temporary_folder
+from warpgs.folders import shared_locks, temporary_folder
 folder = temporary_folder()
 with shared_locks() as locks:
     child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=sys.stdin, pass_fds=locks)
@@ -42,9 +50,9 @@ def places(tmp_path, monkeypatch):
         (tmp_path / name).mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
     monkeypatch.setattr(tempfile, "tempdir", None)
-    temporary.sweep_temporary_files.cache_clear()
+    folders.sweep_temporary_files.cache_clear()
     yield tmp_path / "X", tmp_path / "tmp"
-    temporary.sweep_temporary_files.cache_clear()
+    folders.sweep_temporary_files.cache_clear()
 
 
 def started(code, *words):
@@ -67,7 +75,7 @@ def test_another_command_leaves_what_is_held_and_removes_what_a_killed_one_left(
     assert now[0] >= there[0] and now[1] >= there[1]
     process.kill()
     process.communicate()
-    temporary.sweep_temporary_files.cache_clear()  # of another process
+    folders.sweep_temporary_files.cache_clear()  # of another process
     with hold_folder(results):
         pass
     assert not list(results.iterdir()) and not list(system.iterdir())
@@ -88,7 +96,7 @@ def test_a_folder_is_held_until_the_last_process_in_it_has_ended(places):
         os.close(read)
         os.close(write)
         with lock.open("r+b") as file:
-            temporary.lock_descriptor(file.fileno())  # waits for it
+            folders.lock_descriptor(file.fileno())  # waits for it
         sweep(folder)
     assert not list(system.iterdir())
 
@@ -124,7 +132,7 @@ def test_what_another_user_has_in_the_system_s_folder_stays(tmp_path):
 @pytest.mark.parametrize("late", ["locks first", "removes first"])
 def test_a_sweep_between_making_and_locking_costs_a_name(tmp_path, monkeypatch, late):
     """The maker sees that its file was taken for a leftover, and makes another one."""
-    lock, calls = temporary.lock_descriptor, []
+    lock, calls = folders.lock_descriptor, []
 
     def raced(descriptor, blocking):
         calls.append(descriptor)
@@ -135,7 +143,7 @@ def test_a_sweep_between_making_and_locking_costs_a_name(tmp_path, monkeypatch, 
             left.unlink()
         return lock(descriptor, blocking=blocking)
 
-    monkeypatch.setattr(temporary, "lock_descriptor", raced)
+    monkeypatch.setattr(folders, "lock_descriptor", raced)
     with open_folder(tmp_path) as folder, TemporaryFile(folder) as file:
         assert len(calls) == 2 and (tmp_path / file.name).exists()
 

@@ -4,12 +4,12 @@ import numpy as np
 import torch
 
 from tests.scenes import photos, seeds
-from warpgs.pipeline.metrics.evaluate import render_view, score
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.metrics.scores import render_view, score
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.render.options import RasterizeOptions
 
 
 def test_a_tiny_scene_passes_35_db_in_200_steps():

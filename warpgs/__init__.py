@@ -11,7 +11,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from warpgs.faces import OldNames, lazy
-from warpgs.runtime.openmp import let_idle_threads_sleep
+from warpgs.openmp import let_idle_threads_sleep
 from warpgs.version import __version__ as __version__
 
 let_idle_threads_sleep()  # before torch is imported
@@ -73,31 +73,29 @@ if TYPE_CHECKING:
     from warpgs import io as io
     from warpgs import kernels as kernels
     from warpgs import train as train
-    from warpgs.constants import Rule
+    from warpgs.constants import Rule, rule_named
     from warpgs.errors import DataError, NotFiniteError, ResourceError, UsageError, WarpgsError
     from warpgs.export.base import Format
     from warpgs.export.ply import read_ply, write_ply
     from warpgs.geometry import depth_normals, gaussian_normals, look_at
+    from warpgs.io.folder import Reader
     from warpgs.io.load import load_scene
-    from warpgs.io.readers import Reader
     from warpgs.mesh.fuse import MeshOptions
     from warpgs.mesh.fuse import fuse as fuse_mesh
     from warpgs.pipeline.films.film import render_path
-    from warpgs.pipeline.metrics.evaluate import ViewMetrics, evaluate
-    from warpgs.pipeline.model.model_file import Model, load, save
-    from warpgs.pipeline.runs.fit import FitResult, fit
-    from warpgs.pipeline.runs.folder import StoredRun, open_run
-    from warpgs.pipeline.train.config import FitConfig
+    from warpgs.pipeline.metrics.scores import ViewMetrics, evaluate
+    from warpgs.pipeline.model.table import Model, load, save
+    from warpgs.pipeline.run.fit import FitResult, fit
+    from warpgs.pipeline.run.folder import StoredRun, open_run
     from warpgs.pipeline.train.loss import LossTerm
     from warpgs.pipeline.train.presets import PRESETS
-    from warpgs.pipeline.train.step_report import StepReport
+    from warpgs.pipeline.train.schedule import StepReport
+    from warpgs.pipeline.train.settings import FitConfig
     from warpgs.pipeline.train.strategies.base import Strategy
-    from warpgs.pipeline.train.view_modules.base import ViewModule
+    from warpgs.pipeline.train.view_modules import ViewModule
     from warpgs.render.graphed import clear_graph_cache
     from warpgs.render.options import RasterizeOptions
-    from warpgs.render.rasterize import rasterize
-    from warpgs.render.select_rule import select_rule
-    from warpgs.rules import rule_named
+    from warpgs.render.rasterize import rasterize, select_rule
     from warpgs.scene import (
         ActivatedGaussians,
         Camera,
@@ -120,24 +118,24 @@ else:
         ("warpgs.export.ply", "read_ply", "write_ply"),
         ("warpgs.geometry", "depth_normals", "gaussian_normals", "look_at"),
         ("warpgs.io.load", "load_scene"),
-        ("warpgs.io.readers", "Reader"),
+        ("warpgs.io.folder", "Reader"),
         ("warpgs.mesh.fuse", "MeshOptions", "fuse as fuse_mesh"),
         ("warpgs.pipeline.films.film", "render_path"),
-        ("warpgs.pipeline.metrics.evaluate", "ViewMetrics", "evaluate"),
-        ("warpgs.pipeline.model.model_file", "Model", "load", "save"),
-        ("warpgs.pipeline.runs.fit", "FitResult", "fit"),
-        ("warpgs.pipeline.runs.folder", "StoredRun", "open_run"),
-        ("warpgs.pipeline.train.config", "FitConfig"),
+        ("warpgs.pipeline.metrics.scores", "ViewMetrics", "evaluate"),
+        ("warpgs.pipeline.model.table", "Model", "load", "save"),
+        ("warpgs.pipeline.run.fit", "FitResult", "fit"),
+        ("warpgs.pipeline.run.folder", "StoredRun", "open_run"),
+        ("warpgs.pipeline.train.settings", "FitConfig"),
         ("warpgs.pipeline.train.loss", "LossTerm"),
         ("warpgs.pipeline.train.presets", "PRESETS"),
-        ("warpgs.pipeline.train.step_report", "StepReport"),
+        ("warpgs.pipeline.train.schedule", "StepReport"),
         ("warpgs.pipeline.train.strategies.base", "Strategy"),
-        ("warpgs.pipeline.train.view_modules.base", "ViewModule"),
+        ("warpgs.pipeline.train.view_modules", "ViewModule"),
         ("warpgs.render.graphed", "clear_graph_cache"),
         ("warpgs.render.options", "RasterizeOptions"),
         ("warpgs.render.rasterize", "rasterize"),
-        ("warpgs.render.select_rule", "select_rule"),
-        ("warpgs.rules", "rule_named"),
+        ("warpgs.render.rasterize", "select_rule"),
+        ("warpgs.constants", "rule_named"),
         ("warpgs.scene", "ActivatedGaussians", "Camera", "CovarianceGaussians", "Gaussians", "GivenDepth"),
         ("warpgs.scene", "Normalization", "PointCloud", "Render", "Scene", "View"),
         ("warpgs.synthetic.demo", "write_demo"),

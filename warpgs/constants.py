@@ -1,4 +1,4 @@
-"""Cut-offs and limits of rendering with their derivations, and rules: named sets of cut-offs."""
+"""Numbers of the rasterizer, and the rules that choose among them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass
 from numbers import Real
 
-from warpgs.errors import UsageError
-from warpgs.field_docs import document_fields
+from warpgs.errors import UsageError, document_fields
 
 ALPHA_CUT = 1.0 / 255.0
 """Smallest alpha that is blended: one step of an 8-bit channel (renderer of Kerbl et al. 2023)."""
@@ -139,3 +138,17 @@ RULES = {
     "inria": Rule("inria", inclusive_stop=False, near=0.2, square_sigma=3.0),
 }
 """Rules by name."""
+
+
+def rule_named(name: str) -> Rule:
+    """Return the rule of a name.
+
+    Raises:
+        UsageError: The name is unknown.
+    """
+    if name in RULES:
+        return RULES[name]
+    versions = [known for known in RULES if known.startswith(f"{name}-")]
+    if versions:
+        raise UsageError(f"rule {name!r} needs a version, because its cut-offs changed: choose {' or '.join(versions)}")
+    raise UsageError(f"unknown rule {name!r}: choose one of {', '.join(RULES)}")

@@ -1,22 +1,191 @@
-"""Geometry: rotations, logit, projection and back-projection of points, the extent and focus of a set of cameras.
-
-Functions that take tensors import torch when they are called, so that readers of scenes need not load it.
-"""
+"""Geometry of cameras and Gaussians: poses, rotations, lenses, and the units of a scene and its files."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpgs import lenses
-from warpgs.errors import UsageError
-from warpgs.scene import ActivatedGaussians, Camera, Gaussians
+from warpgs.errors import DataError, UsageError
+from warpgs.scene import ActivatedGaussians, Camera, Gaussians, Mesh, Normalization
 
 if TYPE_CHECKING:
     import torch
+
+    from warpgs.scene import Array
+
+
+# Camera models outside of the kernels: from positions in camera axes to the image plane and back, for arrays or
+# tensors.
+#
+# The image plane holds points (u, v) that K takes to pixels: x / z and y / z for a pinhole. The kernels have their own
+# formulas.
+
+MODELS = ("pinhole", "orthographic", "opencv", "fisheye")
+"""Camera models that are known here."""
+CENTRAL = ("pinhole", "opencv", "fisheye")
+"""Camera models with a centre of projection, which a pinhole of the same K can replace."""
+NEWTON_STEPS = 30
+"""Steps of Newton's method to invert the distortion. Five reach float64's precision for usual lenses. For a fisheye, a step
+that leaves the bracket is replaced by a bisection."""
+
+
+def check_known(model: str) -> None:
+    """Check that a camera model is known here.
+
+    Raises:
+        UsageError: Only the kernels support the model.
+    """
+    if model not in MODELS:
+        raise UsageError(
+            f"outside the rasterizer only the camera models {', '.join(MODELS)} are supported, not {model!r}; undistort the "
+            "images first"
+        )
+
+
+def _library(array: Array) -> Any:
+    """Return the library of the array, numpy or torch."""
+    if isinstance(array, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def depth_of(model: str, positions: Array) -> Array:
+    """Return the depths [...] [u] of positions in the camera [..., 3], as in renders: distance for a fisheye, else z."""
+    if model == "fisheye":
+        depth: Array = (positions**2).sum(-1) ** 0.5
+        return depth
+    return positions[..., 2]
+
+
+def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
+    """Return the points in the image plane [..., 2] of positions in the camera [..., 3].
+
+    Points behind a pinhole or beyond the rim of a lens are meaningless: see `on_lens`.
+
+    Raises:
+        UsageError: The model is unknown here.
+    """
+    check_known(model)
+    library, x, y, z = _library(positions), *(positions[..., i] for i in range(3))
+    if model == "orthographic":
+        return library.stack([x, y], -1)
+    if model == "fisheye":
+        r = library.hypot(x, y)
+        angle = library.arctan2(r, z)
+        scale = _bent(angle, distortion)[0] / library.where(r > 0, r, 1)
+        scale = library.where(r > 0, scale, 1 / library.where(z == 0, 1, z))
+        return library.stack([x * scale, y * scale], -1)
+    a, b = x / z, y / z
+    return library.stack(_distorted(a, b, distortion)[:2] if model == "opencv" else (a, b), -1)
+
+
+def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
+    """Return the positions at depth 1 (`depth_of`) that project to points of the image plane; NaN for points off the lens.
+
+    Shapes are [..., 2] for points and [..., 3] for positions. For an orthographic camera the result is (u, v, 1); positions
+    (u, v, z) of all other depths share that point.
+
+    Raises:
+        UsageError: The model is unknown here.
+    """
+    check_known(model)
+    library, u, v = _library(points), points[..., 0], points[..., 1]
+    if model == "fisheye":
+        radius = library.hypot(u, v)
+        low, high = 0 * radius, 0 * radius + _rim(distortion)
+        angle = library.where(radius < high, radius, high)
+        for _ in range(NEWTON_STEPS):
+            value, slope = _bent(angle, distortion)
+            low, high = library.where(value < radius, angle, low), library.where(value < radius, high, angle)
+            angle = angle - (value - radius) / library.where(slope > 0, slope, 1)
+            angle = library.where((angle > low) & (angle < high), angle, 0.5 * (low + high))
+        scale = library.where(radius > 0, library.sin(angle) / library.where(radius > 0, radius, 1), 1)
+        found = library.stack([u * scale, v * scale, library.cos(angle)], -1)
+    elif model == "opencv":
+        a, b = u, v
+        for _ in range(NEWTON_STEPS):
+            du, dv, aa, ab, bb, _ = _distorted(a, b, distortion)
+            determinant = aa * bb - ab * ab
+            determinant = library.where(determinant == 0, 1, determinant)
+            a, b = a - (bb * (du - u) - ab * (dv - v)) / determinant, b - (aa * (dv - v) - ab * (du - u)) / determinant
+        found = library.stack([a, b, library.ones_like(a)], -1)
+    else:
+        return library.stack([u, v, library.ones_like(u)], -1)
+    back = to_plane(model, distortion, found)
+    missed = ~(library.hypot(back[..., 0] - u, back[..., 1] - v) <= 1e-4) | ~on_lens(model, distortion, found)
+    return library.where(missed[..., None], np.nan, found)
+
+
+def on_lens(model: str, distortion: Array | None, positions: Array, samples: int = 64) -> Array:
+    """Return a mask [...], True where the lens is not folded between its axis and positions in the camera [..., 3].
+
+    The lens is tested at ``samples`` points along the way. Positions behind a pinhole or opencv camera count as folded;
+    positions in an orthographic camera never do.
+    """
+    library, z = _library(positions), positions[..., 2]
+    if model == "orthographic":
+        return z > -np.inf
+    if model == "fisheye":
+        angle = library.arctan2(library.hypot(positions[..., 0], positions[..., 1]), z)
+        good = angle < np.pi
+        for i in range(samples):
+            good = good & (_bent(angle * ((i + 1) / samples), distortion)[1] > 0)
+        return good
+    good = z > 0
+    if model == "opencv":
+        a, b = (positions[..., i] / library.where(good, z, 1) for i in range(2))
+        for i in range(samples):
+            part = (i + 1) / samples
+            s = (part / (1 + (1 - part) * (a * a + b * b))) ** 0.5  # evenly spaced in the squared sine of the angle
+            _, _, aa, ab, bb, denominator = _distorted(s * a, s * b, distortion)
+            good = good & (denominator > 0) & (aa + bb > 0) & (aa * bb - ab * ab > 0)
+    return good
+
+
+def _rim(distortion: Array) -> float:
+    """Return the angle [rad] at which a fisheye folds back, at most pi."""
+    angles = np.linspace(0, np.pi, 4097)[1:]
+    folded = angles[_bent(angles, [float(k) for k in distortion])[1] <= 0]
+    return float(folded[0]) if len(folded) else math.pi
+
+
+def _bent(angle: Array, distortion: Sequence[float] | Array) -> tuple[Array, Array]:
+    """Return the radius in the image plane at an angle [rad] from a fisheye's axis, and its derivative."""
+    t, value, slope = angle * angle, 1.0, 1.0
+    powers = t
+    for i in range(4):
+        value, slope = value + distortion[i] * powers, slope + (2 * i + 3) * distortion[i] * powers
+        powers = powers * t
+    return angle * value, slope
+
+
+def _distorted(a: Array, b: Array, distortion: Array) -> tuple[Array, ...]:
+    """Return the distorted point of (a, b), the three entries of its symmetric Jacobian, and the radial denominator."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (distortion[i] for i in range(8))
+    t = a * a + b * b
+    numerator, denominator = 1 + t * (k1 + t * (k2 + t * k3)), 1 + t * (k4 + t * (k5 + t * k6))
+    radial = numerator / denominator
+    first = (k1 + t * (2 * k2 + 3 * t * k3) - radial * (k4 + t * (2 * k5 + 3 * t * k6))) / denominator
+    return (
+        a * radial + 2 * p1 * a * b + p2 * (t + 2 * a * a),
+        b * radial + p1 * (t + 2 * b * b) + 2 * p2 * a * b,
+        radial + 2 * a * a * first + 2 * p1 * b + 6 * p2 * a,
+        2 * (a * b * first + p1 * a + p2 * b),
+        radial + 2 * b * b * first + 6 * p1 * b + 2 * p2 * a,
+        denominator,
+    )
+
+
+# Geometry: rotations, logit, projection and back-projection of points, the extent and focus of a set of cameras.
+#
+# Functions that take tensors import torch when they are called, so that readers of scenes need not load it.
 
 
 def logit(probability: float) -> float:
@@ -77,7 +246,7 @@ def pinhole_of(camera: Camera) -> Camera:
     Raises:
         UsageError: The camera is orthographic, or its model is only supported by the kernels.
     """
-    if camera.model not in lenses.CENTRAL:
+    if camera.model not in CENTRAL:
         check_pinhole(camera)
     return replace(camera, model="pinhole", distortion=None) if camera.model != "pinhole" else camera
 
@@ -132,10 +301,10 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
     z = in_camera[:, 2]
     if camera.model != "pinhole":
         with np.errstate(all="ignore"):
-            plane = lenses.to_plane(camera.model, camera.distortion, in_camera)
-            seen = np.isfinite(plane).all(1) & lenses.on_lens(camera.model, camera.distortion, in_camera)
+            plane = to_plane(camera.model, camera.distortion, in_camera)
+            seen = np.isfinite(plane).all(1) & on_lens(camera.model, camera.distortion, in_camera)
         plane = np.where(seen[:, None], plane, 0) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
-        return plane, np.where(seen, lenses.depth_of(camera.model, in_camera), 0)
+        return plane, np.where(seen, depth_of(camera.model, in_camera), 0)
     safe = np.where(z == 0, np.finfo(float).tiny, z)
     pixels = matmul(in_camera / safe[:, None], camera.K.T)
     return pixels[:, :2], z
@@ -154,7 +323,7 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
         in_camera = depths[:, None] * matmul(homogeneous, inverse(camera.K).T)
     else:
         plane = (pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
-        in_camera = _at_depth(camera, lenses.from_plane(camera.model, camera.distortion, plane), depths)
+        in_camera = _at_depth(camera, from_plane(camera.model, camera.distortion, plane), depths)
     return matmul(in_camera - camera.viewmat[:3, 3], camera.viewmat[:3, :3])
 
 
@@ -182,7 +351,7 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
         in_camera = torch.stack([x, y, depths], 1)
     else:
         plane = torch.stack([(pixels[:, i] - K[i, 2]) / K[i, i] for i in range(2)], 1)
-        in_camera = _at_depth(camera, lenses.from_plane(camera.model, camera.distortion, plane), depths)
+        in_camera = _at_depth(camera, from_plane(camera.model, camera.distortion, plane), depths)
     return ((in_camera - viewmat[:3, 3])[:, :, None] * viewmat[:3, :3]).sum(1)
 
 
@@ -202,8 +371,8 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
 
     K, viewmat = camera.K, camera.viewmat
     in_camera = (points[:, None] * viewmat[:3, :3]).sum(2) + viewmat[:3, 3]
-    seen, depth = lenses.on_lens(camera.model, camera.distortion, in_camera), lenses.depth_of(camera.model, in_camera)
-    plane = lenses.to_plane(camera.model, camera.distortion, torch.where(seen[:, None], in_camera, torch.ones_like(in_camera)))
+    seen, depth = on_lens(camera.model, camera.distortion, in_camera), depth_of(camera.model, in_camera)
+    plane = to_plane(camera.model, camera.distortion, torch.where(seen[:, None], in_camera, torch.ones_like(in_camera)))
     pixels = torch.stack([K[i, i] * plane[:, i] + K[i, 2] for i in range(2)], 1)
     return pixels, torch.where(seen, depth, 0)
 
@@ -336,3 +505,153 @@ def look_at(center: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     viewmat[:3, :3] = rotation
     viewmat[:3, 3] = -matmul(rotation, center)
     return viewmat
+
+
+# The two systems of units that Gaussians and cameras come in, and the similarity between them.
+#
+# ``scene`` units [u] are those of a `Scene` that `load_scene` returned: recentred and rescaled, as the fit sees it.
+# ``file`` units are those of the scene's own files and of a run's PLY files. `Normalization` holds the similarity from
+# file to scene units: ``x_scene = scale * (x_file - offset)``.
+
+UNITS = ("scene", "file")
+SH_COUNTS = (1, 4, 9, 16, 25)
+"""Numbers of spherical-harmonics coefficients that Gaussians may have."""
+
+
+def check_units(units: str) -> None:
+    """Check that ``units`` names one of the two systems.
+
+    Raises:
+        UsageError: ``units`` is not one of `UNITS`.
+    """
+    if units not in UNITS:
+        raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
+
+
+def checked_normalization(normalization: Normalization | None, units: str, where: str) -> Normalization:
+    """Check and return ``normalization``; with file units, None becomes the identity.
+
+    Args:
+        normalization: Similarity from file to scene units, or None.
+        units: Units of the Gaussians: scene or file.
+        where: Beginning of messages, such as the path of a file.
+
+    Raises:
+        DataError: The normalization is not finite, or its scale is not above 0.
+        UsageError: The units are unknown, or scene units are given without a normalization.
+    """
+    check_units(units)
+    if normalization is None:
+        if units == "scene":
+            raise UsageError(
+                f"{where}: units='scene' requires normalization=scene.normalization; give it, or units='file' "
+                "for Gaussians without a scene"
+            )
+        return Normalization()
+    scale, offset = normalization.scale, np.asarray(normalization.offset)
+    if not (math.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
+        raise DataError(f"{where}: the scene's normalization is not a similarity: {normalization}. Read the scene again")
+    return normalization
+
+
+def check_stored(gaussians: object) -> None:
+    """Check that Gaussians have log scales and logits, as in files, and tensors of matching shapes.
+
+    Raises:
+        TypeError: The Gaussians have other parameters, or a parameter is not a tensor.
+        ValueError: A shape disagrees.
+    """
+    if not isinstance(gaussians, Gaussians):
+        how = "give gaussians.stored()" if hasattr(gaussians, "stored") else "files hold quats, log scales and logits"
+        raise TypeError(f"gaussians must be an instance of Gaussians, not {type(gaussians).__name__}; {how}")
+    for name, tensor in gaussians.tensors().items():
+        if not hasattr(tensor, "detach"):
+            raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
+    count = gaussians.means.shape[0] if gaussians.means.ndim else 0
+    for name, rest in {"means": [3], "quats": [4], "log_scales": [3], "logit_opacities": []}.items():
+        if (found := list(getattr(gaussians, name).shape)) != [count, *rest]:
+            raise ValueError(f"{name} must have shape [{', '.join(map(str, ['N', *rest]))}] (N={count}), not {found}")
+    found = list(gaussians.sh.shape)
+    if len(found) != 3 or found[1] not in SH_COUNTS or found != [count, found[1], 3]:
+        raise ValueError(f"sh must have shape [N, K, 3] (N={count}), where K is 1, 4, 9, 16 or 25, not {found}")
+
+
+def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
+    """Return Gaussians in other units; tensors that do not change are shared.
+
+    Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
+    Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.
+
+    Args:
+        gaussians: N Gaussians in the units ``source``, on any device.
+        normalization: Similarity from file to scene units.
+        source: Units of the input: scene or file.
+        target: Units of the result: scene or file.
+
+    Raises:
+        TypeError: The Gaussians are given by other parameters.
+        UsageError: A name of units is unknown.
+        ValueError: A shape disagrees.
+    """
+    check_stored(gaussians)
+    check_units(source)
+    check_units(target)
+    if source == target:
+        return gaussians
+    means, log_scales = gaussians.means.double(), gaussians.log_scales.double()
+    offset = means.new_tensor(np.asarray(normalization.offset, np.float64))
+    if target == "file":
+        means, log_scales = means / normalization.scale + offset, log_scales - math.log(normalization.scale)
+    else:
+        means, log_scales = normalization.scale * (means - offset), log_scales + math.log(normalization.scale)
+    kind = gaussians.means.dtype
+    return dataclasses.replace(gaussians, means=means.to(kind), log_scales=log_scales.to(kind))
+
+
+def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: str) -> Mesh:
+    """Return a mesh in other units: its vertices change, triangles and colours are shared.
+
+    Args:
+        mesh: The mesh in the units ``source``.
+        normalization: Similarity from file to scene units.
+        source: Units of the input: scene or file.
+        target: Units of the result: scene or file.
+
+    Raises:
+        UsageError: A name of units is unknown.
+    """
+    check_units(source)
+    check_units(target)
+    if source == target:
+        return mesh
+    scale, offset = normalization.scale, np.asarray(normalization.offset, np.float64)
+    vertices = mesh.vertices / scale + offset if target == "file" else scale * (mesh.vertices - offset)
+    return dataclasses.replace(mesh, vertices=vertices)
+
+
+def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:
+    """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not.
+
+    Args:
+        camera: One camera or a batch, with numpy arrays or torch tensors.
+        normalization: Similarity from file to scene units.
+        source: Units of the input: scene or file.
+        target: Units of the result: scene or file.
+
+    Raises:
+        UsageError: A name of units is unknown.
+    """
+    check_units(source)
+    check_units(target)
+    if source == target:
+        return camera
+    viewmat: Any = camera.viewmat.copy() if isinstance(camera.viewmat, np.ndarray) else camera.viewmat.clone()
+    offset: Any = np.asarray(normalization.offset, np.float64)
+    if not isinstance(viewmat, np.ndarray):
+        offset = viewmat.new_tensor(offset)
+    rotation, translation = viewmat[..., :3, :3], viewmat[..., :3, 3]
+    if target == "file":
+        viewmat[..., :3, 3] = translation / normalization.scale - rotation @ offset
+    else:
+        viewmat[..., :3, 3] = normalization.scale * (rotation @ offset + translation)
+    return dataclasses.replace(camera, viewmat=viewmat)

@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import ClassVar, Generic, Protocol, TypeVar
 
 from warpgs.errors import UsageError
-from warpgs.input_files import input_digest
+from warpgs.files import input_digest
 
 
 class Named(Protocol):

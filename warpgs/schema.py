@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from warpgs.input_files import read_input
+from warpgs.files import read_input
 
 MAX_BYTES = 2**25
 """Size of the largest text that is read [bytes]; config.json of a thousand views takes one MiB."""

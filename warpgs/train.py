@@ -46,50 +46,46 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from warpgs.device import STEP, Needs, StepSizes
     from warpgs.kernels.ssim import ssim
-    from warpgs.kernels.step_buffers import Setting
-    from warpgs.pipeline.model.init import InitConfig
+    from warpgs.kernels.update import Setting
+    from warpgs.pipeline.model.start import InitConfig
     from warpgs.pipeline.model.table import Column, DensityUpdate, Table
-    from warpgs.pipeline.train.context import Growth, Settings, StrategyContext
-    from warpgs.pipeline.train.learned_views import LearnedView
-    from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, total
+    from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, photometric_loss, total
     from warpgs.pipeline.train.loss import register as register_loss_term
-    from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
-    from warpgs.pipeline.train.memory_plan import most_instances
+    from warpgs.pipeline.train.memory import most_instances
     from warpgs.pipeline.train.schedule import OptimizerConfig, Phases
     from warpgs.pipeline.train.step import captured_renderer, eager_renderer
-    from warpgs.pipeline.train.strategies.base import Strategy
+    from warpgs.pipeline.train.strategies.base import Growth, Settings, Strategy, StrategyContext
     from warpgs.pipeline.train.strategies.base import register as register_strategy
-    from warpgs.pipeline.train.strategies.clone_split import CloneSplit
-    from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
-    from warpgs.pipeline.train.view_modules.base import FittedViews, Tensors, ViewModule
-    from warpgs.pipeline.train.view_modules.base import register as register_view_module
-    from warpgs.pipeline.train.views import TrainingView
-    from warpgs.runtime.ranks import join as join_ranks
-    from warpgs.runtime.step_sizes import STEP, Needs, StepSizes
+    from warpgs.pipeline.train.strategies.clone_split import CloneSplit, GradientGrowth
+    from warpgs.pipeline.train.view_modules import FittedViews, Tensors, ViewModule
+    from warpgs.pipeline.train.view_modules import register as register_view_module
+    from warpgs.pipeline.train.views import LearnedView, TrainingView
+    from warpgs.ranks import join as join_ranks
     from warpgs.scene import Prior
     from warpgs.schema import fields as state_schema
 else:
     __getattr__, __dir__ = lazy(
         __name__,
         ("warpgs.kernels.ssim", "ssim"),
-        ("warpgs.kernels.step_buffers", "Setting"),
-        ("warpgs.pipeline.model.init", "InitConfig"),
+        ("warpgs.kernels.update", "Setting"),
+        ("warpgs.pipeline.model.start", "InitConfig"),
         ("warpgs.pipeline.model.table", "Column", "DensityUpdate", "Table"),
-        ("warpgs.pipeline.train.context", "Growth", "Settings", "StrategyContext"),
-        ("warpgs.pipeline.train.learned_views", "LearnedView"),
+        ("warpgs.pipeline.train.strategies.base", "Growth", "Settings", "StrategyContext"),
+        ("warpgs.pipeline.train.views", "LearnedView"),
         ("warpgs.pipeline.train.loss", "LossInputs", "LossTerm", "Target", "register as register_loss_term", "total"),
-        ("warpgs.pipeline.train.loss_terms.photometric", "photometric_loss"),
-        ("warpgs.pipeline.train.memory_plan", "most_instances"),
+        ("warpgs.pipeline.train.loss", "photometric_loss"),
+        ("warpgs.pipeline.train.memory", "most_instances"),
         ("warpgs.pipeline.train.schedule", "OptimizerConfig", "Phases"),
         ("warpgs.pipeline.train.step", "captured_renderer", "eager_renderer"),
         ("warpgs.pipeline.train.strategies.base", "Strategy", "register as register_strategy"),
         ("warpgs.pipeline.train.strategies.clone_split", "CloneSplit"),
-        ("warpgs.pipeline.train.strategies.gradient_growth", "GradientGrowth"),
-        ("warpgs.pipeline.train.view_modules.base", "FittedViews", "Tensors", "ViewModule", "register as register_view_module"),
+        ("warpgs.pipeline.train.strategies.clone_split", "GradientGrowth"),
+        ("warpgs.pipeline.train.view_modules", "FittedViews", "Tensors", "ViewModule", "register as register_view_module"),
         ("warpgs.pipeline.train.views", "TrainingView"),
-        ("warpgs.runtime.ranks", "join as join_ranks"),
-        ("warpgs.runtime.step_sizes", "STEP", "Needs", "StepSizes"),
+        ("warpgs.ranks", "join as join_ranks"),
+        ("warpgs.device", "STEP", "Needs", "StepSizes"),
         ("warpgs.scene", "Prior"),
         ("warpgs.schema", "fields as state_schema"),
     )

@@ -24,16 +24,12 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from warpgs.pipeline.farm.engine import Engine
-from warpgs.pipeline.farm.farm import JobStatus, run_farm
-from warpgs.pipeline.farm.job import FarmJob
-from warpgs.pipeline.farm.local import LocalEngine, Slot
-from warpgs.pipeline.farm.record import LOG, PLY, file_digest
-from warpgs.pipeline.farm.run import EngineRequest, make_engine
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.device import usable_cores
+from warpgs.pipeline.farm.farm import EngineRequest, JobStatus, LocalEngine, Slot, make_engine, run_farm
+from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, file_digest
+from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.runtime.processor import usable_cores
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 VIEWS, WIDTH, HEIGHT = 8, 126, 94

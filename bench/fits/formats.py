@@ -14,15 +14,13 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
-from warpgs.coordinates import convert_gaussians
 from warpgs.export import spz
-from warpgs.export.arrays import arrays_of
-from warpgs.export.formats import read_gaussians, suffixes
-from warpgs.pipeline.runs.commands import scene_of
-from warpgs.pipeline.runs.export_filters import Filters
-from warpgs.pipeline.runs.export_model import export
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.results import evaluate_run
+from warpgs.export.base import arrays_of, read_gaussians, suffixes
+from warpgs.geometry import convert_gaussians
+from warpgs.pipeline.run.commands import scene_of
+from warpgs.pipeline.run.export import Filters, export
+from warpgs.pipeline.run.folder import open_run
+from warpgs.pipeline.run.results import evaluate_run
 from warpgs.scene import Gaussians
 
 WHAT = "file size, and loss of PSNR on held-out views, of each file format"

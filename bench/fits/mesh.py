@@ -20,11 +20,11 @@ from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.surfaces import distance_to, distance_to_mesh, sample, summary, true_depth, true_points
 from bench.lib.tables import named
-from warpgs.coordinates import convert_mesh
+from warpgs.geometry import convert_mesh
 from warpgs.mesh.fuse import MeshOptions, fuse
-from warpgs.mesh.surface_views import surface_view
-from warpgs.pipeline.model.model_file import FittedModel
-from warpgs.pipeline.runs.folder import open_run
+from warpgs.mesh.views import surface_view
+from warpgs.pipeline.model.table import FittedModel
+from warpgs.pipeline.run.folder import open_run
 from warpgs.synthetic import raycast
 from warpgs.synthetic.demo import still_life
 

@@ -25,11 +25,11 @@ from bench.lib.backgrounds import over, ply_scores
 from bench.lib.one_fit import compile_all, config_of, figures_of
 from bench.lib.pool import measure_all
 from bench.lib.tables import markdown
-from warpgs.pipeline.metrics.evaluate import summarize
-from warpgs.pipeline.model.compress import drop_unused_sh
-from warpgs.pipeline.runs.request import SceneRequest, choose_device
+from warpgs.pipeline.metrics.scores import summarize
+from warpgs.pipeline.model.edit import drop_unused_sh
+from warpgs.pipeline.run.request import SceneRequest, choose_device
 from warpgs.scene import Gaussians
-from warpgs.synthetic.cut_out import FORMATS, write_object
+from warpgs.synthetic.demo import FORMATS, write_object
 
 WHAT = "fits of synthetic objects with true alpha: held-out PSNR over white, mean rendered alpha, and the PLY over backgrounds"
 SCORES = ("psnr_white", "psnr_foreground", "ssim_white", "alpha_empty", "alpha_object", "ply_black", "ply_white", "ply_pattern")

@@ -26,8 +26,8 @@ from bench.lib.pool import measure_all
 from bench.lib.preset_table import tables
 from bench.lib.scenes import ROWS, Row, made, row_of, scene_at, shrunk
 from warpgs.errors import UsageError, WarpgsError
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.by_views import steps_by_views
+from warpgs.pipeline.run.request import choose_device
+from warpgs.pipeline.train.settings import steps_by_views
 
 WHAT = "scores, sizes and times of fits by row, preset and seed"
 

@@ -25,15 +25,15 @@ from bench.lib.inputs import garden_inputs
 from bench.lib.same_bits import digest
 from bench.lib.training import Trainer, make_trainer, set_gaussians, state_tensors
 from warpgs import load_scene
-from warpgs.io.splits import split_views
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.loop import train_views
+from warpgs.io.load import split_views
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.request import choose_device
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import train_views
+from warpgs.ranks import Ranks, join
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
-from warpgs.runtime.ranks import Ranks, join
 from warpgs.scene import Camera, PointCloud, View
 
 SERIES = 10

@@ -25,7 +25,7 @@ from bench.lib.pool import measure_all
 from bench.lib.preset_table import means_table
 from bench.lib.scenes import Row, made, row_of, shrunk
 from warpgs.errors import UsageError, WarpgsError
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.pipeline.run.request import choose_device
 
 LEFT_OUT = 2
 """Number of training views that are left out at once if there are more than four; else each is left out in turn."""

@@ -22,8 +22,8 @@ import warp
 from bench.lib import result_file
 from bench.lib.arguments import parse
 from bench.lib.same_bits import RESULTS, differing, placed, stages
-from warpgs.kernels.compiler import EXACT, ROLLED
-from warpgs.runtime.interop import set_threads
+from warpgs.kernels.launch import set_threads
+from warpgs.kernels.native import EXACT, ROLLED
 
 WHAT = "SHA-256, first 12 digits, of every stage from photographs to the PLY of a fit, and of single library functions"
 AVX2 = {

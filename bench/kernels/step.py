@@ -16,14 +16,14 @@ from bench.lib.timing import measure
 from bench.lib.training import Trainer, make_trainer, one_step, step_parts
 from warpgs import load_scene
 from warpgs.constants import RULES
-from warpgs.io.splits import split_views
+from warpgs.io.load import split_views
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.request import choose_device
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.request import choose_device
+from warpgs.pipeline.train.loss import photometric_loss
+from warpgs.pipeline.train.settings import FitConfig
 
 
 def stages(trainer: Trainer) -> tuple[list[dict], int]:

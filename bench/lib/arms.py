@@ -8,7 +8,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.by_views import OPAQUE_STEPS
+from warpgs.pipeline.train.settings import OPAQUE_STEPS
 
 ONE_RULE = "background=auto,sh_degree=null,init.source=sweep,init.merge_px=8,init.fill_px=32"
 """Start, background and degree of `default`, without its extrapolated points; the degree follows from the number of views."""

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 import warpgs
-from warpgs.pipeline.metrics.evaluate import to_8_bit
-from warpgs.pipeline.metrics.psnr import psnr
+from warpgs.pipeline.metrics.scores import psnr, to_8_bit
 from warpgs.scene import Gaussians, View
 
 SQUARE = 12

@@ -15,11 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from warpgs.colors import C0
 from warpgs.errors import UsageError
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import ssim
-from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
+from warpgs.scene import C0, Camera, Gaussians, Normalization, Scene, View
 
 BLACK = (0.0, 0.0, 0.0)
 EDGE = 5

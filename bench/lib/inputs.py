@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from warpgs.colors import C0
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import C0, Camera, Gaussians
 
 
 def gaussians(count: int, device: torch.device, degree: int = 3) -> Gaussians:

@@ -10,9 +10,9 @@ import warp as wp
 from torch.autograd.function import once_differentiable
 
 from warpgs.constants import RULES
+from warpgs.kernels import launch
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles, grid
-from warpgs.runtime import interop
 from warpgs.scene import Camera, Gaussians
 
 
@@ -140,28 +140,28 @@ class Naive:
         ends = torch.empty(self.pixels, dtype=torch.int32, device=projected.device)
         columns, rows = grid(width, height, tiles.size)
         self.inputs = [
-            interop.view(self.projected.view(-1, 12), wp.float32), interop.view(tiles.ranges, wp.int32),
-            interop.view(tiles.gaussian_ids, wp.int32), interop.view(black, wp.float32), width, height, columns,
+            launch.view(self.projected.view(-1, 12), wp.float32), launch.view(tiles.ranges, wp.int32),
+            launch.view(tiles.gaussian_ids, wp.int32), launch.view(black, wp.float32), width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
         self.stop, self.kept = rule.transmittance_stop, [black, transmittances, ends]
-        self.state = [interop.view(transmittances, wp.float32), interop.view(ends, wp.int32)]
+        self.state = [launch.view(transmittances, wp.float32), launch.view(ends, wp.int32)]
 
     def _launch(self, kernel, inputs: list) -> None:
-        inputs = [a.array() if isinstance(a, interop.View) else a for a in inputs]
-        with interop.stream_of(self.rgb.device):
+        inputs = [a.array() if isinstance(a, launch.View) else a for a in inputs]
+        with launch.stream_of(self.rgb.device):
             wp.launch(kernel, self.pixels, inputs=inputs, device=self.device, record_tape=False)
 
     def forward(self) -> torch.Tensor:
         """Return the image, shape [C, H, W, 3]."""
-        outputs = [interop.view(self.rgb.view(-1, 3), wp.float32), *self.state]
+        outputs = [launch.view(self.rgb.view(-1, 3), wp.float32), *self.state]
         self._launch(forward_kernel(), [*self.inputs, self.stop, *outputs])
         return self.rgb
 
     def backward(self, v_rgb: torch.Tensor) -> torch.Tensor:
         """Return the gradient of the records for an upstream gradient, shape [C, N, 12]; call `forward` first."""
         self.v_projected.zero_()
-        arrays = [interop.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
+        arrays = [launch.view(t.view(-1, t.shape[-1]), wp.float32) for t in (v_rgb.contiguous(), self.v_projected)]
         self._launch(backward_kernel(), [*self.inputs, *self.state, *arrays])
         return self.v_projected
 

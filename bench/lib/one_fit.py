@@ -20,15 +20,14 @@ from bench.lib import gsplat_trainer
 from bench.lib.scenes import folds, scene_at
 from bench.lib.training import full_bytes, make_trainer
 from warpgs.errors import UsageError
-from warpgs.io.splits import split_views
-from warpgs.pipeline.metrics.evaluate import score
-from warpgs.pipeline.runs.precompile import precompile_kernels
-from warpgs.pipeline.runs.prune import prune
-from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.train.background import mean_color
-from warpgs.pipeline.train.by_views import DEGREES
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.io.load import split_views
+from warpgs.pipeline.metrics.scores import score
+from warpgs.pipeline.run.commands import prune
+from warpgs.pipeline.run.precompile import precompile_kernels
+from warpgs.pipeline.run.request import SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.schedule import mean_color
+from warpgs.pipeline.train.settings import DEGREES, FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.plugins import flag_group
 from warpgs.scene import Scene, View

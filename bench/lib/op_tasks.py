@@ -17,25 +17,16 @@ from bench.lib.points import Point
 from bench.lib.timing import OURS, Task, passes
 from warpgs import rasterize
 from warpgs.constants import RULES
-from warpgs.kernels.adam import adam_step
-from warpgs.kernels.blend import blend
-from warpgs.kernels.blend_channels import blend_channels
-from warpgs.kernels.camera_reach import camera_reach
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.heaviest import heaviest
-from warpgs.kernels.knn import mean_square_distances
-from warpgs.kernels.median_depth import median_depth
-from warpgs.kernels.opacity_decay import opacity_decay
-from warpgs.kernels.pixel_size import pixel_size
-from warpgs.kernels.plane_costs import plane_costs
-from warpgs.kernels.plane_depths import best_inverses
+from warpgs.kernels.blend import blend, blend_channels
+from warpgs.kernels.neighbours import camera_reach, mean_square_distances, pixel_size
 from warpgs.kernels.project import project
-from warpgs.kernels.scanlines import scanline_costs
 from warpgs.kernels.ssim import ssim
-from warpgs.kernels.step_buffers import Setting, begin_step, end_step
+from warpgs.kernels.sweep import best_inverses, plane_costs, scanline_costs
 from warpgs.kernels.tiles import bin_tiles
 from warpgs.kernels.tsdf import empty_grid, integrate
-from warpgs.priors.sweep_planes import UNIT, step_limits
+from warpgs.kernels.update import Setting, adam_step, begin_step, end_step, opacity_decay, opacity_dropout
+from warpgs.kernels.walk import heaviest, median_depth
+from warpgs.priors.sweep import UNIT, step_limits
 from warpgs.scene import Camera
 
 Wanted = Callable[[str, str], bool]

@@ -14,7 +14,7 @@ from bench.lib.pairs import instances_and_pairs
 from bench.lib.points import SIZES, Point, growth, load, points
 from bench.lib.timing import DISTURBED, OURS, REPEATS, Task, measure_in_turn, peak_bytes
 from warpgs.errors import ResourceError
-from warpgs.runtime import interop
+from warpgs.kernels import launch
 
 WHAT = "every op, the whole image and a training step, forward and backward, over sizes"
 LIMIT_MS = 2000.0
@@ -75,7 +75,7 @@ class Bench:
             return None
         everything = torch.get_num_threads()
         if point.threads:
-            interop.set_threads(point.threads)
+            launch.set_threads(point.threads)
         tasks: list[Task] = []
         try:
             tasks += OPS[op].tasks(point, self.device, lambda p, d: (p, d) in chosen)
@@ -84,7 +84,7 @@ class Bench:
         except FAILURES as e:
             return " ".join(str(e).split())[:200] or type(e).__name__
         finally:
-            interop.set_threads(everything)
+            launch.set_threads(everything)
             tasks.clear()
             gc.collect()
             if self.device.type == "cuda":

@@ -10,10 +10,10 @@ import warp as wp
 from bench.lib import inputs, roofline
 from bench.lib.points import Point
 from warpgs.constants import RULES, Rule
+from warpgs.kernels import launch
 from warpgs.kernels.blend import blend
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
-from warpgs.runtime import interop
 
 
 @wp.kernel(enable_backward=False)
@@ -47,13 +47,13 @@ def drawn_pairs(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
     ends = next(t for t in rgb.grad_fn.saved_tensors if t.dtype == torch.int32 and t.shape == rgb.shape[:3])
     columns, rows = -(-width // tiles.size), -(-height // tiles.size)
     drawn = torch.empty(ends.numel(), dtype=torch.int32, device=projected.device)
-    with interop.stream_of(projected.device):
+    with launch.stream_of(projected.device):
         arguments = [
-            interop.view(projected.reshape(-1, projected.shape[-1]), wp.float32), interop.view(tiles.ranges, wp.int32),
-            interop.view(tiles.gaussian_ids, wp.int32), interop.view(ends.reshape(-1), wp.int32),
-            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, interop.view(drawn, wp.int32),
+            launch.view(projected.reshape(-1, projected.shape[-1]), wp.float32), launch.view(tiles.ranges, wp.int32),
+            launch.view(tiles.gaussian_ids, wp.int32), launch.view(ends.reshape(-1), wp.int32),
+            width, height, columns, columns * rows, tiles.size, rule.alpha_cut, launch.view(drawn, wp.int32),
         ]  # fmt: skip
-        interop.launch(count_drawn, len(drawn), arguments, projected.device, cost=100)
+        launch.launch(count_drawn, len(drawn), arguments, projected.device, cost=100)
     return int(drawn.sum(dtype=torch.int64))
 
 

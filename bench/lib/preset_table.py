@@ -7,7 +7,7 @@ import statistics
 from collections import defaultdict
 
 from bench.lib.tables import markdown, mean_sd
-from warpgs.pipeline.study.statistics import Difference, paired_difference
+from warpgs.pipeline.study.tables import Difference, paired_difference
 
 LIMIT = 0.1
 """Largest allowed loss against the best rival [dB]."""

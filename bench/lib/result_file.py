@@ -16,9 +16,8 @@ from pathlib import Path
 import torch
 import warp
 
+from warpgs.device import installed_bytes, processor_name
 from warpgs.files import write_json
-from warpgs.runtime.device_memory import installed_bytes
-from warpgs.runtime.processor import processor_name
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "bench/results"

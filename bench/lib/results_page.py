@@ -10,7 +10,7 @@ from bench.lib.arms import LADDER, RIVALS, SCORES, Arm, chosen_steps, steps_in
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
-from warpgs.pipeline.study.statistics import family_confidence, paired_difference
+from warpgs.pipeline.study.tables import family_confidence, paired_difference
 
 ABLATED = {
     "no events": "no sampling events: no placement, layers or protection",

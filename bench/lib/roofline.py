@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
-from warpgs.runtime import interop
+from warpgs.kernels import launch
 
 REAL = 4
 """Bytes of a number."""
@@ -199,8 +199,8 @@ def ceilings(device: torch.device, tiny: bool = False) -> dict:
     out = torch.empty(tasks, device=device)
 
     def compute():
-        with interop.stream_of(device):
-            interop.launch(multiply_add, tasks, [0.999, steps, interop.view(out, wp.float32)], device, cost=steps)
+        with launch.stream_of(device):
+            launch.launch(multiply_add, tasks, [0.999, steps, launch.view(out, wp.float32)], device, cost=steps)
 
     return {
         "bytes_per_s": 12 * length / triad,

@@ -19,18 +19,15 @@ import torch
 from bench.lib import result_file
 from bench.lib.tables import markdown
 from warpgs.export.ply import write_ply
-from warpgs.io.load import load_scene
-from warpgs.io.splits import split_views
-from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loop import train_views
+from warpgs.io.load import load_scene, split_views
 from warpgs.pipeline.train.loss import LossInputs, Target, outputs_of
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.setup import samples
 from warpgs.pipeline.train.step import total_loss
-from warpgs.pipeline.train.trainer import Trainer
-from warpgs.priors.matches import triangulate_matches
-from warpgs.priors.semantics import classical_maps
+from warpgs.pipeline.train.trainer import Trainer, train_views
+from warpgs.priors.flow import triangulate_matches
+from warpgs.priors.views import classical_maps
 from warpgs.render.options import RasterizeOptions
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, Scene, View

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from warpgs import load_scene
 from warpgs.errors import UsageError
-from warpgs.io.splits import split_views
+from warpgs.io.load import split_views
 from warpgs.scene import Scene
 from warpgs.synthetic.demo import split_spec, write_demo
 

@@ -6,23 +6,19 @@ from collections.abc import Callable
 
 import torch
 
-from warpgs.kernels.step_buffers import Setting
-from warpgs.pipeline.model.scale_limits import TrainingCameras
-from warpgs.pipeline.model.sh_degrees import model_bytes as bytes_of
+from warpgs.kernels.update import Setting
+from warpgs.pipeline.model.limits import TrainingCameras
 from warpgs.pipeline.model.table import DensityUpdate, Table
-from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.context import StrategyContext
-from warpgs.pipeline.train.learned_views import LearnedViews
-from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
+from warpgs.pipeline.model.table import model_bytes as bytes_of
+from warpgs.pipeline.train.loss import LossConfig, built_in_terms
 from warpgs.pipeline.train.schedule import OptimizerConfig, plan_phases
-from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepPlan, eager_renderer, step
-from warpgs.pipeline.train.step_graphs import StepGraphs
-from warpgs.pipeline.train.strategies.base import Strategy
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views
+from warpgs.pipeline.train.step import MAX_STEPS, Learned, StepBuffers, StepGraphs, StepPlan, eager_renderer, step
+from warpgs.pipeline.train.strategies.base import Strategy, StrategyContext
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.views import ViewStack
+from warpgs.pipeline.train.views import LearnedViews, ViewStack
+from warpgs.ranks import ALONE
 from warpgs.render.options import RasterizeOptions
-from warpgs.runtime.ranks import ALONE
 from warpgs.scene import Camera, Gaussians, PointCloud, View
 
 BLACK = (0.0, 0.0, 0.0)

@@ -4,9 +4,9 @@ import os
 import signal
 import sys
 
-from warpgs.app.commands.fit import request_of
-from warpgs.pipeline.runs.fit import fit
-from warpgs.runtime.ranks import join, last_words
+from warpgs.app.fit import request_of
+from warpgs.pipeline.run.fit import fit
+from warpgs.ranks import join, last_words
 
 
 def main() -> int:

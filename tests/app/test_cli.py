@@ -14,7 +14,7 @@ import torch
 
 from warpgs.app.cli import main
 from warpgs.export.ply import read_ply
-from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
+from warpgs.pipeline.metrics.lpips import NETS, convert_lpips
 from warpgs.report import progress
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -330,7 +330,7 @@ def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
     def full(*_):
         raise error
 
-    monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", full)
+    monkeypatch.setattr("warpgs.pipeline.run.export.export", full)
     line = failure(capsys, 4, "export", "run", "--to", "x.ply")
     assert "out of memory (" in line and "End other programs" in line and "total capacity" not in line
     assert "--" not in line, "export has no flags of a fit"
@@ -339,7 +339,7 @@ def test_no_memory_left_is_no_defect(error, capsys, monkeypatch):
 @pytest.mark.parametrize("ask", [lambda: torch.empty(2**60), lambda: np.zeros((2**30, 2**24)), lambda: bytearray(2**62)])
 def test_what_libraries_say_where_the_cpu_has_no_memory(ask, capsys, monkeypatch):
     """Their own words, which may change with their versions: more than any machine has is asked for."""
-    monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", lambda *_: ask())
+    monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *_: ask())
     assert "out of memory (" in failure(capsys, 4, "export", "run", "--to", "x.ply")
 
 
@@ -370,7 +370,7 @@ def test_numbers_at_their_extremes(tmp_path, capsys, monkeypatch, command, flag)
 
 def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
     """An unexpected error is one line with a file that holds the details."""
-    monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", lambda *a: 1 / 0)
+    monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: 1 / 0)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     assert main(["export", "run", "--to", "x.ply"]) == 5
     text = capsys.readouterr().err
@@ -381,7 +381,7 @@ def test_defects_are_called_defects(tmp_path, capsys, monkeypatch):
 def test_a_package_that_is_gone_is_named(capsys, monkeypatch):
     """A package that warpgs was installed with and that is no longer there is no defect of warpgs."""
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", lambda *a: __import__("pyvista"))
+    monkeypatch.setattr("warpgs.pipeline.run.export.export", lambda *a: __import__("pyvista"))
     assert "the Python package pyvista, which is missing" in failure(capsys, 2, "export", "run", "--to", "x.ply")
 
 

@@ -9,12 +9,12 @@ import sys
 import pytest
 
 from warpgs.app.cli import main
-from warpgs.app.commands.fit import request_of
+from warpgs.app.fit import request_of
 from warpgs.app.flags import flags_of, settings_of
-from warpgs.field_docs import field_docs
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
+from warpgs.errors import field_docs
+from warpgs.pipeline.train.loss import AlphaDifference
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -22,7 +22,7 @@ BASE = ["scene", "--out", "run", "--device", "cpu"]
 PLUG_INS = '''
 from dataclasses import dataclass
 
-import warpgs.io.readers as readers
+import warpgs.io.folder as readers
 import warpgs.pipeline.train.loss as loss
 import warpgs.pipeline.train.strategies.base as base
 

@@ -14,10 +14,10 @@ from rich.console import Console
 from warpgs.app import doctor
 from warpgs.app.cli import main
 from warpgs.app.doctor import MISSING, NOTE, OK, Finding
+from warpgs.device import KernelCache
 from warpgs.errors import ResourceError
-from warpgs.pipeline.runs import precompile
+from warpgs.pipeline.run import precompile
 from warpgs.report import progress
-from warpgs.runtime.kernel_cache import KernelCache
 
 
 def text_of(findings, width=80, terminal=False):

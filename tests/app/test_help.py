@@ -7,17 +7,17 @@ import sys
 
 import pytest
 
-from warpgs.app import fit_help
+from warpgs.app import cli
 from warpgs.app.cli import COMMANDS, GROUPS, main
-from warpgs.app.commands.fit import request_of
-from warpgs.io.readers import READERS, Reader
-from warpgs.io.splits import SPECS
-from warpgs.kernels.cameras.base import CAMERA_MODELS, CameraModel
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.app.fit import request_of
+from warpgs.io.folder import READERS, Reader
+from warpgs.io.load import SPECS
+from warpgs.kernels.cameras import CAMERA_MODELS, CameraModel
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES, Strategy
-from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
+from warpgs.pipeline.train.view_modules import VIEW_MODULES
 
 BASE = ["SCENE", "--out", "RUN"]
 SCENE_FIELDS = {"split", "downscale", "max_side", "masks", "depths"}
@@ -85,7 +85,7 @@ def test_all_flags_are_one_word_further(capsys):
     with pytest.raises(SystemExit) as end:
         main(["fit", help_all])
     text = capsys.readouterr().out
-    assert end.value.code == 0 and all(name in text for name, *_ in fit_help.FLAGS)
+    assert end.value.code == 0 and all(name in text for name, *_ in cli.FLAGS)
     assert "--stopping.measurements" in text and len(text.splitlines()) > 200
 
 
@@ -95,7 +95,7 @@ def test_every_command_has_one_purpose(capsys):
     assert all(f"\n{purpose}:\n" in text for purpose in GROUPS) and all(about in text for about in COMMANDS.values())
 
 
-@pytest.mark.parametrize(("flag", "word", "default"), [f[:3] for f in fit_help.FLAGS if f[0] != "--out"])
+@pytest.mark.parametrize(("flag", "word", "default"), [f[:3] for f in cli.FLAGS if f[0] != "--out"])
 def test_flags_and_their_defaults_are_those_of_the_parser(flag, word, default):
     """A flag is a switch where it has no value, and what it does not say of itself is None."""
     request = request_of(BASE, "")
@@ -140,12 +140,12 @@ def test_what_is_registered_is_in_the_help(capsys, monkeypatch):
 
 
 def test_splits_are_those_of_the_code():
-    kinds = ", ".join(fit_help.SPLITS).split(", ")
+    kinds = ", ".join(cli.SPLITS).split(", ")
     assert sorted(kinds) == sorted(re.split(r", (?:or )?", SPECS))
 
 
 def test_choices_are_those_of_the_code():
-    text = {f[0]: f[3] for f in fit_help.FLAGS}
+    text = {f[0]: f[3] for f in cli.FLAGS}
     fields = request_of(BASE, "").config
     for color in re.findall(r"auto|mean|scene|black|white", text["--background"]):
         dataclasses.replace(fields, background=color)
@@ -153,7 +153,7 @@ def test_choices_are_those_of_the_code():
         assert how in text["--masks"] and request_of([*BASE, "--masks", how], "").scene.masks == how
 
 
-@pytest.mark.parametrize("line", fit_help.EXAMPLES)
+@pytest.mark.parametrize("line", cli.EXAMPLES)
 def test_examples_parse(line):
     program, command, *words = line.split()
     assert (program, command) == ("warpgs", "fit") and request_of(words, "").out.name == "run"

@@ -10,12 +10,12 @@ import sys
 import pytest
 
 from tests.app import rank_that_dies
+from warpgs import ranks
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.pipeline.runs.fit import fit
+from warpgs.pipeline.run.fit import fit
+from warpgs.ranks import is_loopback, loopback_interface
 from warpgs.report import progress
-from warpgs.runtime import rank_watch, ranks
-from warpgs.runtime.listening import is_loopback, loopback_interface
 from warpgs.synthetic.demo import write_demo
 
 
@@ -121,14 +121,14 @@ class Store(dict):
 def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys):
     """Not at once, nor where the process has said goodbye; and of two that find it one alone says so."""
     now = [100.0]
-    monkeypatch.setattr(rank_watch.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(rank_watch.time, "sleep", lambda seconds: None)
-    monkeypatch.setattr(rank_watch.threading.Thread, "start", lambda self: None)
+    monkeypatch.setattr(ranks.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(ranks.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(ranks.threading.Thread, "start", lambda self: None)
     store = Store()
-    first, second = (rank_watch.RankWatch(rank, 3, store, store) for rank in (0, 1))
+    first, second = (ranks.RankWatch(rank, 3, store, store) for rank in (0, 1))
     assert not first.is_lost(2)  # it is still to come
     store.set("beat/2", "7|1234|another machine")
-    for seconds, lost in ((0, False), (rank_watch.LOST_SECONDS - 1, False), (2, True)):
+    for seconds, lost in ((0, False), (ranks.LOST_SECONDS - 1, False), (2, True)):
         now[0] += seconds
         assert first.is_lost(2) is lost
     first.fail("warpgs: rank 2 is gone")
@@ -142,20 +142,20 @@ def test_silence_of_another_machine_is_a_loss_after_a_while(monkeypatch, capsys)
 def unwatched(monkeypatch):
     """Watches without a thread, and no time passes; returns the times [s] that they would have slept."""
     slept = []
-    monkeypatch.setattr(rank_watch.time, "sleep", slept.append)
-    monkeypatch.setattr(rank_watch.threading.Thread, "start", lambda self: None)
+    monkeypatch.setattr(ranks.time, "sleep", slept.append)
+    monkeypatch.setattr(ranks.threading.Thread, "start", lambda self: None)
     return slept
 
 
 def test_the_first_rank_keeps_the_store_until_all_have_read_the_error(unwatched, monkeypatch):
     """Another rank has printed why all end. Without the store, a third one would print that rank 0 is gone."""
-    monkeypatch.setattr(rank_watch, "BEAT_SECONDS", 0.001)
-    monkeypatch.setattr(rank_watch.os, "_exit", sys.exit)
+    monkeypatch.setattr(ranks, "BEAT_SECONDS", 0.001)
+    monkeypatch.setattr(ranks.os, "_exit", sys.exit)
     store = Store(spoke=1)
     for rank, waits in ((0, [3 * 0.001]), (1, [])):
         unwatched.clear()
         with pytest.raises(SystemExit):
-            rank_watch.RankWatch(rank, 3, store, store)._watch()
+            ranks.RankWatch(rank, 3, store, store)._watch()
         assert unwatched == waits
 
 
@@ -163,7 +163,7 @@ def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, m
     """Its process, rank 0, was killed, and no rank can ask the others; rank 3 is on another machine."""
     store, gone = Store(), subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    watches = [rank_watch.RankWatch(rank, 4, store, store) for rank in range(4)]
+    watches = [ranks.RankWatch(rank, 4, store, store) for rank in range(4)]
     store.set("beat/0", f"1|{gone.pid}|{watches[0].here}")
     store.set("beat/3", f"1|{os.getpid()}|another machine")
     watches[3].here = "another machine"
@@ -184,7 +184,7 @@ def test_the_lowest_rank_of_a_machine_reports_the_loss_of_the_store(unwatched, m
 
 def test_all_ranks_read_the_texts_of_all(unwatched):
     store = Store()
-    watches = [rank_watch.RankWatch(rank, 3, store, store) for rank in range(3)]
+    watches = [ranks.RankWatch(rank, 3, store, store) for rank in range(3)]
     for rank in (1, 2):
         store.set(f"text/{rank}", f"of {rank}")
     assert watches[0].texts("of 0") == ["of 0", "of 1", "of 2"] and ranks.ALONE.texts("own") == ["own"]
@@ -231,8 +231,8 @@ def test_a_machine_has_a_name_on_every_system(monkeypatch):
     def none(*_):
         raise FileNotFoundError
 
-    monkeypatch.setattr(rank_watch.Path, "read_text", none)
-    assert rank_watch.machine() == rank_watch.platform.node()
+    monkeypatch.setattr(ranks.Path, "read_text", none)
+    assert ranks.machine() == ranks.platform.node()
 
 
 def test_the_end_of_a_process_is_seen():
@@ -242,14 +242,14 @@ def test_the_end_of_a_process_is_seen():
         os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and stays for its parent to ask
     else:
         ended.wait()
-    assert rank_watch.is_gone(ended.pid) and not rank_watch.is_gone(os.getpid())
+    assert ranks.is_gone(ended.pid) and not ranks.is_gone(os.getpid())
     ended.wait()
 
 
 LISTENING = """
 import json, sys
-from warpgs.runtime.listening import listening_at
-from warpgs.runtime.ranks import join
+from warpgs.ranks import listening_at
+from warpgs.ranks import join
 import torch
 ranks = join("cpu")
 ranks.gather(torch.ones(1), torch.empty(2))

@@ -5,8 +5,7 @@ import dataclasses
 import pytest
 
 from warpgs.app.cli import main
-from warpgs.app.flags import parse_flags
-from warpgs.app.wrong_words import refuse
+from warpgs.app.flags import parse_flags, refuse
 from warpgs.errors import UsageError
 
 WHOLE = "expected an integer, got"

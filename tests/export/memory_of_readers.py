@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from warpgs.errors import DataError
-from warpgs.export.formats import read_gaussians
+from warpgs.export.base import read_gaussians
 
 ROOM = 64 * 2**20
 

@@ -7,9 +7,9 @@ import pytest
 from tests.gaussians import cloud
 from warpgs.errors import DataError
 from warpgs.export import spz
-from warpgs.export.formats import format_of, read_gaussians, read_with_antialiasing, suffixes, write_gaussians
+from warpgs.export.base import format_of, read_gaussians, read_with_antialiasing, suffixes, write_gaussians
 from warpgs.export.ply import read_ply
-from warpgs.pipeline.runs.export_model import convert
+from warpgs.pipeline.run.export import convert
 
 SUFFIXES = suffixes()
 

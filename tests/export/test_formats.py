@@ -14,9 +14,8 @@ import torch
 
 from tests.gaussians import cloud
 from warpgs.errors import DataError, UsageError
-from warpgs.export import compressed_ply, gltf, sog, splat, spz
-from warpgs.export.arrays import arrays_of, gaussians_of, half_turn
-from warpgs.export.formats import format_of, read_gaussians, suffixes, write_gaussians
+from warpgs.export import base, gltf, ply, sog, spz
+from warpgs.export.base import arrays_of, format_of, gaussians_of, half_turn, read_gaussians, suffixes, write_gaussians
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
 from warpgs.scene import Normalization
@@ -142,7 +141,7 @@ def test_more_rows_of_harmonics_than_a_palette(monkeypatch, tmp_path):
 
 def test_a_compressed_ply_may_have_a_plain_name(tmp_path):
     made = model()
-    (tmp_path / "a.ply").write_bytes(b"".join(compressed_ply.encode(arrays_of(made))))
+    (tmp_path / "a.ply").write_bytes(b"".join(ply.encode(arrays_of(made))))
     assert differences(made, read_gaussians(tmp_path / "a.ply"))["means"] < 0.01
 
 
@@ -385,6 +384,6 @@ def test_numbers_of_a_gltf_that_are_none(tmp_path):
 
 
 def test_rows_of_splat_that_make_no_sense(tmp_path):
-    row = np.frombuffer(encoded(".splat", degree=0), splat._ROW).copy()
+    row = np.frombuffer(encoded(".splat", degree=0), base._ROW).copy()
     row["scale"][2, 1] = -1
     refused(tmp_path / "a.splat", row.tobytes(), "axis of Gaussian 2 has a negative length")

@@ -14,8 +14,7 @@ import pytest
 from tests.export import memory_of_readers
 from tests.gaussians import cloud
 from warpgs.export import sog, spz
-from warpgs.export.arrays import SH_SIZES, arrays_of
-from warpgs.export.formats import suffixes, write_gaussians
+from warpgs.export.base import SH_SIZES, arrays_of, suffixes, write_gaussians
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux bounds and tells the memory of a process")
 

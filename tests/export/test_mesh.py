@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from warpgs.errors import DataError, UsageError
-from warpgs.export.mesh_files import linear, rotation_to_y, write_mesh
+from warpgs.export.meshes_and_cameras import linear, rotation_to_y, write_mesh
 from warpgs.scene import Mesh
 
 TETRAHEDRON = Mesh(

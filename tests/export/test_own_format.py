@@ -10,9 +10,8 @@ import torch
 from tests.gaussians import cloud
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.export.base import FORMATS, Format
-from warpgs.export.formats import format_of, read_gaussians, suffixes, write_gaussians
-from warpgs.pipeline.runs.export_model import convert
+from warpgs.export.base import FORMATS, Format, format_of, read_gaussians, suffixes, write_gaussians
+from warpgs.pipeline.run.export import convert
 
 OWN = '''
 import io

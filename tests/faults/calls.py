@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from warpgs import temporary
-from warpgs.report.events import EventLog
-from warpgs.runtime import folder_lock
+from warpgs import folders, locks
+from warpgs.report.progress import EventLog
 
 KINDS = ("open", "write", "fsync", "replace", "unlink", "mkdir", "rmdir", "lock", "truncate", "step")
 
@@ -193,8 +192,8 @@ def numbered(root: Path, before: Callable[[Call], int | None], talker: Any = Non
             (os, "rmdir", _on_path(calls, "rmdir", os.rmdir)),
             (os, "truncate", _on_path(calls, "truncate", os.truncate)),
             (os, "fsync", _on_descriptor(calls, "fsync", os.fsync)),
-            (folder_lock, "lock_descriptor", _on_descriptor(calls, "lock", folder_lock.lock_descriptor)),
-            (temporary, "lock_descriptor", _on_descriptor(calls, "lock", temporary.lock_descriptor)),
+            (locks, "lock_descriptor", _on_descriptor(calls, "lock", locks.lock_descriptor)),
+            (folders, "lock_descriptor", _on_descriptor(calls, "lock", folders.lock_descriptor)),
             (EventLog, "write", _step(calls, EventLog.write)),
         ):
             stack.enter_context(mock.patch.object(owner, name, stand_in))

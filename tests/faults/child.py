@@ -24,15 +24,15 @@ from unittest import mock
 import numpy as np
 
 from tests.faults.calls import Call, numbered
-from warpgs.app.cli import COMMANDS, main
-from warpgs.pipeline.farm.engine import Event
-from warpgs.pipeline.farm.job import job_text
+from warpgs.app.cli import OWN_FILES, main
+from warpgs.folders import temporary_folder
+from warpgs.pipeline.farm.job import Event, job_text
 from warpgs.pipeline.farm.work import run_job
-from warpgs.pipeline.runs import plot, results
-from warpgs.pipeline.study import compare
+from warpgs.pipeline.run import commands as plot
+from warpgs.pipeline.run import results
+from warpgs.pipeline.study import study
 from warpgs.poses import mapping
 from warpgs.report.images import png
-from warpgs.temporary import temporary_folder
 
 SUBREAPER = 36
 """Number of Linux's prctl that gives a process the orphans of its children."""
@@ -73,7 +73,7 @@ def overview(*_: object) -> tuple[None, str]:
 def saving_viewer():
     """Have `warpgs view` save a crop box and a path once it shows something, and end."""
     from warpgs.viewer import watch
-    from warpgs.viewer.saved import CROP, PATH, keyframe
+    from warpgs.viewer.window import CROP, PATH, keyframe
 
     windows: list = []
 
@@ -97,7 +97,7 @@ def saving_viewer():
 def run_one(words: list[str]) -> int:
     """Run one command; returns its exit code."""
     if words[0] == "worker":
-        with mock.patch("warpgs.pipeline.farm.run.LocalEngine", OneProcess):
+        with mock.patch("warpgs.pipeline.farm.farm.LocalEngine", OneProcess):
             return main(["farm", *words[1:]])
     with saving_viewer() if words[0] == "view" else contextlib.nullcontext():
         return main(words)
@@ -106,7 +106,7 @@ def run_one(words: list[str]) -> int:
 def run(root: Path, at: int, trace: Path, commands: list[list[str]]) -> int:
     """Run commands; returns the exit code of the first that fails, or 0."""
     results.render_overview, plot.render_plot = overview, plain_plot
-    compare.ABLATION_ROWS = {name: compare.ABLATION_ROWS[name] for name in ("full", "no events")}
+    study.ABLATION_ROWS = {name: study.ABLATION_ROWS[name] for name in ("full", "no events")}
     with trace.open("wb", buffering=0) as log:
         for words in commands:
             if words[0] == "keep":
@@ -141,10 +141,10 @@ def run_words(words: list[str]) -> int:
 def serve() -> None:
     """Fork for each line of stdin, and answer with exit codes."""
     import warpgs.viewer.watch  # noqa: F401  (and all that commands import late)
-    from warpgs.pipeline.runs import commands, export_model, preview  # noqa: F401
+    from warpgs.pipeline.run import commands, export  # noqa: F401
 
-    for name in COMMANDS:
-        importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
+    for name in ("commands", *OWN_FILES):
+        importlib.import_module(f"warpgs.app.{name}")
     if sys.platform.startswith("linux"):
         ctypes.CDLL(None).prctl(SUBREAPER, 1, 0, 0, 0)
     for line in sys.stdin:

@@ -20,12 +20,12 @@ from tests.faults.mutations import Change, damage, json_value, number, text_line
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.export import cameras as camera_writers
-from warpgs.export import compressed_ply, formats, gltf, sog, splat, spz
-from warpgs.export.arrays import arrays_of, gaussians_of
-from warpgs.io import camera_files
+from warpgs.export import base, gltf, ply, sog, spz
+from warpgs.export import meshes_and_cameras as camera_writers
+from warpgs.export.base import arrays_of, gaussians_of
+from warpgs.io import transforms
 from warpgs.io.colmap import read_cameras, read_poses
-from warpgs.pipeline.model import filters
+from warpgs.pipeline.model import edit
 
 
 def written(suffix: str):
@@ -34,8 +34,8 @@ def written(suffix: str):
     def prepare(root: Path) -> list[Path]:
         made = gaussians(5)
         paths = [root / f"a{suffix}", root / f"b{suffix}"]
-        formats.write_gaussians(paths[0], made, units="file")
-        formats.write_gaussians(paths[1], type(made)(**made.tensors() | {"sh": made.sh[:, :1]}), units="file")
+        base.write_gaussians(paths[0], made, units="file")
+        base.write_gaussians(paths[1], type(made)(**made.tensors() | {"sh": made.sh[:, :1]}), units="file")
         return paths
 
     return prepare
@@ -45,7 +45,7 @@ def add(name: str, suffix: str, parser: tuple, changes: tuple[Change, ...], prep
     """Register the reader of a format of Gaussians."""
     register(
         Target(
-            name, prepare or written(suffix), lambda root, path: formats.read_gaussians(path), (*parser, gaussians_of),
+            name, prepare or written(suffix), lambda root, path: base.read_gaussians(path), (*parser, gaussians_of),
             changes, repair, nonsense,
         )
     )  # fmt: skip
@@ -54,11 +54,11 @@ def add(name: str, suffix: str, parser: tuple, changes: tuple[Change, ...], prep
 # ---- compressed PLY and .splat -----------------------------------------------------------------------------------------
 
 COMPRESSED = (
-    compressed_ply.decode, compressed_ply.is_compressed, compressed_ply._harmonics, compressed_ply._table,
-    compressed_ply._column, compressed_ply._unpack,
+    ply.decode, ply.is_compressed, ply._harmonics, ply._table,
+    ply._column, ply._unpack,
 )  # fmt: skip
 add("compressed PLY", ".compressed.ply", COMPRESSED, (ply_header(text_number), ply_header(text_line), ply_body, ply_body))
-add("splat", ".splat", (splat.decode,), (number, number))
+add("splat", ".splat", (base.decode,), (number, number))
 
 # ---- SPZ ---------------------------------------------------------------------------------------------------------------
 
@@ -245,7 +245,7 @@ add("glTF", ".glb", GLTF, (gltf_document, gltf_document, gltf_numbers), gltf_fil
 
 def camera_paths(root: Path) -> list[Path]:
     scenes.write_colmap(root)
-    found, _ = camera_files.read_cameras(root)
+    found, _ = transforms.read_cameras(root)
     for name in camera_writers.NAMES[:2]:
         camera_writers.write_cameras(root / name, list(found.values()))
     camera_writers.write_cameras(root / "text" / "sparse", list(found.values()))
@@ -254,7 +254,7 @@ def camera_paths(root: Path) -> list[Path]:
 
 
 def read_any(root: Path, path: Path) -> dict:
-    return camera_files.read_cameras(path if path.suffix == ".json" else root / "text" / "sparse")[0]
+    return transforms.read_cameras(path if path.suffix == ".json" else root / "text" / "sparse")[0]
 
 
 def camera_nonsense(found: dict) -> str:
@@ -263,7 +263,7 @@ def camera_nonsense(found: dict) -> str:
     return bad or ("" if sound and found else "a camera is none")
 
 
-CAMERAS = (camera_files, read_cameras, read_poses)
+CAMERAS = (transforms, read_cameras, read_poses)
 CAMERA_CHANGES = (rarely(many_rows, json_value), json_value, text_number, text_line)
 register(Target("cameras", camera_paths, read_any, CAMERAS, CAMERA_CHANGES, nonsense=camera_nonsense, lines=0.75))
 
@@ -275,6 +275,6 @@ def box_files(root: Path) -> list[Path]:
     return [root / "a.json"]
 
 
-BOX = (filters.box_of, filters._box_of_file, filters._numbers)
+BOX = (edit.box_of, edit._box_of_file, edit._numbers)
 BOX_CHANGES = (json_value, json_value, text_number)
-register(Target("crop box", box_files, lambda root, path: filters.box_of(str(path)), BOX, BOX_CHANGES))
+register(Target("crop box", box_files, lambda root, path: edit.box_of(str(path)), BOX, BOX_CHANGES))

@@ -17,7 +17,8 @@ from tests.faults.scene_targets import nonsense as scene_nonsense
 from tests.faults.scene_targets import read_scene, write_masked
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
-from warpgs.io import decoding, folders, images, score_masks
+from warpgs.io import folder as folders
+from warpgs.io import images, load
 from warpgs.io.image_formats import bmp, jpeg, png, tiff, webp
 
 MAX_PIXELS = 20_000
@@ -25,7 +26,7 @@ Pixels = tuple[np.ndarray, np.ndarray | None]
 
 
 def read(folder: Path, path: Path) -> Pixels:
-    pixels = decoding.decode(path, MAX_PIXELS)
+    pixels = images.decode(path, MAX_PIXELS)
     assert images.exif_orientation(path) in range(1, 9)
     return pixels
 
@@ -253,7 +254,7 @@ add("webp", WEBPS, (webp,), (webp_chunk, header))
 
 ANY = {"png": encoded("PNG", "LA"), "float": encoded("TIFF", "F"), "double": by_opencv(".tif", COLORS[..., 0] / 255.0)}
 ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P")}
-add("any image", ANY, (decoding.format_of, decoding._raster, decoding.decode), (header,))
+add("any image", ANY, (images.format_of, images._raster, images.decode), (header,))
 
 
 def other_size(data: bytes, rng: np.random.Generator) -> bytes:
@@ -267,6 +268,6 @@ def other_size(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 MASKS = (
-    folders.SceneFolder.find_mask, folders.SceneFolder.mask, folders.read_mask, images._fit_mask, score_masks._fit,
+    folders.SceneFolder.find_mask, folders.SceneFolder.mask, folders.read_mask, images._fit_mask, load._fit,
 )  # fmt: skip
 register(Target("masks", write_masked, read_scene, MASKS, (png_rows, png_rows, other_size), png_checksums, scene_nonsense))

@@ -14,19 +14,18 @@ from tests.faults.mutations import Change, damage, json_value, number, text_line
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from tests.priors import networks as nw
+from warpgs import onnx
 from warpgs.export import ply
-from warpgs.export.formats import read_gaussians
-from warpgs.export.ply_header import parse_header, ply_error
+from warpgs.export.base import read_gaussians
+from warpgs.export.ply import parse_header, ply_error
 from warpgs.files import write_json
-from warpgs.io.load import load_scene
-from warpgs.io.splits import Split
-from warpgs.pipeline.metrics import lpips_weights
-from warpgs.pipeline.model import model_file
-from warpgs.pipeline.runs import checkpoint, folder
-from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.io.load import Split, load_scene
+from warpgs.pipeline.metrics import lpips
+from warpgs.pipeline.model import table
+from warpgs.pipeline.run import folder
+from warpgs.pipeline.run.request import SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.priors import flow, preprocess
-from warpgs.runtime import onnx_file
+from warpgs.priors import flow, networks
 from warpgs.scene import Gaussians, Normalization
 
 
@@ -126,14 +125,14 @@ def within_digest(change: Change) -> Change:
 
 def model_files(root: Path) -> list[Path]:
     path = root / "m.safetensors"
-    model_file.save(path, gaussians(), Normalization(np.array([1.0, 2, 3]), 0.5))
+    table.save(path, gaussians(), Normalization(np.array([1.0, 2, 3]), 0.5))
     path.write_bytes(in_order(path.read_bytes()))
     return [path]
 
 
 register(
     Target(
-        "model file", model_files, lambda root, path: model_file.load(path).scene_gaussians, (model_file.load,),
+        "model file", model_files, lambda root, path: table.load(path).scene_gaussians, (table.load,),
         (tensors_header, tensors_body), nonsense=nonsense,
     )
 )  # fmt: skip
@@ -141,7 +140,7 @@ register(
 
 def checkpoints(root: Path) -> list[Path]:
     state = {"step": 7, "random": [1, 2, 3], "rates": {"means": 0.1}}
-    return [checkpoint.save_checkpoint(root, {f"params.{n}": t for n, t in gaussians().tensors().items()}, state)]
+    return [folder.save_checkpoint(root, {f"params.{n}": t for n, t in gaussians().tensors().items()}, state)]
 
 
 def checkpoint_nonsense(loaded: tuple) -> str:
@@ -153,20 +152,20 @@ def checkpoint_nonsense(loaded: tuple) -> str:
 CHECKPOINT_CHANGES = tuple(within_digest(c) for c in (tensors_header, tensors_header, tensors_body, damage))
 register(
     Target(
-        "checkpoint", checkpoints, lambda root, path: checkpoint.load_checkpoint(root), (checkpoint.load_checkpoint,),
+        "checkpoint", checkpoints, lambda root, path: folder.load_checkpoint(root), (folder.load_checkpoint,),
         CHECKPOINT_CHANGES, with_digest, checkpoint_nonsense,
     )
 )  # fmt: skip
 
-SMALL = lpips_weights.Net("small", "a small network", (("conv", 0, 3, 4, 3, 1, 1), lpips_weights.TAP), 3, "")
+SMALL = lpips.Net("small", "a small network", (("conv", 0, 3, 4, 3, 1, 1), lpips.TAP), 3, "")
 
 
 def lpips_files(root: Path) -> list[Path]:
     from safetensors.torch import save
 
-    lpips_weights.NETS["small"] = SMALL  # the real ones have millions of weights
+    lpips.NETS["small"] = SMALL  # the real ones have millions of weights
     tensors = {n: torch.ones(s) for n, s in SMALL.shapes().items()}
-    metadata = {"format": lpips_weights.FORMAT, "net": "small", "version": "0.1", "backbone_sha256": "1", "heads_sha256": "2"}
+    metadata = {"format": lpips.FORMAT, "net": "small", "version": "0.1", "backbone_sha256": "1", "heads_sha256": "2"}
     (root / "w.safetensors").write_bytes(in_order(save(tensors, metadata)))
     return [root / "w.safetensors"]
 
@@ -180,7 +179,7 @@ def lpips_nonsense(loaded: tuple) -> str:
 
 register(
     Target(
-        "LPIPS weights", lpips_files, lambda root, path: lpips_weights.read_lpips(path), (lpips_weights.read_lpips,),
+        "LPIPS weights", lpips_files, lambda root, path: lpips.read_lpips(path), (lpips.read_lpips,),
         (tensors_header, tensors_body), nonsense=lpips_nonsense,
     )
 )  # fmt: skip
@@ -208,7 +207,7 @@ def onnx_files(root: Path) -> list[Path]:
 def onnx_field(data: bytes, rng: np.random.Generator) -> bytes:
     """Change, remove or repeat a field at any depth; lengths around it stay right."""
     try:
-        fields = onnx_file._message(memoryview(data))
+        fields = onnx._message(memoryview(data))
     except (ValueError, IndexError):
         return data
     if not fields:
@@ -235,11 +234,11 @@ def onnx_field(data: bytes, rng: np.random.Generator) -> bytes:
 
 def check_onnx(root: Path, path: Path) -> bytes:
     data = path.read_bytes() if path.is_file() else b""
-    onnx_file.check_onnx(data, path)
+    onnx.check_onnx(data, path)
     return data
 
 
-register(Target("onnx", onnx_files, check_onnx, (onnx_file,), (onnx_field, onnx_field, onnx_field)))
+register(Target("onnx", onnx_files, check_onnx, (onnx,), (onnx_field, onnx_field, onnx_field)))
 
 
 def flo_files(root: Path) -> list[Path]:
@@ -268,13 +267,13 @@ def side_files(root: Path) -> list[Path]:
 
 
 def side_nonsense(values: dict) -> str:
-    return "" if isinstance(values, dict) and set(values) <= set(preprocess.KEYS) else "no description"
+    return "" if isinstance(values, dict) and set(values) <= set(networks.KEYS) else "no description"
 
 
-SIDE = (preprocess.read_side_file, preprocess.check_value, preprocess._numbers, preprocess._whole)
+SIDE = (networks.read_side_file, networks.check_value, networks._numbers, networks._whole)
 register(
     Target(
-        "description of a network", side_files, lambda root, path: preprocess.read_side_file(root / "m.onnx"), SIDE,
+        "description of a network", side_files, lambda root, path: networks.read_side_file(root / "m.onnx"), SIDE,
         (json_value, json_value, text_number), nonsense=side_nonsense,
     )
 )  # fmt: skip

@@ -12,16 +12,16 @@ from tests.faults.format_targets import zip_member
 from tests.faults.model_targets import SMALL, onnx_field, tensors_body, tensors_header
 from tests.faults.targets import Target, register
 from tests.priors import networks as nw
-from warpgs.pipeline.metrics import lpips_weights
-from warpgs.poses import matcher
-from warpgs.priors import cache, flow, session
-from warpgs.runtime import onnx_session
+from warpgs import onnx
+from warpgs.pipeline.metrics import lpips
+from warpgs.poses import matching
+from warpgs.priors import flow, networks
 
 # ---- weights of LPIPS as others publish them ---------------------------------------------------------------------------
 
 
 def state_files(root: Path) -> list[Path]:
-    lpips_weights.NETS["small"] = SMALL  # the real ones have millions of weights
+    lpips.NETS["small"] = SMALL  # the real ones have millions of weights
     for name in ("heads", "backbone"):
         state = {n: torch.ones(s) for n, s in SMALL.shapes().items() if n.startswith("lin") == (name == "heads")}
         torch.save(state, root / f"{name}.pth")
@@ -30,11 +30,11 @@ def state_files(root: Path) -> list[Path]:
 
 def converted(root: Path, path: Path) -> object:
     (root / "out.safetensors").unlink(missing_ok=True)
-    lpips_weights.convert_lpips(root / "backbone.pth", root / "heads.pth", root / "out.safetensors")
-    return lpips_weights.read_lpips(root / "out.safetensors")
+    lpips.convert_lpips(root / "backbone.pth", root / "heads.pth", root / "out.safetensors")
+    return lpips.read_lpips(root / "out.safetensors")
 
 
-STATES = (lpips_weights._read_state, lpips_weights._net_of, lpips_weights.convert_lpips)
+STATES = (lpips._read_state, lpips._net_of, lpips.convert_lpips)
 register(Target("LPIPS state dict", state_files, converted, STATES, (zip_member, rarely(zip_bomb, zip_member)), lines=0.8))
 
 # ---- maps on disk ------------------------------------------------------------------------------------------------------
@@ -45,12 +45,12 @@ NAMES = ("a", "b")
 
 def map_files(root: Path) -> list[Path]:
     maps = tuple(np.full((6, 9), v, np.float32) for v in (0.25, 1.0))
-    cache.MapCache(root).maps(IMAGE, NAMES, {"model": "x"}, lambda: maps)
+    networks.MapCache(root).maps(IMAGE, NAMES, {"model": "x"}, lambda: maps)
     return list(root.glob("*.safetensors"))
 
 
 def maps_of(root: Path, path: Path) -> tuple[np.ndarray, ...] | None:
-    store = cache.MapCache(root)
+    store = networks.MapCache(root)
     found = store._read(path, NAMES, IMAGE.shape[:2])
     assert found is not None or not path.exists() or str(path) in store.notes[0]
     return found
@@ -62,7 +62,7 @@ def map_nonsense(found: tuple[np.ndarray, ...]) -> str:
 
 register(
     Target(
-        "stored maps", map_files, maps_of, (cache.MapCache._read,), (tensors_header, tensors_body), nonsense=map_nonsense
+        "stored maps", map_files, maps_of, (networks.MapCache._read,), (tensors_header, tensors_body), nonsense=map_nonsense
     )
 )  # fmt: skip
 
@@ -75,10 +75,10 @@ def network_files(root: Path) -> list[Path]:
     return sorted(root.glob("*.onnx"))
 
 
-NETWORK = (session.open_network, onnx_session.start_session, onnx_session.read_model, session._input_axes)
+NETWORK = (networks.open_network, onnx.start_session, onnx.read_model, networks._input_axes)
 register(
     Target(
-        "network", network_files, lambda root, path: session.open_network(path, threads=1), NETWORK,
+        "network", network_files, lambda root, path: networks.open_network(path, threads=1), NETWORK,
         (onnx_field, onnx_field, onnx_field), lines=0.7, share=0.3,
     )
 )  # fmt: skip
@@ -89,18 +89,18 @@ def matcher_files(root: Path) -> list[Path]:
     return [root / "matcher.onnx"]
 
 
-def matched(root: Path, path: Path) -> matcher.Features:
-    return matcher.open_matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
+def matched(root: Path, path: Path) -> matching.Features:
+    return matching.open_matcher(path, threads=1).features(np.zeros((8, 8, 3), np.uint8))
 
 
-def matcher_nonsense(found: matcher.Features) -> str:
+def matcher_nonsense(found: matching.Features) -> str:
     inside = (found.pixels >= 0) & (found.pixels <= 8)
     return "" if inside.all() and len(found.pixels) == len(found.descriptors) else "a keypoint is none"
 
 
 register(
     Target(
-        "matcher", matcher_files, matched, (matcher.open_matcher, matcher.Matcher.features, matcher.Matcher._check),
+        "matcher", matcher_files, matched, (matching.open_matcher, matching.Matcher.features, matching.Matcher._check),
         (onnx_field, onnx_field, onnx_field), nonsense=matcher_nonsense, lines=0.6, share=0.2,
     )
 )  # fmt: skip

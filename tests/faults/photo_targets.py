@@ -17,9 +17,9 @@ from tests.faults.image_targets import encoded, jpeg_segments, photo, png_checks
 from tests.faults.mutations import Change, damage, number
 from tests.faults.targets import Target, register
 from warpgs.errors import DataError
-from warpgs.io.decoding import decode
 from warpgs.io.image_formats import avif
-from warpgs.poses import heic, metadata, photographs, video
+from warpgs.io.images import decode
+from warpgs.poses import photographs
 
 MAX_PIXELS = 20_000
 CONTAINERS = {
@@ -112,7 +112,7 @@ def photo_nonsense(found: tuple[photographs.Photograph, np.ndarray]) -> str:
     return "" if photograph.focal is None or 0 < photograph.focal < 1000 else "a focal length is none"
 
 
-PHOTOGRAPHS = (photographs.prepare, photographs.write_copy, metadata)
+PHOTOGRAPHS = (photographs.prepare, photographs.write_copy, photographs)
 register(
     Target(
         "photograph", photo_files, read_photograph, PHOTOGRAPHS, (exif_tag, rarely(png_bomb, exif_tag), jpeg_segments),
@@ -137,7 +137,7 @@ def heic_files(root: Path) -> list[Path]:
 def heic_copy(root: Path, path: Path) -> np.ndarray:
     """Decode in this process, and tell an error as the process that does it otherwise."""
     try:
-        copy = heic._coded_again(path, MAX_PIXELS)
+        copy = photographs._coded_again(path, MAX_PIXELS)
     except Exception as e:  # as its process does, for which the caller names the file
         raise DataError(f"{path}: the image cannot be decoded: {e}") from e
     (root / "a.jpg").write_bytes(copy)
@@ -146,14 +146,16 @@ def heic_copy(root: Path, path: Path) -> np.ndarray:
 
 def heic_in_process(root: Path, path: Path) -> np.ndarray:
     shutil.rmtree(root / "out", ignore_errors=True)
-    heic.is_heic(path)
-    return decode(heic.to_jpeg([path], root / "in", root / "out", MAX_PIXELS)[path], MAX_PIXELS)[0]
+    photographs.is_heic(path)
+    return decode(photographs.to_jpeg([path], root / "in", root / "out", MAX_PIXELS)[path], MAX_PIXELS)[0]
 
 
 if importlib.util.find_spec("pi_heif"):
-    register(Target("heic", heic_files, heic_copy, (heic._coded_again,), (box, box, box), own_process=True))
+    register(Target("heic", heic_files, heic_copy, (photographs._coded_again,), (box, box, box), own_process=True))
     register(
-        Target("heic by its process", heic_files, heic_in_process, (heic.to_jpeg,), (box, box, box), lines=0.7, share=0.01)
+        Target(
+            "heic by its process", heic_files, heic_in_process, (photographs.to_jpeg,), (box, box, box), lines=0.7, share=0.01
+        )
     )
 
 # ---- videos ------------------------------------------------------------------------------------------------------------
@@ -185,9 +187,9 @@ def frames_of(root: Path, path: Path) -> list[np.ndarray]:
     folder = root / "frames"
     shutil.rmtree(folder)
     folder.mkdir()
-    video.write_frames(path, folder, 2, lambda line: None)
+    photographs.write_frames(path, folder, 2, lambda line: None)
     return [decode(p)[0] for p in sorted(folder.iterdir())]
 
 
-VIDEO = (video._frames, video.write_frames, video.sharpest)
+VIDEO = (photographs._frames, photographs.write_frames, photographs.sharpest)
 register(Target("video", video_files, frames_of, VIDEO, (video_header, box, frame_bytes(damage)), share=0.3))

@@ -17,19 +17,18 @@ from tests.faults.image_targets import png_checksums, png_rows
 from tests.faults.model_targets import gaussians, in_order, run_files, tensors_body, tensors_header
 from tests.faults.mutations import Change, json_value, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
-from warpgs import schema
-from warpgs.app.commands import farm as farm_command
+from warpgs import locks, schema
+from warpgs.app import farm as farm_command
 from warpgs.errors import DataError, UsageError
 from warpgs.files import write_json
-from warpgs.pipeline.farm import ensure_run, listing, record, work
-from warpgs.pipeline.films import keyframes
-from warpgs.pipeline.runs import failed_step, folder, schemas
-from warpgs.pipeline.train import overrides, presets
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.farm import job, work
+from warpgs.pipeline.films import paths
+from warpgs.pipeline.run import failed_step, folder
+from warpgs.pipeline.train import presets, settings
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.poses import record as poses_record
-from warpgs.report import events
-from warpgs.runtime import folder_lock
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.poses import find as poses_record
+from warpgs.report import progress
 from warpgs.scene import Camera, Normalization
 
 JSON_CHANGES: tuple[Change, ...] = (json_value, json_value, rarely(many_rows, json_value), text_number)
@@ -56,8 +55,8 @@ def turned(angle: float) -> list[list[float]]:
 
 
 def cameras_of_path(root: Path, path: Path) -> list[Camera]:
-    found = keyframes.read_keyframes(path, TEMPLATE, Normalization(np.array([1.0, 2, 3]), 0.5))
-    return keyframes.through(found, 5)
+    found = paths.read_keyframes(path, TEMPLATE, Normalization(np.array([1.0, 2, 3]), 0.5))
+    return paths.through(found, 5)
 
 
 def path_nonsense(cameras: list[Camera]) -> str:
@@ -65,7 +64,7 @@ def path_nonsense(cameras: list[Camera]) -> str:
 
 
 PATH = [{"c2w": turned(0.3 * i), "fov_y": 0.8 + 0.1 * i, "seconds": 2.0 * i} for i in range(4)]
-KEYFRAMES = (keyframes.read_keyframes, keyframes.through)
+KEYFRAMES = (paths.read_keyframes, paths.through)
 add("keyframes", "path.json", PATH, cameras_of_path, KEYFRAMES, nonsense=path_nonsense, lines=0.85)
 
 # ---- scores of a run ---------------------------------------------------------------------------------------------------
@@ -90,17 +89,17 @@ add(
     "scores",
     "metrics.json",
     SCORES,
-    lambda root, path: ensure_run._scores(path),
-    (ensure_run._scores, schema, schemas),
+    lambda root, path: work._scores(path),
+    (work._scores, schema, folder),
     lines=0.6,
 )
 
 # ---- farms -------------------------------------------------------------------------------------------------------------
 
-JOB = record.JobRecord("a", "ab12", "done", "fitted", seconds=1.5, psnr=24.5, files=dict.fromkeys(record.CHECKED, "ab12"))
+JOB = job.JobRecord("a", "ab12", "done", "fitted", seconds=1.5, psnr=24.5, files=dict.fromkeys(job.CHECKED, "ab12"))
 add(
-    "record of a job", record.RECORD, dataclasses.asdict(JOB), lambda root, path: record.read_record(root),
-    (record.read_record, schema.fields, schema.mapping, schema.one_of), lines=0.6,
+    "record of a job", job.RECORD, dataclasses.asdict(JOB), lambda root, path: job.read_job_record(root),
+    (job.read_job_record, schema.fields, schema.mapping, schema.one_of), lines=0.6,
 )  # fmt: skip
 
 LINES = (
@@ -127,15 +126,15 @@ def one_line(change: Change) -> Change:
 
 
 LINE_CHANGES = (one_line(json_value), one_line(json_value), one_line(text_number), text_line)
-LISTING = (listing.list_jobs, listing._read, listing._job, listing._flag)
-register(Target("list of jobs", job_files, lambda root, path: listing.list_jobs(str(path)), LISTING, LINE_CHANGES))
+LISTING = (job.list_jobs, job._read, job._job, job._flag)
+register(Target("list of jobs", job_files, lambda root, path: job.list_jobs(str(path)), LISTING, LINE_CHANGES))
 
 
 def jobs_with_flags(root: Path, path: Path) -> list:
     """Read the flags of each job, too, as the command does."""
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            return farm_command._jobs(listing.list_jobs(str(path)), [], root / "out")
+            return farm_command._jobs(job.list_jobs(str(path)), [], root / "out")
     except UsageError as e:  # a wrong flag is told by its job, and the file is named on the command line
         raise UsageError(f"{path}: {e}") from e
 
@@ -159,16 +158,20 @@ FOUND = {
 
 
 def pose_lines(root: Path, path: Path) -> list[str]:
-    return poses_record.report_lines(poses_record.read_record(root))
+    return poses_record.report_lines(poses_record.read_poses_record(root))
 
 
 add(
-    "record of poses", poses_record.JSON, FOUND, pose_lines, (poses_record.read_record, poses_record.report_lines, schema.items)
+    "record of poses",
+    poses_record.JSON,
+    FOUND,
+    pose_lines,
+    (poses_record.read_poses_record, poses_record.report_lines, schema.items),
 )
 
 
 def event_files(root: Path) -> list[Path]:
-    log = events.EventLog(root / "metrics.jsonl")
+    log = progress.EventLog(root / "metrics.jsonl")
     for step in range(1, 5):
         log.write(step=step, loss=0.5 / step, psnr=None if step == 2 else 20.0 + step)
     log.close()
@@ -179,10 +182,10 @@ def events_of(root: Path, path: Path) -> list[dict] | None:
     """Read a log; None where no line is whole. A fit that goes on drops later events."""
     if not path.is_file():
         raise DataError(f"{path}: there is no log, and nobody reads one that is not there")
-    found = events.read_events(path)
-    log = events.EventLog(path, step=2)
+    found = progress.read_events(path)
+    log = progress.EventLog(path, step=2)
     log.close()
-    assert [e["step"] for e in events.read_events(path)] == [e["step"] for e in found if e["step"] <= 2]
+    assert [e["step"] for e in progress.read_events(path)] == [e["step"] for e in found if e["step"] <= 2]
     return found or None
 
 
@@ -191,7 +194,7 @@ def events_nonsense(found: list[dict]) -> str:
     return "" if sound else "an event holds something else than numbers"
 
 
-EVENTS = (events.read_events, events.EventLog.rewind)
+EVENTS = (progress.read_events, progress.EventLog.rewind)
 register(
     Target(
         "events", event_files, events_of, EVENTS, LINE_CHANGES, nonsense=events_nonsense, lines=0.75
@@ -207,10 +210,10 @@ def lock_files(root: Path) -> list[Path]:
 
 def holder(root: Path, path: Path) -> str | None:
     data = path.read_bytes() if path.is_file() else b""
-    return folder_lock._signed(io.BytesIO(data))
+    return locks._signed(io.BytesIO(data))
 
 
-register(Target("signature of a lock", lock_files, holder, (folder_lock._signed,), (one_line(json_value), text_number)))
+register(Target("signature of a lock", lock_files, holder, (locks._signed,), (one_line(json_value), text_number)))
 
 # ---- runs --------------------------------------------------------------------------------------------------------------
 
@@ -275,7 +278,7 @@ def settings_of_preset(root: Path, path: Path) -> FitConfig:
     return FitConfig.from_json(json.loads(json.dumps(config.to_json(), allow_nan=False)))
 
 
-PRESET_PARSER = (presets._read, presets._config_of_file, presets._config_of, overrides.with_settings, overrides._typed)
+PRESET_PARSER = (presets._read, presets._config_of_file, presets._config_of, settings.with_settings, settings._typed)
 register(Target("preset", preset_file, settings_of_preset, PRESET_PARSER, LINE_CHANGES, lines=0.7))
 
 # ---- images of a run ---------------------------------------------------------------------------------------------------
@@ -290,7 +293,7 @@ def render_files(root: Path) -> list[Path]:
 
 def thumbnail(root: Path, path: Path) -> bytes | None:
     """Write a job's thumbnail from a render; None where the render is no image."""
-    target = root / record.THUMBNAIL
+    target = root / job.THUMBNAIL
     target.unlink(missing_ok=True)
     work.write_thumbnail(root / "renders", target)
     return target.read_bytes() if target.is_file() else None

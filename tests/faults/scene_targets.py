@@ -13,7 +13,7 @@ from tests.faults.bombs import many_rows, rarely
 from tests.faults.mutations import Change, json_value, text_line, text_number
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
-from warpgs.io import colmap, dtu, given_maps, llff, load, map_files, middlebury, transforms
+from warpgs.io import colmap, load, maps, others, transforms
 from warpgs.scene import Scene
 
 MAX_PIXELS = 10_000
@@ -126,9 +126,9 @@ COLMAP = {
 FRAMES = {"own": write_frames, "ngp": scenes.write_ngp, "blender": scenes.write_blender}
 add("colmap", COLMAP, (colmap,), TEXT)
 add("transforms", FRAMES, (transforms,), (rarely(many_rows, json_value), json_value, text_number))
-add("llff", {"a": scenes.write_llff}, (llff,), (matrices_changed,))
-add("dtu", {"a": write_dtu}, (dtu,), (matrices_changed,))
-add("middlebury", {"a": scenes.write_middlebury}, (middlebury,), TEXT)
+add("llff", {"a": scenes.write_llff}, (others,), (matrices_changed,))
+add("dtu", {"a": write_dtu}, (others,), (matrices_changed,))
+add("middlebury", {"a": scenes.write_middlebury}, (others,), TEXT)
 
 
 def write_maps(folder: Path) -> list[Path]:
@@ -175,7 +175,7 @@ def nonsense_of_maps(scene: Scene) -> str:
 
 register(
     Target(
-        "given maps", write_maps, read_mapped, (map_files, given_maps), (matrices_changed,), nonsense=nonsense_of_maps,
+        "given maps", write_maps, read_mapped, (maps, maps), (matrices_changed,), nonsense=nonsense_of_maps,
         lines=0.7,
     )
 )  # fmt: skip

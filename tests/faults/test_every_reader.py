@@ -12,7 +12,7 @@ import pytest
 import warpgs
 from tests.faults.fuzz import Worker
 from tests.faults.targets import all_targets
-from warpgs.pipeline.metrics import lpips_weights
+from warpgs.pipeline.metrics import lpips
 
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
@@ -26,47 +26,43 @@ PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", 
 
 READERS = {
     "export/base.py": {"Format.read": "splat"},
-    "export/compressed_ply.py": {"start_of": "ply"},
+    "export/ply.py": {"start_of": "ply", "_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
-    "export/ply.py": {"_read": "ply"},
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
     "export/spz.py": {"SPZ.is_antialiased": "SPZ"},
-    "io/camera_files.py": {"_json": "cameras"},
+    "io/transforms.py": {"_json": "cameras", "read_json": "transforms"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
-    "io/decoding.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
-    "io/dtu.py": {"_read_matrices": "dtu"},
+    "io/images.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
+    "io/others.py": {"_read_matrices": "dtu", "read_poses_bounds": "llff", "read_camera_rows": "middlebury"},
     "io/image_formats/avif.py": {"open_image": "avif"},
-    "io/llff.py": {"read_rows": "llff"},
-    "io/map_files.py": {"_read_array": "given maps"},
-    "io/middlebury.py": {"read_rows": "middlebury"},
-    "io/transforms.py": {"read_json": "transforms"},
-    "pipeline/farm/ensure_run.py": {"_scores": "scores"},
-    "pipeline/farm/listing.py": {"_read": "list of jobs"},
-    "pipeline/farm/record.py": {"read_record": "record of a job"},
-    "pipeline/farm/work.py": {"write_thumbnail": "render of a job"},
-    "pipeline/films/keyframes.py": {"read_keyframes": "keyframes"},
-    "pipeline/metrics/lpips_weights.py": {
+    "io/maps.py": {"_read_array": "given maps"},
+    "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
+    "pipeline/farm/job.py": {"_read": "list of jobs", "read_job_record": "record of a job"},
+    "pipeline/films/paths.py": {"read_keyframes": "keyframes"},
+    "pipeline/metrics/lpips.py": {
         "_check_unpacked": "LPIPS state dict",
         "_read_state": "LPIPS state dict",
         "read_lpips": "LPIPS weights",
     },
-    "pipeline/model/filters.py": {"_box_of_file": "crop box", "box_of": "crop box"},
-    "pipeline/model/model_file.py": {"load": "model file"},
-    "pipeline/runs/checkpoint.py": {"load_checkpoint": "checkpoint"},
-    "pipeline/runs/failed_step.py": {"read_failed_step": "failed step"},
-    "pipeline/runs/folder.py": {"read_record": "run record"},
+    "pipeline/model/edit.py": {"_box_of_file": "crop box", "box_of": "crop box"},
+    "pipeline/model/table.py": {"load": "model file"},
+    "pipeline/run/folder.py": {"load_checkpoint": "checkpoint", "read_record": "run record"},
+    "pipeline/run/failed_step.py": {"read_failed_step": "failed step"},
     "pipeline/train/presets.py": {"_read": "preset"},
-    "poses/heic.py": {"_coded_again": "heic", "to_jpeg": "heic by its process"},
-    "poses/record.py": {"read_record": "record of poses"},
-    "poses/video.py": {"_check_container": "video", "_frames": "video"},
-    "priors/cache.py": {"MapCache._read": "stored maps"},
+    "poses/photographs.py": {
+        "_coded_again": "heic",
+        "to_jpeg": "heic by its process",
+        "_check_container": "video",
+        "_frames": "video",
+    },
+    "poses/find.py": {"read_poses_record": "record of poses"},
+    "priors/networks.py": {"MapCache._read": "stored maps", "read_side_file": "description of a network"},
     "priors/flow.py": {"_network": "flow network", "read_flo": "flow"},
-    "priors/preprocess.py": {"read_side_file": "description of a network"},
-    "report/events.py": {"read_events": "events"},
-    "runtime/folder_lock.py": {"_signed": "signature of a lock"},
-    "runtime/onnx_session.py": {"read_model": "network", "start_session": "network"},
+    "report/progress.py": {"read_events": "events"},
+    "locks.py": {"_signed": "signature of a lock"},
+    "onnx.py": {"read_model": "network", "start_session": "network"},
     "schema.py": {"parse": "scores", "read": "scores"},
-    "viewer/frames.py": {"read_frame": "frame of a websocket"},
+    "viewer/server.py": {"read_frame": "frame of a websocket"},
 }
 """Name of the fuzzer's reader by file and function."""
 
@@ -78,46 +74,42 @@ SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
     "export/sog.py": {"encode": "writes"},
-    "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER},
-    "input_files.py": {"open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
-    "output_folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER},
-    "pipeline/farm/ensure_run.py": {"_with_lpips": OWN},
-    "pipeline/farm/batch.py": {"main": PRIVATE},
-    "pipeline/farm/job.py": {"job_of": PIPE},
-    "pipeline/farm/local.py": {"LocalEngine._compile": PIPE, "LocalEngine.wait": PIPE},
-    "pipeline/farm/record.py": {"file_digest": DIGEST},
-    "pipeline/farm/slurm.py": {"SlurmEngine._answered": PRIVATE, "SlurmEngine._output": PRIVATE},
+    "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER,
+        "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
+    "folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER,
+        "_own_file": "writes"},
+    "pipeline/farm/work.py": {"_with_lpips": OWN},
+    "pipeline/farm/slurm.py": {"main": PRIVATE,
+        "SlurmEngine._answered": PRIVATE, "SlurmEngine._output": PRIVATE},
+    "pipeline/farm/job.py": {"job_of": PIPE,
+        "file_digest": DIGEST},
+    "pipeline/farm/farm.py": {"LocalEngine._compile": PIPE, "LocalEngine.wait": PIPE},
     "pipeline/farm/worker.py": {"main": PIPE},
-    "pipeline/runs/coverage_report.py": {"coverage_section": OWN},
-    "pipeline/runs/commands.py": {"render": "opens a writer of a film"},
-    "pipeline/runs/folder.py": {"check_same": "copies a value"},
-    "pipeline/runs/sampling_report.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
+    "pipeline/metrics/coverage.py": {"coverage_section": OWN},
+    "pipeline/run/commands.py": {"render": "opens a writer of a film"},
+    "pipeline/run/folder.py": {"check_same": "copies a value"},
+    "pipeline/run/results.py": {"sampling_report_of": "reads images for `webp`, which is named here"},
     "plugins.py": {"module_digest": DIGEST},
     "poses/find.py": {"find_poses": OWN, "_digest": DIGEST},
-    "poses/heic.py": {"main": PIPE},
-    "poses/mapping.py": {"_lines": PIPE},
-    "poses/worker.py": {
-        "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN,
-    },
-    "priors/export.py": {"_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do"},
-    "priors/export_matcher.py": {
+    "poses/photographs.py": {"main": PIPE},
+    "poses/mapping.py": {"_lines": PIPE,
+        "main": PIPE, "match": OWN, "import_photographs": OWN, "matched": OWN, "verify_learned": OWN},
+    "priors/export.py": {"_own_weights": "reads weights of 45 MB with safetensors, as the readers named here do",
         "package_files": "reads files whose SHA-256 must be known", "_backbone": "loads weights whose SHA-256 is known",
-    },
-    "priors/onnx_export.py": {"onnx_bytes": OWN},
+        "onnx_bytes": OWN},
     "report/film.py": {"_decoded_sizes": OWN},
     "report/images.py": {"webp": OWN},
-    "report/overview.py": {"render_overview": OWN},
-    "report/scene_plot.py": {"_rendered": OWN, "_with_legend": OWN},
-    "runtime/cuda_source.py": {"source": "reads a file of the package"},
-    "runtime/device_memory.py": {"_text": SYSTEM},
-    "runtime/file_names.py": {"utf8_name": "opens by another name for readers that are named here"},
-    "runtime/load_module.py": {"exclusive": "opens a lock"},
-    "runtime/native_output.py": {"hidden_stderr": "opens /dev/null for writing"},
-    "runtime/output_streams.py": {"_send_to_null": "opens /dev/null for writing"},
-    "runtime/processor.py": {"processor_name": SYSTEM},
-    "runtime/rank_watch.py": {"machine": SYSTEM},
-    "temporary.py": {"_own_file": "writes"},
-    "viewer/panel.py": {"Panel._add_sampling": "reads an image for `decode`, whose reader is named here"},
+    "report/overview.py": {"render_overview": OWN,
+        "_rendered": OWN, "_with_legend": OWN},
+    "kernels/native.py": {"source": "reads a file of the package",
+        "exclusive": "opens a lock"},
+    "device.py": {"_text": SYSTEM,
+        "processor_name": SYSTEM},
+    "process.py": {"utf8_name": "opens by another name for readers that are named here",
+        "hidden_stderr": "opens /dev/null for writing",
+        "_send_to_null": "opens /dev/null for writing"},
+    "ranks.py": {"machine": SYSTEM},
+    "viewer/window.py": {"Panel._add_sampling": "reads an image for `decode`, whose reader is named here"},
 }  # fmt: skip
 """Why a function that opens something is not read by the fuzzer, by file and function."""
 
@@ -151,7 +143,7 @@ BY_TARGET = {t: [(f, n) for f, names in READERS.items() for n, of in names.items
 @pytest.mark.parametrize("target", [t for t, functions in BY_TARGET.items() if functions])
 def test_the_fuzzer_calls_the_reader(target, tmp_path, monkeypatch):
     """The valid files of a target go through the functions that it stands for."""
-    monkeypatch.setattr(lpips_weights, "NETS", dict(lpips_weights.NETS))
+    monkeypatch.setattr(lpips, "NETS", dict(lpips.NETS))
     called = set()
 
     def note(frame, event, argument):

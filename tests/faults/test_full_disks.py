@@ -20,7 +20,7 @@ from tests.faults.test_save_faults import REMEDY
 from tests.faults.tiny_runs import OWN, SAME_BYTES, STEPS, VIEWS, check_whole, digests, leftovers, words_of
 from warpgs.app.cli import main
 from warpgs.errors import ResourceError
-from warpgs.pipeline.runs.checkpoint import load_checkpoint
+from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.synthetic.demo import split_spec
 

@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from tests.faults.tiny_runs import Reference, check_whole, digests, environment, leftovers, words_of
-from warpgs.pipeline.runs.export_model import export
+from warpgs.pipeline.run.export import export
 
 pytestmark = pytest.mark.fault
 RACES = max(1, int(os.environ.get("WARPGS_KILLS", "0")) // 10)
@@ -20,10 +20,10 @@ PAIRS = (("fit", "fit"), ("resume", "resume"), ("fit", "resume"))
 CASES = [(*PAIRS[i % 3], i) for i in range(RACES)]
 GO = """
 import sys
-import warpgs.pipeline.runs.fit
+import warpgs.pipeline.run.fit
 from warpgs.app.cli import main
-from warpgs.pipeline.runs import results
-from warpgs.report.events import EventLog
+from warpgs.pipeline.run import results
+from warpgs.report.progress import EventLog
 
 def at_first_step(log, **values):
     EventLog.write = write

@@ -6,7 +6,7 @@ import pytest
 
 from tests.faults.fuzz import Worker, fuzz, missed, shallow, shares, table
 from tests.faults.targets import all_targets, parser_lines
-from warpgs.pipeline.metrics import lpips_weights
+from warpgs.pipeline.metrics import lpips
 
 INPUTS = int(os.environ.get("FUZZ", "2000"))
 FEW, ENOUGH = 10_000, 50_000
@@ -17,7 +17,7 @@ NAMES = sorted(all_targets())
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_few_damaged_files(name, tmp_path, monkeypatch):
-    monkeypatch.setattr(lpips_weights, "NETS", dict(lpips_weights.NETS))  # the reader of weights is given a small network
+    monkeypatch.setattr(lpips, "NETS", dict(lpips.NETS))  # the reader of weights is given a small network
     worker = Worker(all_targets()[name], seed=1, folder=tmp_path)
     count = max(1, round(12 * all_targets()[name].share))
     for index in range(count):

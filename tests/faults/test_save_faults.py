@@ -20,18 +20,16 @@ from tests.faults.tiny_runs import SAME_BYTES, digests, is_temporary
 from warpgs.errors import ResourceError
 from warpgs.export.ply import write_ply
 from warpgs.files import write_json
+from warpgs.locks import hold_folder
 from warpgs.pipeline.films.film import render_path
-from warpgs.pipeline.model import model_file
-from warpgs.pipeline.model.compress import Pruned
-from warpgs.pipeline.runs.checkpoint import save_checkpoint
-from warpgs.pipeline.runs.commands import evaluate
-from warpgs.pipeline.runs.export_model import export
-from warpgs.pipeline.runs.failed_step import save_failed_step
-from warpgs.pipeline.runs.folder import StoredRun, open_run
-from warpgs.pipeline.runs.prune import _write
-from warpgs.report.events import EventLog
+from warpgs.pipeline.model import table
+from warpgs.pipeline.model.edit import Pruned
+from warpgs.pipeline.run.commands import _write, evaluate
+from warpgs.pipeline.run.export import export
+from warpgs.pipeline.run.failed_step import save_failed_step
+from warpgs.pipeline.run.folder import StoredRun, open_run, save_checkpoint
 from warpgs.report.film import write_film
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.report.progress import EventLog
 
 pytestmark = pytest.mark.fault
 MANY = int(os.environ.get("WARPGS_KILLS", "0")) >= 100
@@ -135,7 +133,7 @@ WAYS: dict[str, Callable[[Saved], object]] = {
     "ply": lambda s: write_ply(s.folder / "a.ply", s.gaussians, s.run.normalization),
     "checkpoint": lambda s: save_checkpoint(s.folder, s.gaussians.tensors(), {"step": s.number}),
     "failed_step": lambda s: save_failed_step(s.folder / "f.safetensors", (s.gaussians.tensors(), {"step": s.number})),
-    "model": lambda s: model_file.save(s.folder / "a.model", s.gaussians, s.run.normalization),
+    "model": lambda s: table.save(s.folder / "a.model", s.gaussians, s.run.normalization),
     "log": save_log,
     "film": save_film,
     "path": save_path,
@@ -242,5 +240,5 @@ def assert_saved(work: Path, new: Path, what: str = "", left: bool = False) -> N
         if path.endswith(SAME_BYTES) or path == "metrics.jsonl":
             assert now[path] == wanted[path], f"{what}: {path}"
         elif path == "a.model":  # its header has no order
-            found = [model_file.load(f / path).gaussians().means for f in (work, new)]
+            found = [table.load(f / path).gaussians().means for f in (work, new)]
             assert torch.equal(*found), what

@@ -1,6 +1,6 @@
 """Every file that a user names, or a scene or a run holds, as a pipe, a device, a socket, a folder, empty, or unreadable.
 
-Each ends in a plain error at once, and two lists are proved complete: no module opens a file past `warpgs.input_files`, and
+Each ends in a plain error at once, and two lists are proved complete: no module opens a file past `warpgs.files`, and
 each that reads through it is tried here.
 """
 
@@ -19,33 +19,32 @@ import warpgs
 from tests.io import scenes
 from tests.test_input_files import special
 from warpgs.errors import WarpgsError
-from warpgs.export.compressed_ply import start_of
-from warpgs.export.formats import read_gaussians, suffixes
+from warpgs.export.base import read_gaussians, suffixes
+from warpgs.export.ply import start_of
 from warpgs.export.sog import SOG
 from warpgs.export.spz import SPZ
 from warpgs.files import read_file
-from warpgs.io import camera_files, folders, images
+from warpgs.io import folder as folders
+from warpgs.io import images, transforms
+from warpgs.io.folder import READERS
 from warpgs.io.load import load_scene
-from warpgs.io.map_files import read_numbers
-from warpgs.io.readers import READERS
-from warpgs.pipeline.farm.listing import list_jobs
-from warpgs.pipeline.farm.record import RECORD, file_digest, read_record
-from warpgs.pipeline.films.keyframes import read_keyframes
-from warpgs.pipeline.metrics.lpips_weights import convert_lpips, read_lpips
-from warpgs.pipeline.model.filters import box_of
-from warpgs.pipeline.runs import folder as run_folder
-from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
-from warpgs.pipeline.runs.failed_step import read_failed_step
+from warpgs.io.maps import read_numbers
+from warpgs.pipeline.farm.job import RECORD, file_digest, list_jobs, read_job_record
+from warpgs.pipeline.films.paths import read_keyframes
+from warpgs.pipeline.metrics.lpips import convert_lpips, read_lpips
+from warpgs.pipeline.model.edit import box_of
+from warpgs.pipeline.run import folder as run_folder
+from warpgs.pipeline.run.failed_step import read_failed_step
+from warpgs.pipeline.run.folder import TENSORS, load_checkpoint
 from warpgs.pipeline.train.presets import preset_settings
 from warpgs.plugins import Registry
-from warpgs.poses import record as poses_record
-from warpgs.poses import video
+from warpgs.poses import find as poses_record
+from warpgs.poses import photographs
 from warpgs.poses.find import find_poses, source_digest
-from warpgs.poses.heic import is_heic
-from warpgs.priors import export, export_matcher, flow, preprocess
-from warpgs.priors.cache import MapCache
-from warpgs.priors.session import open_network
-from warpgs.report.events import read_events
+from warpgs.poses.photographs import is_heic
+from warpgs.priors import export, flow, networks
+from warpgs.priors.networks import MapCache, open_network
+from warpgs.report.progress import read_events
 from warpgs.scene import Camera, Normalization, View
 
 KINDS = ("pipe", "device", "socket", "folder", "unreadable", "empty")
@@ -56,8 +55,8 @@ IMAGE = np.zeros((8, 8, 3), np.float32)
 
 def side_file(path):
     """Read the description of a network, which lies beside it."""
-    path.rename(preprocess.side_file(path))
-    return preprocess.read_side_file(path)
+    path.rename(networks.side_file(path))
+    return networks.read_side_file(path)
 
 
 def flow_folder(path):
@@ -78,7 +77,7 @@ def cached(path):
 
 def job_record(path):
     """Read job.json: one that is not whole counts as none, and the job runs again."""
-    if read_record(path.parent) is None:
+    if read_job_record(path.parent) is None:
         raise WarpgsError("no record")
 
 
@@ -89,10 +88,10 @@ def weights(path):
 
 def package(path):
     """Read the files of an installed package whose code is special."""
-    found = importlib.machinery.ModuleSpec(export_matcher.PACKAGE, None, origin=str(path.with_name("__init__.py")))
+    found = importlib.machinery.ModuleSpec(export.PACKAGE, None, origin=str(path.with_name("__init__.py")))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(importlib.util, "find_spec", lambda name: found)
-        export_matcher.package_files()
+        export.package_files()
 
 
 DOORS = {
@@ -101,13 +100,13 @@ DOORS = {
     "c.ply": ("export.compressed_ply", start_of),
     "b.spz": ("export.spz", lambda p: SPZ().is_antialiased(p)),
     "b.sog": ("export.sog", lambda p: SOG().is_antialiased(p)),
-    "cameras.json": ("io.camera_files", camera_files.read_cameras),
-    "transforms.json": ("io.transforms", camera_files.read_cameras),
+    "cameras.json": ("io.camera_files", transforms.read_cameras),
+    "transforms.json": ("io.transforms", transforms.read_cameras),
     **{f"a{suffix}": ("io.decoding", folders.read_mask) for suffix in images.SUFFIXES},
     "a.heif": ("io.decoding", lambda p: is_heic(p) or folders.read_mask(p)),
     "orientation.jpg": ("io.decoding", lambda p: folders.read_mask(p) if images.exif_orientation(p) else None),
-    **{f"a{suffix}": ("poses.find", lambda p: find_poses(p, p.parent / "out")) for suffix in video.SUFFIXES},
-    "b.mp4": ("poses.video", lambda p: video.write_frames(p, p.parent, 3, lambda line: None)),
+    **{f"a{suffix}": ("poses.find", lambda p: find_poses(p, p.parent / "out")) for suffix in photographs.SUFFIXES},
+    "b.mp4": ("poses.video", lambda p: photographs.write_frames(p, p.parent, 3, lambda line: None)),
     "path.json": ("pipeline.films.keyframes", lambda p: read_keyframes(p, CAMERA, Normalization())),
     "preset.toml": ("pipeline.train.presets", preset_settings),
     "crop.json": ("pipeline.model.filters", lambda p: box_of(str(p))),
@@ -130,7 +129,7 @@ DOORS = {
     TENSORS: ("pipeline.runs.checkpoint", lambda p: load_checkpoint(p.parent)),
     "step.safetensors": ("pipeline.runs.failed_step", lambda p: read_failed_step(p, torch.device("cpu"))),
     run_folder.CONFIG: ("schema", lambda p: run_folder.read_record(p.parent)),
-    poses_record.JSON: ("schema", lambda p: poses_record.read_record(p.parent)),
+    poses_record.JSON: ("schema", lambda p: poses_record.read_poses_record(p.parent)),
     "metrics.jsonl": ("report.events", read_events),
     "plugin.py": ("plugins", lambda p: Registry("reader", object, None).load(f"{p}:Class")),
 }  # fmt: skip
@@ -245,36 +244,29 @@ READS = {
 ALLOWED = {
     ("export/ply.py", "fromfile"): "a file that open_input opened",
     ("export/sog.py", "open"): "a member of an archive in memory",
-    ("files.py", "open"): "a descriptor to write to",
-    ("input_files.py", "open"): "the one place",
-    ("input_files.py", "fdopen"): "the one place",
-    ("output_folders.py", "open"): "opens below a folder without following links, and regular files alone",
-    ("output_folders.py", "fdopen"): "opens below a folder without following links, and regular files alone",
-    ("pipeline/farm/batch.py", "read_text"): "a job in a private folder",
-    ("pipeline/farm/slurm.py", "read_text"): "an answer in a private folder",
+    ("files.py", "open"): "a descriptor to write to; the one place",
+    ("files.py", "fdopen"): "the one place",
+    ("folders.py", "open"): "opens below a folder without following links, and regular files alone; makes a temporary file",
+    ("folders.py", "fdopen"): "opens below a folder without following links, and regular files alone",
+    ("pipeline/farm/slurm.py", "read_text"): "a job in a private folder; an answer in a private folder",
     ("pipeline/farm/slurm.py", "open"): "output in a private folder",
     ("pipeline/farm/worker.py", "fdopen"): "the standard output",
-    ("pipeline/runs/failed_step.py", "safe_open"): "a path that open_input tried",
+    ("pipeline/run/failed_step.py", "safe_open"): "a path that open_input tried",
     ("poses/find.py", "read_bytes"): "a model that pycolmap has just written",
-    ("poses/heic.py", "read_text"): "a job that the calling process has just written",
-    ("poses/video.py", "VideoCapture"): "a path whose first bytes read_start read",
-    ("poses/worker.py", "open"): "a database that this process makes",
-    ("poses/worker.py", "read_text"): "a job that the calling process has just written",
-    ("priors/onnx_export.py", "read_bytes"): "a network that torch has just written",
+    ("poses/photographs.py", "read_text"): "a job that the calling process has just written",
+    ("poses/photographs.py", "VideoCapture"): "a path whose first bytes read_start read",
+    ("poses/mapping.py", "open"): "a database that this process makes",
+    ("poses/mapping.py", "read_text"): "a job that the calling process has just written",
+    ("priors/export.py", "read_bytes"): "a network that torch has just written",
     ("report/film.py", "VideoCapture"): "a temporary film that was just written",
     ("report/overview.py", "read_bytes"): "an image that a child has just written",
-    ("report/scene_plot.py", "read_bytes"): "an image that a child has just written",
-    ("report/scene_plot.py", "open"): "an image in memory",
-    ("runtime/device_memory.py", "read_text"): "files of the system",
-    ("runtime/cuda_source.py", "read_text"): "code of the package",
-    ("runtime/file_names.py", "open"): "a descriptor by which a library opens the file",
-    ("runtime/folder_lock.py", "fdopen"): "the lock of a folder",
-    ("runtime/load_module.py", "open"): "a lock in the cache of kernels",
-    ("runtime/native_output.py", "open"): "the null device",
-    ("runtime/output_streams.py", "open"): "the null device",
-    ("temporary.py", "open"): "makes a temporary file",
-    ("runtime/processor.py", "read_text"): "files of the system",
-    ("runtime/rank_watch.py", "read_text"): "files of the system",
+    ("report/overview.py", "open"): "an image in memory",
+    ("device.py", "read_text"): "files of the system",
+    ("kernels/native.py", "read_text"): "code of the package",
+    ("process.py", "open"): "a descriptor by which a library opens the file; the null device; the null device",
+    ("locks.py", "fdopen"): "the lock of a folder",
+    ("kernels/native.py", "open"): "a lock in the cache of kernels",
+    ("ranks.py", "read_text"): "files of the system",
 }
 """Calls that open no file of others, and why not."""
 
@@ -291,7 +283,7 @@ def test_no_module_opens_a_file_past_the_one_place():
     for path in PACKAGE.rglob("*.py"):
         tree = ast.parse(path.read_text("utf-8"))
         found |= {(path.relative_to(PACKAGE).as_posix(), name) for name in calls(tree) if name in READS}
-    assert found - ALLOWED.keys() == set(), "open these with warpgs.input_files, or say why not"
+    assert found - ALLOWED.keys() == set(), "open these with warpgs.files, or say why not"
     assert ALLOWED.keys() - found == set(), "these are gone"
 
 
@@ -309,4 +301,4 @@ def test_every_module_that_opens_files_is_tried():
 
 
 def test_formats_are_all_tried():
-    assert {f"a{s}" for s in (*suffixes(), *images.SUFFIXES, *video.SUFFIXES)} <= DOORS.keys()
+    assert {f"a{s}" for s in (*suffixes(), *images.SUFFIXES, *photographs.SUFFIXES)} <= DOORS.keys()

@@ -17,11 +17,11 @@ import cv2
 import numpy as np
 import torch
 
-from warpgs.export.formats import read_gaussians
+from warpgs.export.base import read_gaussians
 from warpgs.export.ply import read_ply
 from warpgs.files import LOCK, OWN_NAMES
-from warpgs.pipeline.metrics.lpips_weights import NETS
-from warpgs.pipeline.runs.checkpoint import load_checkpoint
+from warpgs.pipeline.metrics.lpips import NETS
+from warpgs.pipeline.run.folder import load_checkpoint
 from warpgs.report.film import _decoded_sizes
 from warpgs.synthetic import raycast
 from warpgs.synthetic.demo import camera_path, split_spec, still_life, write_demo

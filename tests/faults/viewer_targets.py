@@ -10,9 +10,9 @@ import numpy as np
 
 from tests.faults.mutations import changed_value, flip, number, text_line
 from tests.faults.targets import Target, register
+from warpgs import ranks
 from warpgs.errors import DataError
-from warpgs.runtime import listening
-from warpgs.viewer import connections, frames
+from warpgs.viewer import server
 
 PLACE = {"name": "/crop", "owner": ""}
 MESSAGES = {
@@ -42,7 +42,7 @@ TOKEN = "a" * 43
 
 def frame_files(root: Path) -> list[Path]:
     for name, message in MESSAGES.items():
-        (root / f"{name}.frame").write_bytes(frames.write_frame(message))
+        (root / f"{name}.frame").write_bytes(server.write_frame(message))
     return sorted(root.glob("*.frame"))
 
 
@@ -65,7 +65,7 @@ def message_of(root: Path, path: Path) -> object | None:
     from viser.infra._messages import Message
 
     data = path.read_bytes() if path.is_file() else b""
-    rules = connections.Rules()
+    rules = server.Rules()
     rules.control_of = CONTROLS.get
     try:
         frame = rules.checked(data)
@@ -135,7 +135,7 @@ def admitted(root: Path, path: Path) -> str | None:
         request = e.value
     except Exception as e:  # of websockets, which closes the connection
         raise DataError(f"{path}: is no request that websockets reads ({e})") from e
-    guard = listening.WebGuard()
+    guard = ranks.WebGuard()
     guard.token = TOKEN
     headers = request.headers
     return guard.admitted_path(request.path, headers.get_all("Host"), headers.get_all("Origin"), "Upgrade" in headers)
@@ -143,13 +143,13 @@ def admitted(root: Path, path: Path) -> str | None:
 
 if importlib.util.find_spec("viser"):
     FRAMES = (
-        connections.Rules.checked,
-        frames.read_frame,
-        frames.control_value,
-        frames._value,
-        frames._rotation,
-        frames._limited,
+        server.Rules.checked,
+        server.read_frame,
+        server.control_value,
+        server._value,
+        server._rotation,
+        server._limited,
     )
     register(Target("frame of a websocket", frame_files, message_of, FRAMES, (frame_value, frame_value, number)))
-    REQUESTS = (listening.WebGuard.admitted_path, listening._is_own)
+    REQUESTS = (ranks.WebGuard.admitted_path, ranks._is_own)
     register(Target("request to the viewer", request_files, admitted, REQUESTS, (request_line, request_line, text_line)))

@@ -5,7 +5,7 @@ import pytest
 
 from tests.io import scenes
 from warpgs.io.load import load_scene
-from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.metrics.scores import counted_region
 
 
 def ring(i):

@@ -11,7 +11,7 @@ from PIL import Image
 
 from tests.io import scenes
 from warpgs.errors import DataError, ResourceError
-from warpgs.io.decoding import decode
+from warpgs.io.images import decode
 from warpgs.io.load import load_scene
 
 

@@ -10,7 +10,7 @@ from tests.io import scenes
 from warpgs.errors import DataError, UsageError
 from warpgs.io.images import LoadedImage, turn_upright
 from warpgs.io.load import load_scene
-from warpgs.io.map_pixels import in_pixels_of, resized
+from warpgs.io.maps import in_pixels_of, resized
 
 SHAPE = (scenes.HEIGHT, scenes.WIDTH)
 RAMP = (np.arange(np.prod(SHAPE), dtype=np.uint16).reshape(SHAPE) * 10 + 1000).astype(np.uint16)

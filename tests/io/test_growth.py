@@ -11,16 +11,15 @@ import pytest
 import warpgs
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.io import camera_files, colmap, middlebury
-from warpgs.io.load import load_scene
-from warpgs.io.splits import coincident_views, split_views
-from warpgs.pipeline.farm.listing import list_jobs
-from warpgs.poses.advice import advice, neighbours
-from warpgs.poses.find import _notes
+from warpgs.io import colmap, others
+from warpgs.io import transforms as camera_files
+from warpgs.io.load import coincident_views, load_scene, split_views
+from warpgs.pipeline.farm.job import list_jobs
+from warpgs.poses.find import _notes, advice, neighbours
 from warpgs.poses.mapping import FoundView, Mapping, camera_groups, cameras_of
 from warpgs.poses.photographs import Photograph
-from warpgs.report.events import read_events
-from warpgs.report.image_names import image_names
+from warpgs.report.page import image_names
+from warpgs.report.progress import read_events
 from warpgs.scene import Camera, Scene, View
 
 PACKAGE = str(Path(warpgs.__file__).parent)
@@ -116,7 +115,7 @@ def test_parameters_of_middlebury(tmp_path):
     def make(n):
         path = tmp_path / f"{n}_par.txt"
         path.write_text(f"{n}\n" + "".join(f"{i}.png {'1 ' * 21}\n" for i in range(n)))
-        return lambda: middlebury.read_rows(path)
+        return lambda: others.read_camera_rows(path)
 
     grows(make)
 
@@ -145,7 +144,7 @@ def test_splits_by_names(form):
     ("c.png", "could be any of a/b/c.png, b/c.png"), ("/c.png", "no view"), ("", "no view"), ("f" * 9999, "no view"),
 ])  # fmt: skip
 def test_names_are_found_by_their_ends(wanted, found):
-    from warpgs.io.splits import _Names
+    from warpgs.io.load import _Names
 
     names = _Names(["a/b/c.png", "b/c.png", "x/d/e.png", "f" * 5000], "s")
     if " " in found:
@@ -209,7 +208,7 @@ def test_what_to_photograph_next():
 @pytest.mark.parametrize("kind", ["transforms", "middlebury"])
 def test_an_image_that_is_listed_twice_is_read_once(kind, tmp_path, monkeypatch):
     """One file of ten thousand rows would decode its image ten thousand times, and hold all of them."""
-    from warpgs.io import folders
+    from warpgs.io import folder as folders
 
     folder = scenes.WRITERS[kind](tmp_path / "scene")
     if kind == "transforms":

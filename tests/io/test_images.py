@@ -9,10 +9,8 @@ from PIL import Image
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.decoding import decode
-from warpgs.io.images import Lens, load_image
-from warpgs.io.load import load_scene
-from warpgs.io.normalize import fingerprint
+from warpgs.io.images import Lens, decode, load_image
+from warpgs.io.load import fingerprint, load_scene
 
 
 def lens(width, height, focal=20.0, distortion=(), model="PINHOLE"):

@@ -5,7 +5,7 @@ import pytest
 
 from tests.io import scenes
 from tests.lens_cameras import opencv_pixels
-from warpgs import lenses
+from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import project_points
 from warpgs.io.load import load_scene
@@ -83,7 +83,7 @@ def lenses_reach(camera) -> np.ndarray:
     """Return where the way back from the pixels of a camera ends."""
     x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     plane = (np.stack([x, y], -1) - camera.K[:2, 2]) / camera.K[0, 0]
-    return np.isfinite(lenses.from_plane(camera.model, camera.distortion, plane)).all(-1)
+    return np.isfinite(geometry.from_plane(camera.model, camera.distortion, plane)).all(-1)
 
 
 def test_errors_name_the_way_to_keep_a_lens(tmp_path):

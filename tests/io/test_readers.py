@@ -11,8 +11,8 @@ import pytest
 from tests.io import scenes
 from tests.io.scenes import refused
 from warpgs.errors import UsageError
+from warpgs.io.folder import Probe, Reader, all_readers, find_reader
 from warpgs.io.load import load_scene
-from warpgs.io.readers import Probe, Reader, all_readers, find_reader
 from warpgs.scene import Camera, Normalization, Scene, View
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "06_own_format.py"

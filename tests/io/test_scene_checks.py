@@ -12,10 +12,9 @@ import warpgs
 from tests.io import scenes
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import DataError, UsageError
+from warpgs.io.folder import Probe, Reader
 from warpgs.io.load import load_scene
-from warpgs.io.readers import Probe, Reader
-from warpgs.scene import Camera, GivenDepth, Normalization, PointCloud, Scene, View
-from warpgs.scene_checks import checked_scene, checked_views
+from warpgs.scene import Camera, GivenDepth, Normalization, PointCloud, Scene, View, checked_scene, checked_views
 
 W, H = 20, 12
 RNG = np.random.default_rng(0)

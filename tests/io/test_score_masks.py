@@ -7,9 +7,9 @@ import pytest
 
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.io.image_ids import image_ids
+from warpgs.io.folder import image_ids
 from warpgs.io.load import load_scene
-from warpgs.pipeline.metrics.evaluate import score
+from warpgs.pipeline.metrics.scores import score
 
 RECT = tuple(f"rect_{i + 1:03d}_3_r5000.png" for i in range(scenes.VIEWS))
 

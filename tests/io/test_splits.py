@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.load import load_scene
-from warpgs.io.splits import Split, coincident_views, held_out_split, split_views
+from warpgs.io.load import Split, coincident_views, held_out_split, load_scene, split_views
 from warpgs.scene import Camera
 
 

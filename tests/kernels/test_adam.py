@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.reference.adam import adam_reference
-from warpgs.kernels.adam import adam_step
+from warpgs.kernels.update import adam_step
 
 
 def run(param, grads, **options):

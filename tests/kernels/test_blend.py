@@ -10,12 +10,12 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
-from warpgs.colors import C0
 from warpgs.constants import ALPHA_CUT, ALPHA_MAX, RULES, TRANSMITTANCE_STOP
 from warpgs.kernels.blend import blend, composite, contributions
-from warpgs.kernels.blend_settings import BlendSettings
+from warpgs.kernels.falloff import BlendSettings
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
+from warpgs.scene import C0
 
 
 def drawn(gaussians, cam, background, rule, tile_size=16, degree=1):

@@ -10,8 +10,7 @@ from tests.reference.blend_channels import blend_channels_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
-from warpgs.kernels.blend import blend
-from warpgs.kernels.blend_channels import _width, blend_channels, width_of
+from warpgs.kernels.blend import _width, blend, blend_channels, width_of
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
 

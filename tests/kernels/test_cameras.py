@@ -10,7 +10,8 @@ from tests.parallel_camera import NAME
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels.project import project
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 BENDS = [[0.05, -0.02, 0.03, 0.01], [-0.04, 0.02, 0.01, 0.03]]
 

@@ -5,9 +5,9 @@ import itertools
 import pytest
 import warp as wp
 
-from warpgs.kernels import blend_channels, blend_cuda, heaviest, median_depth, project_cuda
-from warpgs.kernels.cameras.base import CAMERA_MODELS
-from warpgs.pipeline.runs.precompile import fit_kernels
+from warpgs.kernels import blend, blend_cuda, project_cuda, walk
+from warpgs.kernels.cameras import CAMERA_MODELS
+from warpgs.pipeline.run.precompile import fit_kernels
 
 ARCHITECTURE = 75
 """Oldest architecture that is compiled for (Turing)."""
@@ -16,12 +16,12 @@ ARCHITECTURE = 75
 def modules() -> dict[str, wp.Module]:
     """Modules of all kernels that a fit launches on CUDA, and of those that only the public op launches."""
     kernels = [k for k, _ in fit_kernels(True)]
-    kernels += [make(size) for make in (median_depth.make_native, heaviest.make_native) for size in (8, 16)]
+    kernels += [make(size) for make in (walk.make_median_native, walk.make_heaviest_native) for size in (8, 16)]
     variants = list(itertools.product(("stored", "activated", "covariances"), (True, False)))  # parameters, antialiased
     for variant in [*variants, ("stored", False, 25)]:
         both = project_cuda.make_forward, project_cuda.make_backward
         kernels += [make(real, "pinhole", *variant) for make in both for real in (wp.float32, wp.float64)]
-    for channels in blend_channels.WIDTHS:
+    for channels in blend.WIDTHS:
         kernels += [blend_cuda.make_forward(8, save, per, channels) for save in (True, False) for per in (1, 2)]
         for depth, absgrad in itertools.product((True, False), repeat=2):
             made = blend_cuda.make_backward(8, depth, 64, True, channels, absgrad)

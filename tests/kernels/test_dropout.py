@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from tests.reference.dropout import expected_factors
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.step_buffers import Setting
+from warpgs.kernels.update import Setting, opacity_dropout
 
 COUNT = 20_000
 

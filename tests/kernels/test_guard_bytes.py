@@ -6,12 +6,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
-from warpgs.kernels.adam import adam_step
 from warpgs.kernels.blend import blend, contributions
-from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.ssim import differences, ssim
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
+from warpgs.kernels.update import adam_step
+from warpgs.kernels.walk import median_depth
 
 GUARD = 64
 """Entries before and behind each tensor; a multiple of 16 bytes."""

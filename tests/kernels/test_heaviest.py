@@ -12,10 +12,11 @@ from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
-from warpgs.kernels.heaviest import heaviest
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import bin_tiles
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.kernels.walk import heaviest
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 
 def found_by(gaussians, cam, rule, k, tile_size=16):

@@ -6,7 +6,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from tests.reference.knn import mean_square_distances_reference
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.neighbours import mean_square_distances
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 4, 33, 1500])

@@ -9,11 +9,12 @@ import torch
 
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.lens_cameras import COEFFICIENTS, LENSES, lens_camera, opencv_pixels
-from warpgs import lenses
+from warpgs import geometry
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.kernels.project import project
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 from warpgs.scene import Camera, Gaussians
 
@@ -78,7 +79,7 @@ def test_pixels_are_those_of_opencv(model, largest, dtype):
     """`cv2.projectPoints` and `cv2.fisheye.projectPoints`; the depth of a fisheye is the distance."""
     positions, cam = directions(largest), lens_camera(model, width=400, height=300, cameras=1)
     wanted = opencv_pixels(model, COEFFICIENTS[model], cam.K[0].numpy(), positions)
-    plane = lenses.to_plane(model, np.array(COEFFICIENTS[model]), positions)
+    plane = geometry.to_plane(model, np.array(COEFFICIENTS[model]), positions)
     assert np.allclose(plane * np.diag(cam.K[0])[:2] + cam.K[0, :2, 2].numpy(), wanted, atol=1e-9)
     found = projected(at(positions, dtype), Camera(*(t.to(dtype) for t in (cam.viewmat, cam.K)), 400, 300, model,
                                                    cam.distortion.to(dtype)))[0]  # fmt: skip
@@ -167,7 +168,7 @@ def test_nothing_is_drawn_beyond_the_rim(name, dtype):
     cam = Camera(torch.eye(4, dtype=dtype)[None], K, 8000, 8000, model, K.new_tensor([coefficients]))
     drawn = projected(at(positions, dtype), cam)[0, :, 5] > 0
     assert drawn.tolist() == [True, True] + [False] * 21
-    assert lenses.on_lens(model, np.array(coefficients), positions).tolist() == drawn.tolist()
+    assert geometry.on_lens(model, np.array(coefficients), positions).tolist() == drawn.tolist()
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -220,12 +221,12 @@ def test_extremes_give_finite_numbers(model):
 def test_the_way_back_from_the_plane(model, largest):
     """Positions come back from their points in the plane, as arrays and tensors; a point beyond the rim gives NaN."""
     positions, lens = directions(largest), np.array(COEFFICIENTS[model])
-    plane = lenses.to_plane(model, lens, positions)
-    depth = lenses.depth_of(model, positions)[:, None]
+    plane = geometry.to_plane(model, lens, positions)
+    depth = geometry.depth_of(model, positions)[:, None]
     wanted = np.concatenate([plane, np.ones_like(depth)], 1) if model == "orthographic" else positions / depth
-    assert np.allclose(lenses.from_plane(model, lens, plane), wanted, atol=1e-9)
-    found = lenses.from_plane(model, torch.from_numpy(lens), torch.from_numpy(plane))
+    assert np.allclose(geometry.from_plane(model, lens, plane), wanted, atol=1e-9)
+    found = geometry.from_plane(model, torch.from_numpy(lens), torch.from_numpy(plane))
     assert np.allclose(found.numpy(), wanted, atol=1e-9)
     if model != "orthographic":
         rim = {"opencv": (-0.3, *[0] * 7), "fisheye": (-0.15, 0, 0, 0)}[model]
-        assert np.isnan(lenses.from_plane(model, np.array(rim), np.array([[1.5, 0.0]]))).all()
+        assert np.isnan(geometry.from_plane(model, np.array(rim), np.array([[1.5, 0.0]]))).all()

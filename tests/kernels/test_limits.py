@@ -9,9 +9,9 @@ from tests.reference.adam import adam_reference
 from tests.reference.ssim import ssim_reference
 from tests.tolerances import close
 from warpgs.kernels import ssim as ssim_module
-from warpgs.kernels.adam import adam_step
-from warpgs.kernels.knn import mean_square_distances, morton_codes
+from warpgs.kernels.neighbours import mean_square_distances, morton_codes
 from warpgs.kernels.ssim import differences, ssim
+from warpgs.kernels.update import adam_step
 
 
 @pytest.mark.parametrize("size", [1e-15, 1e-14])

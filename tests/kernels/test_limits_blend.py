@@ -11,7 +11,7 @@ from tests.reference.blend import blend_reference
 from tests.tolerances import close
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
-from warpgs.kernels import blend, tiles, tiles_order
+from warpgs.kernels import blend, tiles
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
@@ -35,11 +35,11 @@ def test_budget_is_met_to_the_byte():
 def test_one_running_sum_holds_both_numbers():
     """The largest sum of each number of Gaussians stays below 2^63, and every number of instances that is allowed fits."""
     for count in (1, 2, 3, 4095, 4096, 2_794_625, 2**23, 2**31 - 1):
-        unit = 2 ** tiles_order.sum_bits(count)
+        unit = 2 ** tiles.sum_bits(count)
         assert unit > tiles.MAX_INSTANCES and count * unit + unit - 1 < 2**63
-        assert tiles_order.split_sum(count * unit + unit - 1, count) == (count, unit - 1)
-    assert tiles_order.sums_fit(2_794_625, 240 * 135)  # 3840 x 2160 px
-    assert tiles_order.sums_fit(2**23, 2**16 - 1) and not tiles_order.sums_fit(2**23, 2**16)
+        assert tiles.split_sum(count * unit + unit - 1, count) == (count, unit - 1)
+    assert tiles.sums_fit(2_794_625, 240 * 135)  # 3840 x 2160 px
+    assert tiles.sums_fit(2**23, 2**16 - 1) and not tiles.sums_fit(2**23, 2**16)
 
 
 def test_free_memory_is_asked_for_only_where_it_may_matter(monkeypatch):
@@ -73,7 +73,7 @@ def test_counted_apart_where_one_sum_might_not_hold_both(monkeypatch, fits):
 
     monkeypatch.setattr(tiles, "sums_fit", lambda count, per_camera: fits and (count, per_camera) == (10, 6))
     monkeypatch.setattr(tiles, "_check_total", stop("apart"))
-    monkeypatch.setattr(tiles.interop, "launch", stop("together"))
+    monkeypatch.setattr(tiles.launch, "launch", stop("together"))
     with pytest.raises(InterruptedError, match="together" if fits else "apart"):
         tiles.bin_tiles(projected, counts, width=48, height=30, rule=EXACT)
 

@@ -9,10 +9,9 @@ import torch
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.project import project_reference
 from tests.tolerances import close
-from warpgs.colors import C0
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.kernels.project import project
-from warpgs.scene import Gaussians
+from warpgs.scene import C0, Gaussians
 
 EXACT = RULES["exact"]
 

@@ -11,10 +11,11 @@ from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import RULES, Rule
 from warpgs.kernels.blend import blend
-from warpgs.kernels.median_depth import median_depth
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.kernels.walk import median_depth
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 
 def rendered(gaussians, cam, rule, tile_size=16):

@@ -10,17 +10,17 @@ import warp as wp
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import ALPHA_CUT
-from warpgs.kernels import blend_cuda, native
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime import interop
-from warpgs.runtime.cuda_source import source
+from warpgs.kernels import blend_cuda, launch, native
+from warpgs.kernels.native import source
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 pytestmark = pytest.mark.cuda
 CUDA = torch.device("cuda", 0)
 
 
-def ints(tensor: torch.Tensor) -> interop.View:
-    return interop.view(tensor.view(-1), wp.int32)
+def ints(tensor: torch.Tensor) -> launch.View:
+    return launch.view(tensor.view(-1), wp.int32)
 
 
 @pytest.mark.parametrize("count", [1, 31, 1000, 1025, 8192, 8193, 20_000])
@@ -35,7 +35,7 @@ def test_long_lists_come_first(count):
     counts = torch.zeros(blend_cuda.RANKS, dtype=torch.int32, device=CUDA)
     threads = -(-count // blend_cuda.ORDER_THREADS) * blend_cuda.ORDER_THREADS
     inputs = [ints(ranges), count, ints(counts), ints(order)]
-    interop.launch(blend_cuda.make_kernels(16).order_tiles, threads, inputs, CUDA, block_dim=blend_cuda.ORDER_THREADS)
+    launch.launch(blend_cuda.make_kernels(16).order_tiles, threads, inputs, CUDA, block_dim=blend_cuda.ORDER_THREADS)
     ranks = 32 - torch.ceil(torch.log2(lengths.double() + 1)).int()
     for rank, found in enumerate(order.cpu()):
         wanted = torch.nonzero(ranks == rank)[:, 0].int()
@@ -82,7 +82,7 @@ def test_wanted_items_go_to_the_first_threads(fraction):
     draw = torch.rand(blocks * native.BLOCK, generator=torch.Generator().manual_seed(0))
     wanted = torch.where(draw < fraction, (draw * 1000).int() % 3 + 1, 0).int()
     found = torch.full_like(wanted, -7).to(CUDA)
-    interop.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
+    launch.launch(small_kernels().deal, len(wanted), [ints(wanted.to(CUDA)), ints(found)], CUDA, block_dim=native.BLOCK)
     for i, dealt in enumerate(found.cpu().view(blocks, -1).tolist()):
         items = range(i * native.BLOCK, (i + 1) * native.BLOCK)
         mine = [item for item in items if wanted[item] > 0]
@@ -125,8 +125,8 @@ def test_no_block_that_draws_is_left_out(longest, corner):
     alpha = opacity * torch.exp(-0.5 * ((u11 * dx + u12 * dy) ** 2 + (u22 * dy) ** 2))
     drawn = (alpha.amax((1, 2)) >= ALPHA_CUT).to(CUDA)
     found = torch.empty(len(records), dtype=torch.int32, device=CUDA)
-    floats = [interop.view(t.to(CUDA).view(-1), wp.float32) for t in (records, corners)]
-    interop.launch(small_kernels().block, len(records), [*floats, ALPHA_CUT, ints(found)], CUDA)
+    floats = [launch.view(t.to(CUDA).view(-1), wp.float32) for t in (records, corners)]
+    launch.launch(small_kernels().block, len(records), [*floats, ALPHA_CUT, ints(found)], CUDA)
     assert int(drawn.sum()) > 180_000 and int((drawn & (found == 0)).sum()) == 0
 
 
@@ -160,10 +160,10 @@ def test_gradients_agree_for_every_chunk(monkeypatch):
 def test_devices_and_streams_without_a_number():
     """The current device is meant; Warp's own work runs on torch's stream, and on no other afterwards."""
     unnumbered = torch.device("cuda")
-    assert interop.warp_device(unnumbered) is interop.warp_device(CUDA) and interop.warp_device(torch.device("cpu")).is_cpu
-    where = interop.warp_device(CUDA)
+    assert launch.warp_device(unnumbered) is launch.warp_device(CUDA) and launch.warp_device(torch.device("cpu")).is_cpu
+    where = launch.warp_device(CUDA)
     before = where.stream.cuda_stream
-    with torch.cuda.stream(torch.cuda.Stream(CUDA)), interop.stream_of(CUDA):
+    with torch.cuda.stream(torch.cuda.Stream(CUDA)), launch.stream_of(CUDA):
         wanted = torch.cuda.current_stream(CUDA).cuda_stream
-        assert where.stream.cuda_stream == wanted == interop.warp_stream(unnumbered).cuda_stream
+        assert where.stream.cuda_stream == wanted == launch.warp_stream(unnumbered).cuda_stream
     assert where.stream.cuda_stream == before != wanted

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.reference.opacity_decay import decayed
-from warpgs.kernels.opacity_decay import opacity_decay
+from warpgs.kernels.update import opacity_decay
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.995, 0.999, 1 - 1e-6])

@@ -8,8 +8,8 @@ import torch
 
 from tests.reference.pixel_size import log_pixel
 from tests.scenes import ring
-from warpgs.kernels.pixel_size import SMALLEST, pixel_size
-from warpgs.pipeline.model.scale_limits import TrainingCameras
+from warpgs.kernels.neighbours import SMALLEST_PIXEL, pixel_size
+from warpgs.pipeline.model.limits import TrainingCameras
 from warpgs.scene import Camera
 
 CPU = torch.device("cpu")
@@ -33,11 +33,11 @@ def test_it_is_the_smallest_pixel_of_those_that_see_it(device, cameras):
     generator = torch.Generator().manual_seed(cameras)
     means = torch.randn(2000, 3, generator=generator) * torch.logspace(-2, 4, 2000)[:, None]
     given = rows(cameras)
-    exact = torch.from_numpy(log_pixel(means.numpy(), given.numpy(), 0.4, SMALLEST))
+    exact = torch.from_numpy(log_pixel(means.numpy(), given.numpy(), 0.4, SMALLEST_PIXEL))
     found = pixel_size(means.to(device), given.to(device), 0.4).cpu().double()
     same = torch.isclose(found, exact, rtol=1e-5, atol=1e-5)
     assert found.dtype == torch.float64 and float(same.double().mean()) > 0.998
-    seen = exact > math.log(2 * SMALLEST)
+    seen = exact > math.log(2 * SMALLEST_PIXEL)
     assert bool(seen.any()) and (cameras == 40 or not bool(seen.all()))
 
 
@@ -54,7 +54,7 @@ def test_a_row_says_what_a_camera_sees(device):
     ):
         found = pixel_size(means.to(device), TrainingCameras.of([camera], device).rows, 1.0).cpu()
         for size, expected in zip(found.exp().tolist(), wanted, strict=True):
-            assert size == pytest.approx(SMALLEST if expected is None else expected, rel=1e-5)
+            assert size == pytest.approx(SMALLEST_PIXEL if expected is None else expected, rel=1e-5)
     both = TrainingCameras.of([pinhole, *ring(3)], device)
     assert both.rows.shape == (4, 9) and both.centers.shape == (4, 3)
 
@@ -62,9 +62,9 @@ def test_a_row_says_what_a_camera_sees(device):
 def test_at_a_camera_and_without_gaussians(device):
     """The smallest size; nothing from nothing; a NaN is seen by none; a wrong shape is refused."""
     given = rows(1).to(device)
-    assert float(pixel_size(given[:, :3].contiguous(), given, 0.5)) == pytest.approx(math.log(SMALLEST))
+    assert float(pixel_size(given[:, :3].contiguous(), given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
     assert pixel_size(given[:0, :3], given, 0.5).shape == (0,)
     broken = torch.full((1, 3), math.nan, device=device)
-    assert float(pixel_size(broken, given, 0.5)) == pytest.approx(math.log(SMALLEST))
+    assert float(pixel_size(broken, given, 0.5)) == pytest.approx(math.log(SMALLEST_PIXEL))
     with pytest.raises(ValueError, match="cameras"):
         pixel_size(given[:, :3].contiguous(), given[:, :4], 0.5)

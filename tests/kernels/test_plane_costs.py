@@ -5,8 +5,7 @@ import pytest
 
 from tests.priors.rigs import still_life
 from tests.reference import plane_costs
-from warpgs.priors.sweep_cpu import matching_costs
-from warpgs.priors.sweep_planes import UNIT
+from warpgs.priors.sweep import UNIT, matching_costs_cpu
 from warpgs.scene import Camera, View
 
 
@@ -20,7 +19,7 @@ def test_costs_are_those_of_opencv(size):
         views.append(View(v.name, Camera(c.viewmat, c.K, width, height), np.resize(v.image[40:], (height, width, 3))))
     views[2] = still_life()[0][2]  # of another size
     inverses = np.linspace(1 / 12, 1 / 2, 21)
-    found = matching_costs(views[1], [views[0], views[2]], inverses, 7).numpy()
+    found = matching_costs_cpu(views[1], [views[0], views[2]], inverses, 7).numpy()
     wanted = plane_costs.matching_costs(views[1], [views[0], views[2]], inverses, 7).transpose(1, 2, 0)
     off = np.abs(found[..., :21] / UNIT - wanted)
     # a pixel at the very border is inside for one and outside for the other

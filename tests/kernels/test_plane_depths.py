@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from tests.reference.plane_depths import best_inverse
-from warpgs.kernels.plane_depths import best_inverses
+from warpgs.kernels.sweep import best_inverses
 
 
 def test_best_planes_are_those_of_numpy():

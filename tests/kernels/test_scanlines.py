@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tests.reference.scanlines import scanline_costs as defined
-from warpgs.kernels.scanlines import LARGEST, scanline_costs
+from warpgs.kernels.sweep import LARGEST, scanline_costs
 
 
 def problem(shape: tuple[int, int, int], seed: int = 0, largest: int = 4096):

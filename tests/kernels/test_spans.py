@@ -7,8 +7,7 @@ import pytest
 import torch
 import warp as wp
 
-from warpgs.kernels import falloff, functions
-from warpgs.runtime import interop
+from warpgs.kernels import ellipse, falloff, launch
 
 COUNT = 4000
 
@@ -16,7 +15,7 @@ COUNT = 4000
 @functools.cache
 def make_probe():
     """A kernel that calls the functions in float64, one case an item."""
-    s, f = functions.make_spans(wp.float64), falloff.make_functions(wp.float64)
+    s, f = ellipse.make_spans(wp.float64), falloff.make_functions(wp.float64)
     vec3 = wp.types.vector(3, wp.float64)
 
     @wp.kernel(enable_backward=False)
@@ -47,8 +46,8 @@ def make_probe():
 
 def probe(cases: torch.Tensor, device, whole_tiles=0, origin=16, size=53, tile_size=16) -> torch.Tensor:
     spans = torch.zeros(len(cases), 5, dtype=torch.int32, device=device)
-    inputs = [interop.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, interop.view(spans, wp.int32)]
-    interop.launch(make_probe(), len(cases), inputs, device)
+    inputs = [launch.view(cases.to(device), wp.float64), whole_tiles, origin, size, tile_size, launch.view(spans, wp.int32)]
+    launch.launch(make_probe(), len(cases), inputs, device)
     return spans.cpu()
 
 
@@ -163,7 +162,7 @@ def test_columns_of_the_box_where_there_is_no_reach(device, far):
 @functools.cache
 def make_reach():
     """A kernel for `reach_of` and for the falloff of both scalar types."""
-    s = functions.make_spans(wp.float64)
+    s = ellipse.make_spans(wp.float64)
     single = falloff.make_falloff(wp.float32)
 
     @wp.kernel(enable_backward=False)
@@ -182,9 +181,9 @@ def make_reach():
 
 def reaches(opacities, cut, square_sigma, xs):
     found, falls = torch.zeros_like(opacities), torch.zeros_like(xs)
-    inputs = [interop.view(opacities, wp.float64), cut, square_sigma, interop.view(xs, wp.float32)]
-    outputs = [interop.view(found, wp.float64), interop.view(falls, wp.float32)]
-    interop.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
+    inputs = [launch.view(opacities, wp.float64), cut, square_sigma, launch.view(xs, wp.float32)]
+    outputs = [launch.view(found, wp.float64), launch.view(falls, wp.float32)]
+    launch.launch(make_reach(), len(opacities), [*inputs, *outputs], torch.device("cpu"))
     return found, falls
 
 

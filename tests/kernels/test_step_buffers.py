@@ -7,7 +7,7 @@ import torch
 
 from tests.kernels.test_guard_bytes import Guarded
 from tests.reference import step_buffers as reference
-from warpgs.kernels.step_buffers import NOT_FINITE, SHIFT, Setting, begin_step, end_step, squared_error
+from warpgs.kernels.update import NOT_FINITE, SHIFT, Setting, begin_step, end_step, squared_error
 
 
 def rows(device, height=5, width=7, views=3, steps=4) -> list[torch.Tensor]:

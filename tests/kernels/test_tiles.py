@@ -9,12 +9,21 @@ from tests.reference.project import project_reference
 from tests.reference.tiles import touched_reference
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
+from warpgs.kernels import launch
 from warpgs.kernels.blend import blend, contributions
 from warpgs.kernels.project import project
-from warpgs.kernels.tiles import InstanceMemory, Visible, bin_tiles
-from warpgs.kernels.tiles_emit import EACH, make_find_ranges
-from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries
-from warpgs.runtime import interop
+from warpgs.kernels.tiles import (
+    EACH,
+    InstanceMemory,
+    Visible,
+    bin_tiles,
+    make_find_ranges,
+    make_kernels,
+    running_counts,
+    split_sum,
+    sum_bits,
+    sum_entries,
+)
 
 EXACT = RULES["exact"]
 SIZES = [(1, 1), (1, 17), (17, 1), (15, 15), (16, 16), (17, 17), (33, 47), (97, 129)]
@@ -197,8 +206,8 @@ def test_ranges_by_four_instances_a_thread(device, count, slotted):
     for native in (True, False):
         each = EACH if native else 1
         ids, ranges = torch.full((count,), -1, dtype=torch.int32, device=device), torch.zeros_like(tiles)[:, None].repeat(1, 2)
-        ints = [interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges)]
-        interop.launch(make_find_ranges(slotted, native), -(-count // each), [*ints[:3], count, no_tile, *ints[3:]], device)
+        ints = [launch.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges)]
+        launch.launch(make_find_ranges(slotted, native), -(-count // each), [*ints[:3], count, no_tile, *ints[3:]], device)
         empty = begin == end
         assert torch.equal(ranges[~empty], torch.stack([begin, end], 1)[~empty]) and not ranges[empty].any()
         inside = keys < no_tile
@@ -219,9 +228,9 @@ def test_visible_ones_come_first_and_in_order(device, count):
     wanted = torch.where(counts[order] > 0, projected[order, 9], torch.inf)
     for limit in (count, seen, seen // 2):
         keys, ids = torch.zeros(count, device=device), torch.full((count,), -1, dtype=torch.int32, device=device)
-        inputs = [interop.view(projected, wp.float32), interop.view(counts, wp.int32), interop.view(sums, wp.int64)]
-        inputs += [sum_bits(count), limit, interop.view(keys, wp.float32), interop.view(ids, wp.int32)]
-        interop.launch(kernels.visible_keys, sum_entries(count, native)[1], inputs, device)
+        inputs = [launch.view(projected, wp.float32), launch.view(counts, wp.int32), launch.view(sums, wp.int64)]
+        inputs += [sum_bits(count), limit, launch.view(keys, wp.float32), launch.view(ids, wp.int32)]
+        launch.launch(kernels.visible_keys, sum_entries(count, native)[1], inputs, device)
         assert torch.equal(keys[:limit], wanted[:limit]) and torch.equal(ids[:limit].long(), order[:limit])
         assert not keys[limit:].any() and bool((ids[limit:] == -1).all())
 

@@ -3,9 +3,8 @@
 import numpy as np
 import torch
 
-from warpgs.colors import C0
 from warpgs.geometry import look_at
-from warpgs.scene import Camera, Gaussians
+from warpgs.scene import C0, Camera, Gaussians
 
 RADIUS = 1.0
 CENTER = np.array([0.4, -0.2, 0.3])

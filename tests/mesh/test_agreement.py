@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from warpgs.mesh import agreement
-from warpgs.mesh.agreement import agreed, depth_map, neighbours
-from warpgs.mesh.surface_views import SurfaceView
+from warpgs.mesh import views
+from warpgs.mesh.views import SurfaceView, agreed, depth_map, neighbours
 from warpgs.scene import Camera
 
 WIDTH, HEIGHT = 48, 32
@@ -56,7 +55,7 @@ def test_thinned_maps_say_the_same(monkeypatch):
     for v in (view, other):
         x = (torch.arange(WIDTH) + 0.5 - 24) / 40
         v.depth[:] = (4 + 0.1 * float(v.camera.center[0])) / (1 - 0.1 * x)  # z = 4 + x / 10
-    monkeypatch.setattr(agreement, "MAX_PIXELS", 2 * WIDTH * HEIGHT / 7)
+    monkeypatch.setattr(views, "MAX_PIXELS", 2 * WIDTH * HEIGHT / 7)
     thin = depth_map(other, 2)
     assert thin.step == 3 and thin.depth.shape == (11, 16) and torch.equal(thin.depth, other.depth[1::3, 1::3])
     assert torch.equal(agreed(view, [thin]).depth, view.depth)
@@ -66,7 +65,7 @@ def test_thinned_maps_say_the_same(monkeypatch):
 def test_neighbours_share_sight(monkeypatch):
     """The nearest views with another angle come first, at most so many."""
     maps = [depth_map(wall(x), 5) for x in (0.0, 0.5, 1.0, 1.5, 90.0)]
-    monkeypatch.setattr(agreement, "NEIGHBOURS", 2)
+    monkeypatch.setattr(views, "NEIGHBOURS", 2)
     assert neighbours(maps)[0] == [1, 2] and sorted(neighbours(maps)[2]) == [1, 3]
     assert neighbours(maps[:1]) == [[]]
 

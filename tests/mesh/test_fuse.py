@@ -11,11 +11,11 @@ from tests.mesh.balls import ALL_SIDES, CENTER, RADIUS, RED, ball, cameras
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.mesh.fuse import MeshOptions, fuse, vertex_colors
-from warpgs.mesh.surface_views import SurfaceViews, sample_surface, surface_view
-from warpgs.pipeline.films.rig import common_up
-from warpgs.pipeline.runs import mesh_of_run as run_mesh
-from warpgs.pipeline.runs.folder import METRICS_FILE, StoredRun
-from warpgs.render.rasterize import RasterizeOptions
+from warpgs.mesh.views import SurfaceViews, sample_surface, surface_view
+from warpgs.pipeline.films.paths import common_up
+from warpgs.pipeline.run import export as run_mesh
+from warpgs.pipeline.run.folder import METRICS_FILE, StoredRun
+from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Gaussians, Normalization
 
 RENDER = RasterizeOptions()

@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.mesh import grid
-from warpgs.mesh.fuse import MeshOptions
-from warpgs.mesh.grid import GridPlan, check_memory, find_box, plan_grid
+from warpgs.mesh import fuse
+from warpgs.mesh.fuse import GridPlan, MeshOptions, check_memory, find_box, plan_grid
 
 CPU = torch.device("cpu")
 
@@ -61,11 +60,11 @@ def test_no_surface_is_said():
 def test_a_grid_that_does_not_fit_is_refused(monkeypatch):
     """Before anything is allocated; the message has both sizes and the remedy."""
     plan = GridPlan((0, 0, 0), 1.0, (1000, 1000, 100), 1.0)
-    monkeypatch.setattr(grid, "available_bytes", lambda _: 3 * 10**9)
+    monkeypatch.setattr(fuse, "available_bytes", lambda _: 3 * 10**9)
     assert check_memory(plan, CPU) == "2.0 GiB"
-    monkeypatch.setattr(grid, "available_bytes", lambda _: 2 * 10**9)
+    monkeypatch.setattr(fuse, "available_bytes", lambda _: 2 * 10**9)
     with pytest.raises(ResourceError, match=r"2\.0 GiB of memory on cpu, more than 80 % of the free 1\.9 GiB; give a larger"):
         check_memory(plan, CPU)
-    monkeypatch.setattr(grid, "available_bytes", lambda _: 10**15)
+    monkeypatch.setattr(fuse, "available_bytes", lambda _: 10**15)
     with pytest.raises(ResourceError, match="kernels can index"):
         check_memory(GridPlan((0, 0, 0), 1.0, (1300, 1300, 1300), 1.0), CPU)

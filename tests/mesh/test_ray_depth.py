@@ -8,10 +8,9 @@ import torch
 
 from tests.gaussians import camera, cloud
 from warpgs import RasterizeOptions, rasterize
-from warpgs.mesh import ray_depth
-from warpgs.mesh.ray_depth import densest_depths, surface_depth, weighted_median, whitening
-from warpgs.mesh.surface_views import surface_view
-from warpgs.pipeline.model.merge import covariances as covariances_of
+from warpgs.mesh import views
+from warpgs.mesh.views import densest_depths, surface_depth, surface_view, weighted_median, whitening
+from warpgs.pipeline.model.edit import covariances as covariances_of
 from warpgs.scene import Camera, Gaussians
 
 K = np.array([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]])
@@ -95,6 +94,6 @@ def test_needles_and_empty_pixels(monkeypatch):
     nothing = torch.full((32, 48, 4), -1, dtype=torch.int32)
     assert not any(bool(t.any()) for t in surface_depth(g, FRONT, nothing, torch.zeros(32, 48, 4)))
     whole = surface_depth(g, FRONT, r.heaviest_ids, r.heaviest_weights)
-    monkeypatch.setattr(ray_depth, "BLOCK", 100)
+    monkeypatch.setattr(views, "BLOCK", 100)
     parts = surface_depth(g, FRONT, r.heaviest_ids, r.heaviest_weights)
     assert all(torch.equal(a, b) for a, b in zip(whole, parts))

@@ -6,7 +6,7 @@ import torch
 
 from warpgs.errors import DataError
 from warpgs.kernels.tsdf import DistanceGrid
-from warpgs.mesh.triangles import decimate, extract, parts, remove_small_parts
+from warpgs.mesh.fuse import decimate, extract, parts, remove_small_parts
 from warpgs.scene import Mesh
 
 ORIGIN, VOXEL = (-1.5, -1.4, -1.6), 0.1

@@ -9,7 +9,8 @@ from tests.gaussians import SMOOTH, camera, cloud
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference, rotations
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 SLOTS = (

@@ -14,7 +14,8 @@ from tests.numerics.scenes import Scene
 from tests.numerics.thresholds import Band, band
 from tests.reference.low_precision import Images, Inputs, p32, r64, r64c
 from warpgs.constants import Rule
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 IMAGES = Images._fields

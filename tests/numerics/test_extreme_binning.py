@@ -10,10 +10,11 @@ import torch
 from tests.gaussians import SMOOTH, camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import ResourceError
+from warpgs.kernels import launch
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import InstanceMemory, bin_tiles
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime import interop
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
@@ -87,9 +88,9 @@ def test_sizes_beyond_32_bits_are_refused(device):
     """An axis, a launch and a number of tiles that would wrap around are errors that say what to do."""
     huge = torch.zeros(1, device=device).expand(2**31)
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries .* fewer Gaussians"):
-        interop.view(huge, torch.float32).array()
+        launch.view(huge, torch.float32).array()
     with pytest.raises(ResourceError, match=r"2,147,483,648 entries"):
-        interop.launch(None, 2**31, [], device)
+        launch.launch(None, 2**31, [], device)
     projected, counts = torch.zeros(1, 0, 12, device=device), torch.zeros(1, 0, dtype=torch.int32, device=device)
     with pytest.raises(ResourceError, match=r"2,147,483,648 tiles of 8 px.* fewer cameras"):
         bin_tiles(projected, counts, width=8 * 2**16, height=8 * 2**15, tile_size=8, rule=EXACT)
@@ -97,14 +98,14 @@ def test_sizes_beyond_32_bits_are_refused(device):
 
 def test_a_refused_size_leaves_a_recorded_launch_as_it_was():
     """A recorded launch that was refused an argument takes the next one whole, at the same address and of the same size too."""
-    recorded, packed = interop._Recorded.__new__(interop._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
+    recorded, packed = launch._Recorded.__new__(launch._Recorded), SimpleNamespace(ndim=1, data=0, shape=[0])
     recorded.command = SimpleNamespace(bounds=SimpleNamespace(size=1), params=[None, None, packed], set_dim=lambda _: None)
     recorded.known = [None]
     small, other = torch.zeros(5), torch.zeros(6)
-    recorded._patch(1, [interop.view(small, None)])
+    recorded._patch(1, [launch.view(small, None)])
     with pytest.raises(ResourceError, match="2,147,483,648 entries"):
-        recorded._patch(1, [interop.view(other[:1].expand(2**31), None)])
-    recorded._patch(1, [interop.view(small, None)])
+        recorded._patch(1, [launch.view(other[:1].expand(2**31), None)])
+    recorded._patch(1, [launch.view(small, None)])
     assert packed.data == small.data_ptr() and packed.shape == [5]
 
 

@@ -13,11 +13,11 @@ from tests.gaussians import camera, cloud, leaves
 from tests.kernels.test_blend import drawn, stack_of
 from tests.reference.blend import blend_reference
 from warpgs.constants import ALPHA_CUT, RULES
-from warpgs.kernels import blend_cuda
+from warpgs.kernels import blend_cuda, launch
 from warpgs.kernels.falloff import make_falloff
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime import interop
-from warpgs.runtime.cuda_source import source
+from warpgs.kernels.native import source
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 EXACT = RULES["exact"]
@@ -311,9 +311,9 @@ def test_exponential_in_ulps(device):
     turn = 2 * math.pi * torch.rand(len(radii), generator=generator)
     e = torch.stack([radii * torch.cos(turn), radii * torch.sin(turn)], 1)
     found = torch.empty(len(e), device=device)
-    inputs = [interop.view(e.to(device), wp.float32), interop.view(found, wp.float32)]
-    with interop.stream_of(device):
-        interop.launch(exponential(device.type == "cuda"), len(e), inputs, device)
+    inputs = [launch.view(e.to(device), wp.float32), launch.view(found, wp.float32)]
+    with launch.stream_of(device):
+        launch.launch(exponential(device.type == "cuda"), len(e), inputs, device)
     found = found.cpu().double()
     exact = torch.exp(-0.5 * e.double().square().sum(1))
     assert finite(found) and bool((found >= 0).all()) and bool((found <= 1).all())

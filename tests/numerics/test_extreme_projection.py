@@ -18,13 +18,14 @@ from tests.scenes import three_gaussians
 from warpgs.constants import FAR, FARTHEST_PIXEL, LARGEST_AXIS, LARGEST_COEFFICIENT, RULES, SHORTEST_QUAT
 from warpgs.export.ply import read_ply, write_ply
 from warpgs.io.load import load_scene
-from warpgs.kernels.functions import make_spans
+from warpgs.kernels import launch
+from warpgs.kernels.ellipse import make_spans
 from warpgs.kernels.project import project
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime import interop
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 EXACT = RULES["exact"]
@@ -315,9 +316,9 @@ def test_tiles_of_impossible_boxes(device):
     found = {}
     for where in {"cpu", str(device)}:
         result = torch.empty(len(table), 4, dtype=torch.int32, device=where)
-        inputs = [interop.view(boxes.to(where), wp.float32), interop.view(result, wp.int32)]
-        with interop.stream_of(torch.device(where)):
-            interop.launch(spans_kernel(), len(table), inputs, torch.device(where))
+        inputs = [launch.view(boxes.to(where), wp.float32), launch.view(result, wp.int32)]
+        with launch.stream_of(torch.device(where)):
+            launch.launch(spans_kernel(), len(table), inputs, torch.device(where))
         found[where] = result.cpu()
     rows = found[str(device)]
     assert torch.equal(rows, found["cpu"])

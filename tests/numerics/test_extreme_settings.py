@@ -8,16 +8,15 @@ import torch
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.scale_limits import LimitConfig
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss_terms.built_in import LossConfig
+from warpgs.pipeline.model.limits import LimitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.loss import LossConfig
+from warpgs.pipeline.train.sampling import ImportanceConfig, SamplerConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import StoppingConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.pipeline.train.strategies.importance import ImportanceConfig
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.trainer import Trainer
 
 NUMBERS = [math.nan, math.inf, -1, 0, 1e-300, 1, 3, 1e300]

@@ -15,21 +15,19 @@ from tests.reference.knn import mean_square_distances_reference
 from tests.scenes import photos, ring, seeds
 from warpgs.errors import DataError, NotFiniteError
 from warpgs.export.ply import write_ply
-from warpgs.io.normalize import normalization_of, normalize_points, normalize_view
-from warpgs.kernels.adam import adam_step
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.io.load import normalization_of, normalize_points, normalize_view
+from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences, ssim
-from warpgs.pipeline.metrics.quantiles import quantiles
-from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
+from warpgs.kernels.update import adam_step
+from warpgs.pipeline.metrics.scores import quantiles
+from warpgs.pipeline.model.start import InitConfig, initial_gaussians, initial_points
 from warpgs.pipeline.model.table import Column, DensityUpdate, Table
-from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loop import run
-from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig, refine
-from warpgs.pipeline.train.strategies.importance import normalized
-from warpgs.pipeline.train.strategies.sampler import geometry_gate, sample_pixels
-from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.loss import photometric_loss
+from warpgs.pipeline.train.sampling import geometry_gate, normalized, sample_pixels
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
+from warpgs.pipeline.train.trainer import Trainer, run
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Normalization, PointCloud, View
 

@@ -10,9 +10,10 @@ import pytest
 import torch
 
 from tests.gaussians import camera, cloud
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 REPEATS = 50
@@ -93,8 +94,8 @@ def test_a_side_stream_gives_the_same_bits():
 PROCESS = """
 import hashlib, torch
 from tests.scenes import photos
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
 torch.set_num_threads({threads})
 config = FitConfig(steps=12, seed=5, dropout=0.1, init=InitConfig(source="random", random_count=300))

@@ -74,8 +74,8 @@ DEBUG = """
 import sys, torch, warp as wp
 wp.config.mode = "debug"
 from tests.gaussians import camera, cloud, leaves
-from warpgs.kernels.adam import adam_step
-from warpgs.kernels.knn import mean_square_distances
+from warpgs.kernels.update import adam_step
+from warpgs.kernels.neighbours import mean_square_distances
 from warpgs.kernels.ssim import differences
 from warpgs.render.rasterize import RasterizeOptions, rasterize
 device = torch.device(sys.argv[1])

@@ -3,12 +3,11 @@
 import dataclasses
 from pathlib import Path
 
-from warpgs.pipeline.farm.engine import Event
-from warpgs.pipeline.farm.job import FarmJob, job_text
+from warpgs.pipeline.farm.job import Event, FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.request import FitRequest, SceneRequest
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CONFIG = FitConfig(steps=6, checkpoint_every=2, checkpoint_seconds=0, init=InitConfig(source="random", random_count=60))

@@ -7,13 +7,12 @@ import pytest
 from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.fit import fit_request
-from warpgs.pipeline.study.compare import ABLATION_ROWS, ablation_variants
-from warpgs.pipeline.study.study import SWITCHES
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.fit import fit_request
+from warpgs.pipeline.study.study import ABLATION_ROWS, SWITCHES, ablation_variants
 from warpgs.pipeline.train.presets import PRESETS
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 FULL = FitConfig(
@@ -60,7 +59,7 @@ def test_command_ablates(tmp_path, capsys, monkeypatch):
     scene = tmp_path / "still"
     write_demo(scene, views=8, width=48, height=36)
     monkeypatch.setitem(PRESETS._made, "whole", FULL)
-    monkeypatch.setattr("warpgs.pipeline.study.compare.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
+    monkeypatch.setattr("warpgs.pipeline.study.study.ABLATION_ROWS", {n: ABLATION_ROWS[n] for n in ("full", "no pm")})
     monkeypatch.setenv("WARPGS_CACHE", str(tmp_path / "cache"))
     asked = []
 
@@ -68,7 +67,7 @@ def test_command_ablates(tmp_path, capsys, monkeypatch):
         asked.append((request.config.seed, request.config.method))
         return fit_request(request)
 
-    monkeypatch.setattr("warpgs.pipeline.farm.ensure_run.fit_request", noted)
+    monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", noted)
     flags = ["--preset", "whole", "--seeds", "1", "--steps", "2", "--device", "cpu", "--out", str(tmp_path / "out")]
     assert main(["ablate", str(scene), "--split", split_spec(8), *flags]) == 0
     assert "[2/2] still, no pm, seed 0" in capsys.readouterr().out

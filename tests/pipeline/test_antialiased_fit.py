@@ -11,21 +11,22 @@ from PIL import Image
 import warpgs
 from tests.scenes import photos, ring, seeds
 from warpgs.app.cli import main
-from warpgs.export.cameras import write_cameras
-from warpgs.export.formats import read_with_antialiasing
-from warpgs.kernels.pixel_size import pixel_size
-from warpgs.pipeline.metrics.evaluate import score
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.scale_limits import LimitConfig, TrainingCameras
-from warpgs.pipeline.runs.failed_step import failed_step, repeated
-from warpgs.pipeline.runs.model_and_cameras import open_file
-from warpgs.pipeline.train import step, step_graphs
-from warpgs.pipeline.train.memory_plan import most_instances
+from warpgs.export.base import read_with_antialiasing
+from warpgs.export.meshes_and_cameras import write_cameras
+from warpgs.kernels.neighbours import pixel_size
+from warpgs.pipeline.metrics.scores import score
+from warpgs.pipeline.model.limits import LimitConfig, TrainingCameras
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.commands import open_file
+from warpgs.pipeline.run.failed_step import failed_step, repeated
+from warpgs.pipeline.train import step
+from warpgs.pipeline.train.memory import most_instances
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Scene
 from warpgs.synthetic.demo import write_demo
-from warpgs.viewer.content import content_of_file, content_of_run
+from warpgs.viewer.window import content_of_file, content_of_run
 
 CPU = torch.device("cpu")
 # points far below a pixel in size, so that every render with the filter is another than without
@@ -73,9 +74,7 @@ def test_a_step_renders_with_the_filter(device, captured):
         for a in (True, False)
     ]
     assert most_instances(fit.gaussians, cameras, options) == wanted[0] != wanted[1]
-    assert (
-        step_graphs.instance_capacity(fit.gaussians, stack, 0, options) == int(step_graphs.CAPACITY_FACTOR * wanted[0]) + 1024
-    )
+    assert step.instance_capacity(fit.gaussians, stack, 0, options) == int(step.CAPACITY_FACTOR * wanted[0]) + 1024
     image = repeated(failed_step(fit, 1, "01.png"))[1].rendered.rgb.detach().cpu().numpy()
     assert np.array_equal(image, filtered(fit.gaussians, view.camera))
 

@@ -10,11 +10,11 @@ from tests.io import scenes
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.io.load import load_scene
-from warpgs.pipeline.runs.commands import scene_of
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.train.background import choose_background, color_of, over_background
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.run.commands import scene_of
+from warpgs.pipeline.run.folder import open_run
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.schedule import choose_background, color_of, over_background
+from warpgs.pipeline.train.settings import FitConfig
 
 
 @pytest.mark.parametrize(

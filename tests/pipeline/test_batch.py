@@ -10,21 +10,17 @@ from tests.pipeline.test_importance_sampling import CONFIG as METHOD
 from tests.pipeline.test_slots import by_threads
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError
-from warpgs.kernels.adam import scheduled_lrs
-from warpgs.kernels.step_buffers import Setting
-from warpgs.pipeline.model.init import InitConfig
+from warpgs.kernels.update import Setting, scheduled_lrs
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train import batch
-from warpgs.pipeline.train.batch import BatchSteps
-from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.batch import BatchSteps, Tree
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.slots import Tree
-from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers, steps_at_once
-from warpgs.pipeline.train.step_graphs import instance_capacity
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views
+from warpgs.pipeline.train.step import MAX_STEPS, StepBuffers, instance_capacity, steps_at_once
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.runtime.ranks import ALONE, Ranks
+from warpgs.ranks import ALONE, Ranks
 from warpgs.scene import View
 
 CPU = torch.device("cpu")
@@ -174,7 +170,7 @@ def test_ranks_go_on_without_graphs_together():
 
 def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
     """Each updates its own rows, and a few are left over. The set of Gaussians grows, and the last steps are averaged."""
-    monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 4000)
+    monkeypatch.setattr("warpgs.pipeline.train.batch.DIVIDED_BYTES", 4000)
     density = DensityConfig(start=2, every=4, gradient=1e-5, reset_every=8)
     optimizer = OptimizerConfig(average_last=0.5)
     config = dataclasses.replace(PLAIN, steps=10, batch=5, dropout=0.3, sh_degree=2, density=density, optimizer=optimizer)
@@ -187,7 +183,7 @@ def test_ranks_that_divide_the_coefficients_have_the_bits_of_one(monkeypatch):
 @pytest.mark.parametrize("stopped", [None, 5])
 def test_ranks_that_divide_the_coefficients_take_several_steps_at_once(monkeypatch, stopped):
     """Moments are exchanged once for a series, and also where a view stops the series before its end."""
-    monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 4000)
+    monkeypatch.setattr("warpgs.pipeline.train.batch.DIVIDED_BYTES", 4000)
     views = photos(9)
     if stopped is not None:
         views[4] = View("bad", views[4].camera, np.full_like(views[4].image, np.nan))

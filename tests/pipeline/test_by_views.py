@@ -7,10 +7,10 @@ import dataclasses
 import pytest
 
 from tests.scenes import view_stub
-from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.train.by_views import ONE_LAYER, settings_by_views
+from warpgs.pipeline.run.request import SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import plan_phases
+from warpgs.pipeline.train.settings import ONE_LAYER, settings_by_views
 from warpgs.pipeline.train.stopping import StoppingConfig
 
 

@@ -11,15 +11,16 @@ import warpgs
 from tests.parallel_camera import NAME
 from tests.scenes import photos, ring, seeds, three_gaussians
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.failed_step import failed_step, repeated
-from warpgs.pipeline.runs.folder import _camera, camera_values
-from warpgs.pipeline.train import step, step_graphs
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.memory_plan import most_instances
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.failed_step import failed_step, repeated
+from warpgs.pipeline.run.folder import _camera, camera_values
+from warpgs.pipeline.train import step
+from warpgs.pipeline.train.memory import most_instances
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import half_size
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Scene, View
 
 CPU = torch.device("cpu")
@@ -80,7 +81,7 @@ def test_a_step_renders_by_the_views_own_camera(fit, captured):
     for number in range(4):
         fit.buffers.load([number], [[0.0] * fit.buffers.lr_rows.shape[1]], [fit.settings(1)])
         if captured:
-            capacity = step_graphs.instance_capacity(fit.gaussians, stack, plan.degree, fit.context.render_options())
+            capacity = step.instance_capacity(fit.gaussians, stack, plan.degree, fit.context.render_options())
             render = step.captured_renderer(fit.context.render_options(), capacity, fit.buffers.stop)
         else:
             render = step.eager_renderer(fit.context.render_options(), None)
@@ -111,8 +112,8 @@ def test_memory_is_planned_for_the_instances_of_the_model(fit):
     assert most != max(int(rasterize(fit.gaussians, c, options).tile_counts.sum()) for c in pinholes)
     assert most_instances(fit.gaussians, [v.camera for v in fit.views], options) == most
     (stack,) = fit.stacks.values()
-    capacity = step_graphs.instance_capacity(fit.gaussians, stack, 0, options)
-    assert capacity == int(step_graphs.CAPACITY_FACTOR * most) + 1024
+    capacity = step.instance_capacity(fit.gaussians, stack, 0, options)
+    assert capacity == int(step.CAPACITY_FACTOR * most) + 1024
 
 
 def test_half_size_views_and_stacks_keep_the_model(fit):

@@ -8,10 +8,18 @@ import pytest
 from tests.scenes import ring
 from warpgs.errors import UsageError
 from warpgs.geometry import look_at, project_points
-from warpgs.pipeline.films.camera_paths import BY_KIND, camera_path, framed, path_of
-from warpgs.pipeline.films.keyframes import Keyframe, through
-from warpgs.pipeline.films.rig import common_up, rig_of, up_of
-from warpgs.pipeline.films.view_tour import tour_of
+from warpgs.pipeline.films.paths import (
+    BY_KIND,
+    Keyframe,
+    camera_path,
+    common_up,
+    framed,
+    path_of,
+    rig_of,
+    through,
+    tour_of,
+    up_of,
+)
 from warpgs.scene import Camera
 
 K = np.array([[50.0, 0, 20], [0, 55, 15], [0, 0, 1]])

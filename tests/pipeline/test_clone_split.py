@@ -8,7 +8,7 @@ import torch
 from tests.gaussians import cloud
 from warpgs.errors import UsageError
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig, refine
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig, refine
 from warpgs.scene import Gaussians
 
 

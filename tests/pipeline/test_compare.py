@@ -19,19 +19,17 @@ from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.files import LOCK
-from warpgs.pipeline.farm.engine import Event
-from warpgs.pipeline.farm.ensure_run import ensure_run
-from warpgs.pipeline.farm.job import job_of
-from warpgs.pipeline.farm.run import EngineRequest
-from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import TENSORS
-from warpgs.pipeline.runs.request import CPU_MAX_SIDE, FitRequest, SceneRequest, read_scene
-from warpgs.pipeline.study.compare import _places, preset_variants, run_study
-from warpgs.pipeline.study.statistics import paired_difference
-from warpgs.pipeline.study.study import FILES, StudyRequest, run_folder
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.farm.farm import EngineRequest
+from warpgs.pipeline.farm.job import Event, job_of
+from warpgs.pipeline.farm.work import ensure_run
+from warpgs.pipeline.metrics.lpips import NETS, convert_lpips
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import TENSORS
+from warpgs.pipeline.run.request import CPU_MAX_SIDE, FitRequest, SceneRequest, read_scene
+from warpgs.pipeline.study.study import FILES, StudyRequest, _places, preset_variants, run_folder, run_study
+from warpgs.pipeline.study.tables import paired_difference
 from warpgs.pipeline.train.presets import PRESETS, preset_settings
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.synthetic.demo import split_spec, write_demo
 
@@ -205,7 +203,7 @@ def test_a_strategy_whose_code_was_edited_is_fitted_again(finished, tmp_path, mo
 def test_what_makes_a_run_another_run(finished, tmp_path, monkeypatch, key, value, word):
     """Each of these alone forbids to keep it."""
     monkeypatch.setattr(
-        "warpgs.pipeline.farm.ensure_run.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
+        "warpgs.pipeline.farm.work.fit_request", lambda request: SimpleNamespace(metrics={"fitted": request.resume})
     )
     request = copy_of(finished, tmp_path)
     folder = run_folder(request, "still", "a", 0)
@@ -225,7 +223,7 @@ def test_a_failed_run_is_left_out_of_its_pairs_and_named(finished, tmp_path, mon
     def fail(*_, **__):
         raise DataError("no luck")
 
-    monkeypatch.setattr("warpgs.pipeline.farm.ensure_run.fit_request", fail)
+    monkeypatch.setattr("warpgs.pipeline.farm.work.fit_request", fail)
     run_study(request)
     text = (request.out / "table.md").read_text()
     assert states(request) == ["kept", "kept", "kept", "failed"]
@@ -286,7 +284,7 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
 
 def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
     """Its runs are jobs; what failed there is a failed run, and is not fitted again in this process."""
-    monkeypatch.setattr("warpgs.pipeline.farm.run.LocalEngine", lambda slots: HereEngine(slots=len(slots)))
+    monkeypatch.setattr("warpgs.pipeline.farm.farm.LocalEngine", lambda slots: HereEngine(slots=len(slots)))
     request = dataclasses.replace(finished[0], out=tmp_path / "out", seeds=1, engine=EngineRequest(slots=2))
     run_study(request)
     assert states(request) == ["fitted", "fitted"] and (request.out / "index.html").is_file()
@@ -294,7 +292,7 @@ def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
         there, here = (run_folder(r, "still", variant, 0) / "point_cloud.ply" for r in (finished[0], request))
         assert there.read_bytes() == here.read_bytes()
     shutil.rmtree(run_folder(request, "still", "a", 0))
-    monkeypatch.setattr("warpgs.pipeline.farm.run.LocalEngine", lambda slots: HereEngine(fail))
+    monkeypatch.setattr("warpgs.pipeline.farm.farm.LocalEngine", lambda slots: HereEngine(fail))
     with pytest.raises(DataError, match=r"every run of a failed.*its process ended \(2 attempts\)"):
         run_study(request)
 

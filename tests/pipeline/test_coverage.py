@@ -6,8 +6,9 @@ import math
 import torch
 
 from tests.scenes import ring, three_gaussians
-from warpgs.pipeline.model.coverage import SEEN, coverage, fisher
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.pipeline.model.edit import SEEN, coverage, fisher
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 

@@ -10,13 +10,23 @@ import torch
 
 from tests.scenes import photos, ring, three_gaussians
 from warpgs.geometry import look_at
-from warpgs.pipeline.metrics.coverage_map import MAX_COUNT, DepthView, coverage_map, depth_views, fraction_outside
-from warpgs.pipeline.metrics.coverage_scores import BINS, classes_of, photo_errors, score_by_coverage
-from warpgs.pipeline.metrics.evaluate import score
-from warpgs.pipeline.runs.coverage_report import coverage_lines, coverage_of_run
-from warpgs.pipeline.runs.schemas import METRICS
-from warpgs.render.rasterize import RasterizeOptions
-from warpgs.report.coverage_image import coverage_image
+from warpgs.pipeline.metrics.coverage import (
+    BINS,
+    MAX_COUNT,
+    DepthView,
+    classes_of,
+    coverage_lines,
+    coverage_map,
+    coverage_of_run,
+    depth_views,
+    fraction_outside,
+    photo_errors,
+    score_by_coverage,
+)
+from warpgs.pipeline.metrics.scores import score
+from warpgs.pipeline.run.folder import METRICS
+from warpgs.render.options import RasterizeOptions
+from warpgs.report.images import coverage_image
 from warpgs.scene import Camera, View
 from warpgs.synthetic import raycast
 from warpgs.synthetic.demo import camera_path, still_life

@@ -9,22 +9,20 @@ import torch
 from tests.scenes import ring, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.geometry import look_at
-from warpgs.kernels.step_buffers import SHIFT
-from warpgs.pipeline.metrics.region import fitted_region
-from warpgs.pipeline.model import init
-from warpgs.pipeline.model.hull import carve, hull_points, in_empty_region, silhouettes
-from warpgs.pipeline.model.init import InitConfig, initial_points
-from warpgs.pipeline.model.random_points import random_points
-from warpgs.pipeline.runs.failed_step import failed_step, findings
-from warpgs.pipeline.train.background import over, random_shift
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossInputs, Target
-from warpgs.pipeline.train.loss_terms.built_in import LossConfig
-from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.kernels.update import SHIFT
+from warpgs.pipeline.metrics.scores import fitted_region
+from warpgs.pipeline.model import start as init
+from warpgs.pipeline.model.depth_points import carve, hull_points, in_empty_region, silhouettes
+from warpgs.pipeline.model.start import InitConfig, initial_points, random_points
+from warpgs.pipeline.run.failed_step import failed_step, findings
+from warpgs.pipeline.train.loss import AlphaDifference, LossConfig, LossInputs, Target
+from warpgs.pipeline.train.schedule import over, random_shift
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size, stack_views, with_alpha
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, PointCloud, View
 
 CPU = torch.device("cpu")

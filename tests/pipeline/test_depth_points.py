@@ -9,7 +9,7 @@ from tests.scenes import photos, ring
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, in_image, project_points
 from warpgs.pipeline.model.depth_points import coarse_points, depth_bounds, in_free_space, merge, merge_cells
-from warpgs.pipeline.model.init import InitConfig, initial_points
+from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 
 

@@ -12,9 +12,9 @@ from tests.example_terms import DepthCorrelation
 from tests.pipeline.test_loss import maps
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
 from warpgs.render.rasterize import rasterize

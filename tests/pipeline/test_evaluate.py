@@ -8,9 +8,7 @@ import torch
 
 from tests.scenes import photos, ring
 from warpgs.geometry import back_project, camera_extent, focus_point, in_image, project_points
-from warpgs.pipeline.metrics.evaluate import baselines, score, summarize, to_8_bit, variants
-from warpgs.pipeline.metrics.psnr import psnr
-from warpgs.pipeline.metrics.region import counted_region
+from warpgs.pipeline.metrics.scores import baselines, counted_region, psnr, score, summarize, to_8_bit, variants
 from warpgs.scene import View
 
 

@@ -11,14 +11,14 @@ import warpgs
 from tests import scenes
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.pipeline.metrics.matched_psnr import matched_psnr
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.held_out_blocks import rendered
+from warpgs.pipeline.metrics.scores import matched_psnr
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.stopping import rendered
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.exposure import EXPOSURE, Exposure, exposed, exposure_of
-from warpgs.pipeline.train.view_modules.poses import RefinePoses
+from warpgs.pipeline.train.view_modules import EXPOSURE, Exposure, RefinePoses, exposed, exposure_of
 from warpgs.pipeline.train.views import half_size
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")

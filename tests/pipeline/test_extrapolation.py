@@ -11,14 +11,13 @@ import torch
 from tests.pipeline.test_depth_points import known
 from tests.scenes import photos, seeds, view_stub
 from warpgs.geometry import in_image, project_points
-from warpgs.pipeline.model.extrapolation import BEYOND, BEYOND_PX, EXTRAPOLATED_OPACITY, REACH, STEP, extrapolated_points
-from warpgs.pipeline.model.init import InitConfig, Start, initial_gaussians, initial_points, subsample
+from warpgs.pipeline.model.depth_points import BEYOND, BEYOND_PX, EXTRAPOLATED_OPACITY, REACH, STEP, extrapolated_points
+from warpgs.pipeline.model.start import InitConfig, Start, initial_gaussians, initial_points, subsample
 from warpgs.pipeline.train import setup
-from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, settings_by_views
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.opacity_decay import decay_opacities
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.settings import EXTRAPOLATED_VIEWS, FitConfig, settings_by_views
+from warpgs.pipeline.train.step import decay_opacities
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Camera, PointCloud, View, ViewDepth
 

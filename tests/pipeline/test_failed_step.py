@@ -10,12 +10,11 @@ from tests.pipeline.test_trainer import BUSY
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, NotFiniteError
-from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
-from warpgs.pipeline.runs.failed_step import FILE, broken_terms, failed_step, findings, read_failed_step, save_failed_step
+from warpgs.pipeline.run.failed_step import FILE, broken_terms, failed_step, findings, read_failed_step, save_failed_step
+from warpgs.pipeline.run.folder import TENSORS, load_checkpoint
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm, register
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.exposure import Exposure
-from warpgs.pipeline.train.view_modules.poses import RefinePoses
+from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
 from warpgs.scene import Scene
 
 CPU = torch.device("cpu")

@@ -18,21 +18,30 @@ from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.files import make_folder
-from warpgs.pipeline.farm import record, work
-from warpgs.pipeline.farm.ensure_run import Outcome
-from warpgs.pipeline.farm.farm import run_farm
-from warpgs.pipeline.farm.job import job_of, job_text
-from warpgs.pipeline.farm.local import LocalEngine, Slot, local_slots
-from warpgs.pipeline.farm.record import CHECKED, LOG, PLY, RECORD, THUMBNAIL, file_digest, finished, read_record
+from warpgs.locks import hold_folder
+from warpgs.pipeline.farm import job as record
+from warpgs.pipeline.farm import work
+from warpgs.pipeline.farm.farm import LocalEngine, Slot, local_slots, run_farm
+from warpgs.pipeline.farm.job import (
+    CHECKED,
+    LOG,
+    PLY,
+    RECORD,
+    THUMBNAIL,
+    file_digest,
+    finished,
+    job_of,
+    job_text,
+    read_job_record,
+)
 from warpgs.pipeline.farm.slurm import SlurmEngine
-from warpgs.pipeline.farm.work import run_job
-from warpgs.pipeline.runs.fit import fit_request
+from warpgs.pipeline.farm.work import Outcome, run_job
+from warpgs.pipeline.run.fit import fit_request
 from warpgs.pipeline.train.loss import LOSS_TERMS
 from warpgs.pipeline.train.presets import PRESETS, preset_settings
 from warpgs.pipeline.train.strategies.base import STRATEGIES
-from warpgs.runtime.folder_lock import hold_folder
-from warpgs.runtime.listening import is_loopback, listeners
-from warpgs.runtime.subprocesses import run_python
+from warpgs.process import run_python
+from warpgs.ranks import is_loopback, listeners
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +253,7 @@ def test_crashes_and_lack_of_memory_cost_one_scene_and_are_tried_again(
     monkeypatch.setattr(work, "ensure_run", fail)
     statuses = run_farm(jobs, HereEngine())
     assert [s.state for s in statuses] == ["failed", "done"] and statuses[0].attempts == attempts
-    assert read_record(jobs[0].folder).message == statuses[0].record.message and str(error) in statuses[0].record.message
+    assert read_job_record(jobs[0].folder).message == statuses[0].record.message and str(error) in statuses[0].record.message
     monkeypatch.setattr(work, "ensure_run", unfitted)
     assert [s.state for s in run_farm(jobs, HereEngine())] == ["done", "done"]
 
@@ -306,7 +315,7 @@ def test_slots(monkeypatch):
 
 def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, capsys, monkeypatch):
     """Settings of all and of one; a failure by its message; exit code 4, and 0 once nothing fails."""
-    monkeypatch.setattr("warpgs.pipeline.farm.run.LocalEngine", lambda slots: HereEngine())
+    monkeypatch.setattr("warpgs.pipeline.farm.farm.LocalEngine", lambda slots: HereEngine())
     jobs = tmp_path / "jobs.jsonl"
     lines = [{"scene": str(scenes / "s0"), "name": "a", "seed": 3}, {"scene": "gone", "name": "b & c"}]
     jobs.write_text("\n".join(map(json.dumps, lines)))

@@ -4,7 +4,7 @@ import pytest
 
 from tests.pipeline.farms import write_scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.pipeline.farm.listing import list_jobs
+from warpgs.pipeline.farm.job import list_jobs
 
 
 def test_folders_and_globs(tmp_path):

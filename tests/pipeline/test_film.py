@@ -14,12 +14,9 @@ import warpgs
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import look_at
-from warpgs.pipeline.films.film import render_film
-from warpgs.pipeline.films.frame_check import FrameCheck
-from warpgs.pipeline.films.keyframes import read_keyframes
-from warpgs.pipeline.films.plan import FilmPlan, FilmSettings, plan_film
-from warpgs.pipeline.films.rig import rig_of
-from warpgs.pipeline.model.model_file import FittedModel
+from warpgs.pipeline.films.film import FilmPlan, FilmSettings, FrameCheck, plan_film, render_film
+from warpgs.pipeline.films.paths import read_keyframes, rig_of
+from warpgs.pipeline.model.table import FittedModel
 from warpgs.scene import Normalization
 
 UNITS = Normalization(np.array([1.0, 2.0, 3.0]), 0.5)
@@ -97,7 +94,7 @@ def test_no_file_of_keyframes(model, tmp_path):
 
 def test_a_film_through_photographs_of_one_side_names_the_calmer_path(model, monkeypatch):
     """Where warpgs chose the path, and only there."""
-    monkeypatch.setattr("warpgs.pipeline.films.plan.path_of", lambda rig: "interpolate")
+    monkeypatch.setattr("warpgs.pipeline.films.film.path_of", lambda rig: "interpolate")
     calmer = "; --path turntable is calmer"
     named = [plan_film(model, path, FilmSettings()).notes[-1].endswith(calmer) for path in ("auto", "interpolate")]
     assert named == [True, False]

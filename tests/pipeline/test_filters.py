@@ -10,10 +10,10 @@ import torch
 from tests.gaussians import cloud
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.export.formats import read_gaussians, write_gaussians
+from warpgs.export.base import read_gaussians, write_gaussians
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels.sh import basis
-from warpgs.pipeline.model.filters import (
+from warpgs.pipeline.model.edit import (
     box_of,
     disturbing,
     harmonics_rotation,
@@ -23,8 +23,7 @@ from warpgs.pipeline.model.filters import (
     rotate,
     rotation_about,
 )
-from warpgs.pipeline.runs.export_filters import Filters
-from warpgs.pipeline.runs.export_model import convert
+from warpgs.pipeline.run.export import Filters, convert
 
 TURN = rotation_about(np.array([1.0, -2.0, 0.5]), 1.1)
 

@@ -10,12 +10,12 @@ from PIL import Image
 
 import warpgs
 from warpgs.app.cli import main
-from warpgs.coordinates import convert_camera
 from warpgs.errors import DataError, UsageError
-from warpgs.export.formats import read_gaussians
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.request import NO_SCORES
-from warpgs.runtime.terminal import Detail
+from warpgs.export.base import read_gaussians
+from warpgs.geometry import convert_camera
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.request import NO_SCORES
+from warpgs.process import Detail
 from warpgs.synthetic.demo import split_spec, write_demo
 
 STEPS, SPLIT = 12, split_spec(8)
@@ -62,7 +62,7 @@ def test_command_and_function_are_one_fit(folder, fitted):
 def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder, tmp_path, capsys, monkeypatch):
     """No score is made up, which the report says; a later default leaves the run as it is."""
     few, out = dataclasses.replace(CONFIG, steps=2), tmp_path / "run"
-    monkeypatch.setattr("warpgs.pipeline.runs.request.CPU_MAX_SIDE", 20)
+    monkeypatch.setattr("warpgs.pipeline.run.request.CPU_MAX_SIDE", 20)
     result = warpgs.fit(folder / "scene", few, out=out, device="cpu")
     assert len(result.train) == 8 and result.test == () and not result.metrics["test"]
     printed = capsys.readouterr().out
@@ -70,7 +70,7 @@ def test_every_photograph_trains_by_default_and_a_run_remembers_its_scale(folder
     assert NO_SCORES in result.notes and NO_SCORES in (out / "report.html").read_text()
     protocol = result.metrics["protocol"]
     assert (protocol["split"], protocol["resolution"]) == ("all (no --split given)", ["20 x 16"])
-    monkeypatch.setattr("warpgs.pipeline.runs.request.CPU_MAX_SIDE", 30)
+    monkeypatch.setattr("warpgs.pipeline.run.request.CPU_MAX_SIDE", 30)
     record = json.loads((out / "config.json").read_text())["scene"]
     assert (record["downscale"], record["max_side"]) == (1, 20)
     assert main(["eval", str(out), "--device", "cpu"]) == 0 and "no view is held out" in capsys.readouterr().out

@@ -8,13 +8,12 @@ import torch
 
 from tests.scenes import ring
 from tests.tolerances import GAIN
-from warpgs.colors import C0
 from warpgs.constants import LOW_PASS, Rule
-from warpgs.pipeline.train.strategies.gain import EVERY, gain_map, gains, residual_of
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig, fine_gaussians
+from warpgs.pipeline.train.sampling import EVERY, SamplerConfig, fine_gaussians, gain_map, gains, residual_of
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.scene import Camera, Gaussians, View
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import C0, Camera, Gaussians, View
 
 CPU = torch.device("cpu")
 SIZE = (64, 48)

@@ -10,7 +10,7 @@ import warpgs
 from tests.io.scenes import save
 from tests.priors.rigs import exact_depth
 from warpgs.app.cli import main
-from warpgs.pipeline.runs.request import SceneRequest
+from warpgs.pipeline.run.request import SceneRequest
 from warpgs.synthetic import demo
 
 VIEWS, SIZE, STEPS = 8, (48, 36), 8

@@ -12,21 +12,22 @@ from tests.priors.rigs import still_life
 from tests.scenes import photos, seeds, three_gaussians
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LOSS_TERMS
-from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
-from warpgs.pipeline.train.loss_terms.given import (
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.loss import (
+    LOSS_TERMS,
     GivenDepthDifference,
     GivenNormalsDifference,
+    LossConfig,
+    built_in_terms,
     inverse_depth_difference,
     normal_difference,
 )
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
-from warpgs.priors.view_prior import PriorConfig
+from warpgs.priors.views import PriorConfig
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import GivenDepth, Prior, View
 

@@ -8,17 +8,10 @@ import pytest
 import torch
 
 from tests.scenes import photos, three_gaussians
-from warpgs.pipeline.train.held_out_blocks import (
-    FLOOR,
-    SIDES,
-    block_errors,
-    decibels,
-    gain,
-    hide,
-    sample_blocks,
-)
+from warpgs.pipeline.train.stopping import FLOOR, SIDES, block_errors, decibels, gain, hide, sample_blocks
 from warpgs.pipeline.train.views import TrainingView
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 CPU = torch.device("cpu")
 

@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.scenes import photos, seeds
-from warpgs.pipeline.model.init import InitConfig, initial_gaussians
-from warpgs.pipeline.runs.results import evaluate_run
-from warpgs.render.rasterize import RasterizeOptions
-from warpgs.report.image_names import image_names, renaming_notes
+from warpgs.pipeline.model.start import InitConfig, initial_gaussians
+from warpgs.pipeline.run.results import evaluate_run
+from warpgs.render.options import RasterizeOptions
+from warpgs.report.page import image_names, renaming_notes
 
 
 def test_plain_names_stay_as_they_are():

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.strategies.importance import (
+from warpgs.pipeline.train.sampling import (
     ImportanceConfig,
     blur,
     geometry_score,

@@ -9,18 +9,18 @@ import torch
 
 from tests.scenes import photos, priors, seeds, three_gaussians
 from warpgs.errors import UsageError
-from warpgs.kernels.step_buffers import Setting
-from warpgs.pipeline.model.init import InitConfig, initial_points
+from warpgs.kernels.update import Setting
+from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.sampling import ImportanceConfig, SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.pipeline.train.strategies.importance import ImportanceConfig
-from warpgs.pipeline.train.strategies.importance_sampling import COARSE, NOT_SAMPLED
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.strategies.sampling_event import (
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import (
+    COARSE,
     FINE,
+    NOT_SAMPLED,
     Event,
     MethodConfig,
     ProtectConfig,
@@ -30,7 +30,8 @@ from warpgs.pipeline.train.strategies.sampling_event import (
     sampling_event,
 )
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 CPU = torch.device("cpu")

@@ -8,16 +8,25 @@ import torch
 from tests.example_terms import DepthCorrelation
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LOSS_TERMS, LossInputs, LossTerm, Target, outputs_of, total
-from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
-from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
-from warpgs.pipeline.train.loss_terms.photometric import Photometric, photometric_loss
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.loss import (
+    LOSS_TERMS,
+    AlphaDifference,
+    LossConfig,
+    LossInputs,
+    LossTerm,
+    Photometric,
+    Target,
+    built_in_terms,
+    outputs_of,
+    photometric_loss,
+    total,
+)
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.step import StepPlan, eager_renderer, total_loss, view_gradients
 from warpgs.pipeline.train.strategies.base import Strategy
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.poses import ROTATION, RefinePoses
+from warpgs.pipeline.train.view_modules import ROTATION, RefinePoses
 
 CPU = torch.device("cpu")
 PLAIN = FitConfig(steps=8, init=InitConfig(source="points"), sh_degree=0)

@@ -11,8 +11,7 @@ from torch import nn
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError
-from warpgs.pipeline.metrics.lpips import MODES, load_lpips
-from warpgs.pipeline.metrics.lpips_weights import NETS, convert_lpips
+from warpgs.pipeline.metrics.lpips import MODES, NETS, convert_lpips, load_lpips
 
 CHANNELS = {"vgg": (64, 128, 256, 512, 512), "alex": (64, 192, 384, 256, 256)}
 TAPS = {"vgg": (3, 8, 15, 22, 29), "alex": (1, 4, 7, 9, 11)}
@@ -231,7 +230,7 @@ def test_bad_weights_are_named(weights, tmp_path):
 def test_headers_without_entries_and_numbers_that_are_none(tmp_path, monkeypatch):
     from safetensors.torch import save_file
 
-    from warpgs.pipeline.metrics import lpips_weights
+    from warpgs.pipeline.metrics import lpips as lpips_weights
 
     bad, text = tmp_path / "bad.safetensors", b'{"__metadata__":null}   '
     bad.write_bytes(len(text).to_bytes(8, "little") + text)

@@ -11,12 +11,11 @@ from safetensors.torch import save
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError
-from warpgs.pipeline.model.model_file import load as load_model
-from warpgs.pipeline.model.model_file import save as save_model
-from warpgs.pipeline.runs import checkpoint
-from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint
-from warpgs.pipeline.runs.folder import open_run, read_record, stored_request
-from warpgs.report.events import read_events
+from warpgs.pipeline.model.table import load as load_model
+from warpgs.pipeline.model.table import save as save_model
+from warpgs.pipeline.run import folder as checkpoint
+from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, open_run, read_record, stored_request
+from warpgs.report.progress import read_events
 from warpgs.synthetic.demo import write_demo
 
 FLAGS = ["--steps", "6", "--device", "cpu", "--init.source", "random", "--init.random-count", "50", "--preset", "3dgs"]

@@ -9,9 +9,9 @@ import torch
 
 from tests.gaussians import cloud
 from tests.scenes import photos, seeds
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.mcmc import MAX_COPIES, MCMCConfig, perturb, relocated
 from warpgs.pipeline.train.trainer import Trainer
 

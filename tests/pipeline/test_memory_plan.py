@@ -11,21 +11,21 @@ from tests.example_terms import DepthCorrelation
 from tests.gaussians import camera, cloud, leaves
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
+from warpgs.device import StepSizes, add_needs
 from warpgs.kernels import blend, project, tiles
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
-from warpgs.pipeline.train.memory_plan import most_instances, plan
+from warpgs.pipeline.train.memory import most_instances, plan
+from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import StoppingConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.exposure import Exposure
-from warpgs.pipeline.train.view_modules.poses import RefinePoses
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.runtime.step_sizes import StepSizes, add_needs
+from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import View
 from warpgs.synthetic.demo import split_spec, write_demo
 

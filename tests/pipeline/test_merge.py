@@ -7,7 +7,7 @@ import torch
 
 from tests.gaussians import cloud
 from warpgs.geometry import quaternions, rotation_matrices
-from warpgs.pipeline.model.merge import OPAQUE, covariances, merges
+from warpgs.pipeline.model.edit import OPAQUE, covariances, merges
 from warpgs.scene import Gaussians
 
 

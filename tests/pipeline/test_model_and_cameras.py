@@ -11,17 +11,16 @@ from tests.gaussians import cloud
 from tests.io import scenes
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.export.cameras import NAMES, write_cameras
-from warpgs.export.formats import write_gaussians
+from warpgs.export.base import write_gaussians
+from warpgs.export.meshes_and_cameras import NAMES, write_cameras
 from warpgs.files import make_folder
 from warpgs.geometry import look_at
-from warpgs.io.camera_files import read_cameras
-from warpgs.pipeline.films.plan import FilmSettings
-from warpgs.pipeline.runs.commands import render
-from warpgs.pipeline.runs.export_filters import Filters
-from warpgs.pipeline.runs.export_model import convert
-from warpgs.pipeline.runs.model_and_cameras import open_file
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.io.transforms import read_cameras
+from warpgs.pipeline.films.film import FilmSettings
+from warpgs.pipeline.run.commands import open_file, render
+from warpgs.pipeline.run.export import Filters, convert
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.scenes import photos
-from warpgs.pipeline.metrics.moved import Rendered, moved_fractions, moved_notes
+from warpgs.pipeline.metrics.scores import Rendered, moved_fractions, moved_notes
 from warpgs.scene import View
 
 WALL = 2.2

@@ -11,15 +11,14 @@ import torch
 import warpgs
 from tests.io.scenes import save
 from tests.scenes import ring, seeds, three_gaussians
-from warpgs import lenses
+from warpgs import geometry
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.geometry import pinhole_of, seen_pixels
 from warpgs.io.images import list_images
-from warpgs.pipeline.films.camera_paths import framed
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.films.paths import framed
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views
 from warpgs.pipeline.train.setup import prepare
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Scene, View
@@ -37,7 +36,7 @@ def write_lens_demo(folder) -> None:
     number, _, width, height, *K = cameras.read_text().splitlines()[-1].split()
     fx, fy, cx, cy = map(float, K)
     x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
-    rays = lenses.from_plane(LENS[1], np.array(LENS[2]), np.stack([(x - cx) / fx, (y - cy) / fy], -1))
+    rays = geometry.from_plane(LENS[1], np.array(LENS[2]), np.stack([(x - cx) / fx, (y - cy) / fy], -1))
     at = rays[..., :2] / rays[..., 2:] * [fx, fy] + [cx - 0.5, cy - 0.5]
     for path in list_images(folder / "images"):
         image = cv2.imread(str(path))[..., ::-1]

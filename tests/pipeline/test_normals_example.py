@@ -10,10 +10,10 @@ from tests.example_terms import NormalSmoothness
 from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
 from warpgs.geometry import depth_normals
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.render.rasterize import rasterize
 

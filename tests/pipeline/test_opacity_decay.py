@@ -11,10 +11,10 @@ import torch
 from tests.scenes import view_stub
 from tests.tolerances import OPACITY_DECAY
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.by_views import EXTRAPOLATED_VIEWS, ONE_LAYER_VIEWS, settings_by_views
-from warpgs.pipeline.train.opacity_decay import LEAST_LOGIT, decay_opacities
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
+from warpgs.pipeline.train.settings import EXTRAPOLATED_VIEWS, ONE_LAYER_VIEWS, settings_by_views
+from warpgs.pipeline.train.step import LEAST_LOGIT, decay_opacities
 
 GOING = torch.tensor([True])
 

@@ -11,10 +11,9 @@ import torch
 from tests.pipeline.test_trainer import BUSY, fitted
 from tests.scenes import photos, seeds
 from warpgs.errors import OutOfMemoryError, ResourceError
-from warpgs.pipeline.train import take_steps
+from warpgs.pipeline.train import batch
 from warpgs.pipeline.train import trainer as trainer_module
-from warpgs.pipeline.train.loop import run
-from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.trainer import Trainer, run
 
 CPU = torch.device("cpu")
 CUDA = torch.device("cuda", 0)
@@ -69,7 +68,7 @@ def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
     """The same bits as without the lack; it is said once for each."""
     reference = fitted(BUSY, 60)
     fit = fitted(BUSY, 0)
-    failing(monkeypatch, take_steps, "step", {3, 30})
+    failing(monkeypatch, batch, "step", {3, 30})
     assert finished(fit, []) == list(range(1, 61))
     assert same(fit, reference)
     assert len(fit.messages) == 2 and "step 3 ran out of memory" in fit.messages[0]
@@ -78,7 +77,7 @@ def test_a_step_is_tried_again_and_nothing_else_changes(monkeypatch):
 def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
     """The state saved is that before the step, with its view still to come; a fit that continues from it is the same."""
     reference, fit, states = fitted(BUSY, 60), fitted(BUSY, 0), []
-    failing(monkeypatch, take_steps, "step", {26, 27})
+    failing(monkeypatch, batch, "step", {26, 27})
     with pytest.raises(OutOfMemoryError, match=r"step 26 .*--memory-limit.*--downscale.*--resume") as found:
         finished(fit, states)
     assert found.value.exit_code == 4 and states[-1][1]["step"] == 25
@@ -91,7 +90,7 @@ def test_a_step_that_fails_twice_ends_the_fit_and_is_saved(monkeypatch):
 def test_where_not_even_the_smallest_step_fits_the_state_is_saved(monkeypatch):
     """Nothing is free when the step is to be tried again."""
     fit, states = fitted(BUSY, 0), []
-    failing(monkeypatch, take_steps, "step", {26})
+    failing(monkeypatch, batch, "step", {26})
     monkeypatch.setattr(trainer_module, "available_bytes", lambda _: 0)
     with pytest.raises(ResourceError, match="smallest step needs") as found:
         finished(fit, states)
@@ -126,7 +125,7 @@ def test_other_errors_pass(monkeypatch):
     def broken(*_):
         raise RuntimeError("something else")
 
-    monkeypatch.setattr(take_steps, "step", broken)
+    monkeypatch.setattr(batch, "step", broken)
     with pytest.raises(RuntimeError, match="something else"):
         finished(fit, [])
 

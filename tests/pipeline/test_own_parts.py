@@ -8,10 +8,10 @@ import torch
 
 from tests.scenes import photos, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.loss import LOSS_TERMS, LossTerm
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
 from warpgs.pipeline.train.trainer import Trainer
 

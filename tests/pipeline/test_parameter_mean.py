@@ -12,16 +12,14 @@ import torch
 from tests.example_terms import DepthCorrelation
 from tests.scenes import photos, priors, seeds, view_stub
 from warpgs.errors import DataError, UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.by_views import AVERAGED_VIEWS, settings_by_views
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.memory_plan import layout_of
-from warpgs.pipeline.train.parameter_mean import SAMPLES, ParameterMean
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.memory import layout_of
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.exposure import Exposure
+from warpgs.pipeline.train.settings import AVERAGED_VIEWS, FitConfig, settings_by_views
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.trainer import SAMPLES, ParameterMean, Trainer
+from warpgs.pipeline.train.view_modules import Exposure
 
 CPU = torch.device("cpu")
 CONFIG = FitConfig(

@@ -10,18 +10,18 @@ import warp as wp
 from tests.example_terms import DepthCorrelation
 from tests.scenes import photos, priors, seeds
 from warpgs.app.cli import main
-from warpgs.pipeline.metrics.evaluate import render_view, score
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs import precompile
-from warpgs.pipeline.runs.precompile import fit_kernels
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.kernels import launch as interop
+from warpgs.pipeline.metrics.scores import render_view, score
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run import precompile
+from warpgs.pipeline.run.precompile import fit_kernels
+from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.render.rasterize import RasterizeOptions
-from warpgs.runtime import interop
+from warpgs.render.options import RasterizeOptions
 
 
 @wp.kernel(enable_backward=False, module="unique")

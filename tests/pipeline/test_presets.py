@@ -11,19 +11,18 @@ import pytest
 import warpgs
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
-from warpgs.app.commands.fit import request_of
+from warpgs.app.fit import request_of
 from warpgs.errors import DataError, UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.fit import fit
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss_terms.opacity import AlphaDifference
-from warpgs.pipeline.train.overrides import keyword, setting_names, with_settings
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.fit import fit
+from warpgs.pipeline.train.loss import AlphaDifference
 from warpgs.pipeline.train.presets import MAX_BYTES, MAX_DOTS, PRESETS, preset_settings
+from warpgs.pipeline.train.settings import FitConfig, keyword, setting_names, with_settings
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
 from warpgs.scene import Scene
 
 OWN = """
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.settings import FitConfig
 PLAIN = FitConfig(steps=5)
 SOME = {"base": "quick", "init": {"opacity": 0.5}}
 NUMBER = 3
@@ -256,3 +255,9 @@ def test_the_command_line_takes_files_and_objects(own, tmp_path, capsys):
         assert said in text and len(text.splitlines()) == 1
     assert main(["compare", *base, "--presets", f"default,{tmp_path}/broken.py:X"]) == 2
     assert f"the preset '{tmp_path}/broken.py:X' cannot be loaded" in capsys.readouterr().err
+
+
+def test_presets_are_listed():
+    """As a mapping: names, number, membership."""
+    assert list(warpgs.PRESETS) == ["default", "3dgs", "mcmc", "paper-literal", "quick"]
+    assert len(warpgs.PRESETS) == 5 and "quick" in warpgs.PRESETS

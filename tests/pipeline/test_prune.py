@@ -12,7 +12,7 @@ from tests.scenes import ring
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.export.ply import read_ply
-from warpgs.pipeline.model.compress import (
+from warpgs.pipeline.model.edit import (
     ViewSet,
     keep_last,
     largest_fraction,
@@ -21,10 +21,10 @@ from warpgs.pipeline.model.compress import (
     rows_of,
     stored_degrees,
 )
-from warpgs.pipeline.runs.checkpoint import load_checkpoint
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.prune import _new_folder, prune
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.pipeline.run.commands import _new_folder, prune
+from warpgs.pipeline.run.folder import load_checkpoint, open_run
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera
 from warpgs.synthetic.demo import split_spec, write_demo
 

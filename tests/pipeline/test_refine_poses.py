@@ -11,9 +11,9 @@ import warpgs
 from tests import scenes
 from warpgs.app.cli import main
 from warpgs.geometry import matmul
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.poses import (
+from warpgs.pipeline.train.view_modules import (
     CAMERA_NUMBER,
     FOCAL,
     ROTATION,

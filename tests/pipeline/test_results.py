@@ -4,10 +4,10 @@ import pytest
 
 from tests.scenes import photos, seeds
 from warpgs.errors import ResourceError
-from warpgs.pipeline.metrics.evaluate import options_for, render_view, score
-from warpgs.pipeline.model.init import InitConfig, initial_gaussians
-from warpgs.pipeline.runs import results
-from warpgs.pipeline.runs.results import evaluate_run, result_lines
+from warpgs.pipeline.metrics.scores import options_for, render_view, score
+from warpgs.pipeline.model.start import InitConfig, initial_gaussians
+from warpgs.pipeline.run import results
+from warpgs.pipeline.run.results import evaluate_run, result_lines
 
 BLACK = (0.0, 0.0, 0.0)
 

@@ -11,12 +11,13 @@ from tests.gaussians import cloud
 from tests.scenes import photos, seeds, three_gaussians
 from warpgs.constants import RULES, TILE_SIZE
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.rule_report import rule_report_of
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.results import rule_report_of
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView, half_size
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians, View
 
 CPU = torch.device("cpu")

@@ -11,15 +11,15 @@ import warpgs
 from warpgs.app.cli import main
 from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError
 from warpgs.files import LOCK
-from warpgs.pipeline.farm import ensure_run
-from warpgs.pipeline.films.plan import FilmSettings
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs import fit as fit_module
-from warpgs.pipeline.runs.checkpoint import TENSORS
-from warpgs.pipeline.runs.commands import evaluate, render
-from warpgs.pipeline.runs.export_model import export
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.runtime.folder_lock import hold_folder
+from warpgs.locks import hold_folder
+from warpgs.pipeline.farm import work
+from warpgs.pipeline.films.film import FilmSettings
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run import fit as fit_module
+from warpgs.pipeline.run.commands import evaluate, render
+from warpgs.pipeline.run.export import export
+from warpgs.pipeline.run.folder import TENSORS
+from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.synthetic.demo import write_demo
 
 CONFIG = warpgs.FitConfig(steps=2, init=InitConfig(source="random", random_count=50))
@@ -106,7 +106,7 @@ def test_a_study_leaves_a_run_in_progress_alone(folder, tmp_path):
     scene = warpgs.load_scene(folder / "scene")
     request = FitRequest(SceneRequest(str(folder / "scene")), out, dataclasses.replace(CONFIG, steps=3), "cpu")
     with hold_folder(out):
-        outcome = ensure_run.ensure_run(request, scene.fingerprint, warpgs.open_run(out, "cpu"), "cpu", {})
+        outcome = work.ensure_run(request, scene.fingerprint, warpgs.open_run(out, "cpu"), "cpu", {})
     assert outcome.state == "failed" and "is writing there" in outcome.note
     assert [p.name for p in out.parent.iterdir()] == ["0"]
 

@@ -7,8 +7,7 @@ import pytest
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError
-from warpgs.pipeline.runs.checkpoint import FORMAT, TENSORS, load_checkpoint
-from warpgs.pipeline.runs.folder import open_run
+from warpgs.pipeline.run.folder import FORMAT, TENSORS, load_checkpoint, open_run
 from warpgs.synthetic.demo import write_demo
 
 OLD_CONFIG = {

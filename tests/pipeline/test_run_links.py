@@ -11,7 +11,7 @@ from tests.pipeline.farms import HereEngine, jobs_of, write_scenes
 from warpgs.app.cli import main
 from warpgs.errors import ResourceError
 from warpgs.pipeline.farm.farm import run_farm
-from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="links need a right that users of Windows often lack")

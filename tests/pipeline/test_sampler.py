@@ -7,17 +7,9 @@ from scipy.stats import chisquare
 
 from tests.scenes import ring
 from warpgs import geometry
-from warpgs.colors import C0
 from warpgs.errors import UsageError
-from warpgs.pipeline.train.strategies.sampler import (
-    SUPPORT,
-    SamplerConfig,
-    fine_gaussians,
-    geometry_gate,
-    sample_pixels,
-    valid_pixels,
-)
-from warpgs.scene import Camera
+from warpgs.pipeline.train.sampling import SUPPORT, SamplerConfig, fine_gaussians, geometry_gate, sample_pixels, valid_pixels
+from warpgs.scene import C0, Camera
 
 
 def drawn_counts(score: torch.Tensor, gate: torch.Tensor, count: int, repeats: int) -> np.ndarray:

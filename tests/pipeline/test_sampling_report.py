@@ -9,25 +9,17 @@ import torch
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import ResourceError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs import sampling_report
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.runs.sampling_report import (
-    SHEET_WIDTH,
-    event_figures,
-    images_kept,
-    sampling_report_of,
-    shown_steps,
-    view_sheet,
-)
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run import results
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.run.results import SHEET_WIDTH, event_figures, images_kept, sampling_report_of, shown_steps, view_sheet
+from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig, plan_phases
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig, ProtectConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig, ProtectConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.report.contact_sheet import DOT, GAP, HEAD, MARGIN, TITLE_SIZE
-from warpgs.report.images import colored, webp
+from warpgs.report.images import CONTACT_GAP, CONTACT_HEAD, CONTACT_MARGIN, DOT, TITLE_SIZE, colored, webp
 
 CPU = torch.device("cpu")
 NAMES = ["00.png", "01.png", "02.png"]
@@ -66,8 +58,8 @@ def run(tmp_path_factory):
 def tile(sheet: np.ndarray, index: int, view, text: float = 1.25, width: int = 320) -> np.ndarray:
     """The pixels of one tile of a sheet of five columns."""
     height = round(width * view.camera.height / view.camera.width)
-    head, top = round(text * HEAD), MARGIN + round(text * TITLE_SIZE) + 18
-    x, y = MARGIN + index % 5 * (width + GAP), top + head + index // 5 * (head + height + GAP)
+    head, top = round(text * CONTACT_HEAD), CONTACT_MARGIN + round(text * TITLE_SIZE) + 18
+    x, y = CONTACT_MARGIN + index % 5 * (width + CONTACT_GAP), top + head + index // 5 * (head + height + CONTACT_GAP)
     return sheet[y : y + height, x : x + width]
 
 
@@ -86,7 +78,7 @@ def test_pictures_lie_in_the_run_folder(run):
     files = sorted((out / "sampling").iterdir())
     assert [int(f.stem) for f in files] == sorted(shown_steps(fit.phases)) and len(files) == 2
     first = cv2.imread(str(files[0]))
-    assert first.shape[0] % 3 == 0 and first.shape[1] == 2 * MARGIN + 5 * 320 + 4 * GAP
+    assert first.shape[0] % 3 == 0 and first.shape[1] == 2 * CONTACT_MARGIN + 5 * 320 + 4 * CONTACT_GAP
 
 
 def test_tiles_show_what_the_event_saw(run):
@@ -124,7 +116,13 @@ def test_uniform_events_show_no_scores(tmp_path):
     drawn, view = seen[0].views[1], fit.views[1]
     assert fit.disparities == [] and not any(s.any() for s in drawn.scores)
     sheet = view_sheet("01.png", 8, view, None, drawn, method)
-    one_row = tile(np.zeros((10**4, 10**4)), 0, view).shape[0] + round(1.25 * HEAD) + 2 * MARGIN + round(1.25 * TITLE_SIZE) + 18
+    one_row = (
+        tile(np.zeros((10**4, 10**4)), 0, view).shape[0]
+        + round(1.25 * CONTACT_HEAD)
+        + 2 * CONTACT_MARGIN
+        + round(1.25 * TITLE_SIZE)
+        + 18
+    )
     assert sheet.shape[0] == one_row  # render, image, gate, pixels, words
     words = sampling_report_of(fit, tmp_path).words
     assert "uniformly at random" in words and "All scores have weight 0, so no score is shown." in words
@@ -196,7 +194,7 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
         raise ResourceError(f"{path.name}: no space left")
 
     if cause == "disk":
-        monkeypatch.setattr(sampling_report, "write_bytes", full)
+        monkeypatch.setattr(results, "write_bytes", full)
     else:
         (tmp_path / "sampling").write_text("in the way")
     views = photos(3)
@@ -211,7 +209,7 @@ def test_images_that_cannot_be_written_end_no_fit(tmp_path, monkeypatch, cause):
 
 def test_an_error_of_ours_in_an_image_is_not_hidden(tmp_path, monkeypatch):
     """Only what the disk does is a note."""
-    monkeypatch.setattr(sampling_report, "write_bytes", lambda path, data: 1 / 0)
+    monkeypatch.setattr(results, "write_bytes", lambda path, data: 1 / 0)
     views = photos(3)
     fit = Trainer(views, seeds(), CONFIG, CPU, priors=priors(views))
     with pytest.raises(ZeroDivisionError), images_kept(fit, NAMES, tmp_path):

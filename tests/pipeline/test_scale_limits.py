@@ -10,8 +10,7 @@ import torch
 from tests.gaussians import cloud
 from tests.scenes import photos, ring, seeds
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.model.scale_limits import (
+from warpgs.pipeline.model.limits import (
     LimitConfig,
     Limits,
     TrainingCameras,
@@ -20,10 +19,11 @@ from warpgs.pipeline.model.scale_limits import (
     shape_figures,
     shape_summary,
 )
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.train.config import FitConfig
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Gaussians, PointCloud
 

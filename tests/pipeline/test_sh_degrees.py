@@ -4,13 +4,8 @@ import pytest
 import torch
 
 from tests.gaussians import cloud
-from warpgs.pipeline.model.compress import drop_unused_sh, stored_degrees
-from warpgs.pipeline.model.sh_degrees import (
-    model_bytes,
-    pack,
-    truncated,
-    unpack,
-)
+from warpgs.pipeline.model.edit import drop_unused_sh, stored_degrees
+from warpgs.pipeline.model.table import model_bytes, pack, truncated, unpack
 from warpgs.scene import Gaussians
 
 

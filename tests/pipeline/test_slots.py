@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.train import slots as train_slots
-from warpgs.pipeline.train.slots import SlotSums, Tree, check_ranks, check_renders, own_slots
-from warpgs.runtime.ranks import ALONE, Ranks
+from warpgs.pipeline.train import batch as train_slots
+from warpgs.pipeline.train.batch import SlotSums, Tree, check_ranks, check_renders, own_slots
+from warpgs.ranks import ALONE, Ranks
 
 SHAPES = [(7, 3), (7,), (5,)]
 
@@ -86,7 +86,7 @@ def test_rows_of_a_large_tensor_are_divided_and_means_are_sums_over_slots(monkey
     slots = [[torch.randn(s, generator=random) for s in ((7, 3), (501, 4), (5,))] for _ in range(6)]
     alone, sums = summed(slots, ALONE, means=2), summed(slots, ALONE)
     assert all(torch.equal(a, b * (1 / 6 if k < 2 else 1)) for k, (a, b) in enumerate(zip(alone, sums, strict=True)))
-    monkeypatch.setattr("warpgs.pipeline.train.slots.DIVIDED_BYTES", 501 * 16)
+    monkeypatch.setattr("warpgs.pipeline.train.batch.DIVIDED_BYTES", 501 * 16)
     for count in (2, 3):
         for found in by_threads(lambda ranks: summed(slots, ranks, means=2), count):
             assert all(torch.equal(a, b) for a, b in zip(alone, found, strict=True))

@@ -12,15 +12,12 @@ from filelock import FileLock
 
 from tests.pipeline.farms import jobs_of
 from warpgs.errors import ResourceError, UsageError
-from warpgs.pipeline.farm import batch, slurm
-from warpgs.pipeline.farm.engine import Event
-from warpgs.pipeline.farm.farm import run_farm
-from warpgs.pipeline.farm.job import job_of
-from warpgs.pipeline.farm.private_folder import private_shared_folder
-from warpgs.pipeline.farm.record import JobRecord, write_record
-from warpgs.pipeline.farm.run import EngineRequest, make_engine
+from warpgs.locks import private_shared_folder
+from warpgs.pipeline.farm import slurm
+from warpgs.pipeline.farm.farm import EngineRequest, make_engine, run_farm
+from warpgs.pipeline.farm.job import Event, JobRecord, job_of, write_record
 from warpgs.pipeline.farm.slurm import SlurmEngine
-from warpgs.runtime.subprocesses import ProgramResult
+from warpgs.process import ProgramResult
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="Slurm runs on Linux")
 
@@ -106,7 +103,7 @@ def test_a_job_goes_to_its_node_as_json_in_a_private_folder(cluster, job, tmp_pa
     engine.start(job)
     ((program, *options),) = cluster.calls
     words = cluster.scripts["70"]
-    assert program == "sbatch" and words[:5] == ["exec", sys.executable, "-P", "-m", "warpgs.pipeline.farm.batch"]
+    assert program == "sbatch" and words[:5] == ["exec", sys.executable, "-P", "-m", "warpgs.pipeline.farm.slurm"]
     assert {"--time=90", "--cpus-per-task=3", "--gpus-per-node=1", "--partition=gpu"} <= set(options)
     text, answer = map(Path, words[5:7])
     assert job_of(text.read_text()) == job and words[7] == "3"
@@ -191,21 +188,21 @@ def test_what_slurm_refuses_is_said(cluster, job, monkeypatch, capsys):
 def test_the_process_of_a_job_answers_with_its_state(tmp_path, monkeypatch, capsys):
     """Nothing where it is interrupted; a reason on stderr where the job cannot begin."""
     (tmp_path / "job").write_text("TEXT")
-    monkeypatch.setattr(batch, "run_job", lambda text, threads: f"{text} {threads}")
-    assert batch.main(str(tmp_path / "job"), str(tmp_path / "answer"), "2") == 0
+    monkeypatch.setattr(slurm, "run_job", lambda text, threads: f"{text} {threads}")
+    assert slurm.main(str(tmp_path / "job"), str(tmp_path / "answer"), "2") == 0
     assert (tmp_path / "answer").read_text() == "TEXT 2"
 
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(batch, "run_job", stop)
-    assert batch.main(str(tmp_path / "job"), str(tmp_path / "none"), "2") == 130 and not (tmp_path / "none").exists()
+    monkeypatch.setattr(slurm, "run_job", stop)
+    assert slurm.main(str(tmp_path / "job"), str(tmp_path / "none"), "2") == 130 and not (tmp_path / "none").exists()
 
     def refuse(*_):
         raise UsageError("the loss term is not there")
 
-    monkeypatch.setattr(batch, "run_job", refuse)
-    assert batch.main(str(tmp_path / "job"), str(tmp_path / "none"), "2") == 1 and not (tmp_path / "none").exists()
+    monkeypatch.setattr(slurm, "run_job", refuse)
+    assert slurm.main(str(tmp_path / "job"), str(tmp_path / "none"), "2") == 1 and not (tmp_path / "none").exists()
     assert capsys.readouterr().err == "the loss term is not there\n"
 
 

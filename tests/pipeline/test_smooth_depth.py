@@ -12,13 +12,11 @@ from tests.pipeline.test_memory_plan import STEADY, instances, measured
 from tests.pipeline.test_normals_example import same_bits
 from tests.scenes import photos, seeds, view_stub
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.by_views import FEW, SMOOTH_STEPS, settings_by_views, steps_by_views
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss_terms.built_in import LossConfig, built_in_terms
-from warpgs.pipeline.train.loss_terms.smooth_depth import BOUND, CONFIRMED, EDGE, SmoothDepth, depth_roughness
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.loss import BOUND, CONFIRMED, EDGE, LossConfig, SmoothDepth, built_in_terms, depth_roughness
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.settings import FEW, SMOOTH_STEPS, FitConfig, settings_by_views, steps_by_views
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.render.rasterize import rasterize

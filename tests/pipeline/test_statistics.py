@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from warpgs.pipeline.study.statistics import family_confidence, paired_difference, sample
+from warpgs.pipeline.study.tables import family_confidence, paired_difference, sample
 
 
 @pytest.mark.parametrize("n", [2, 3, 5, 40])

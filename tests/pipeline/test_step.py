@@ -10,11 +10,11 @@ from tests.example_terms import DepthCorrelation
 from tests.pipeline.test_importance_sampling import CONFIG as METHOD
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import NotFiniteError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train import step_graphs
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train import step
 from warpgs.pipeline.train.schedule import OptimizerConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import View
 
@@ -92,7 +92,7 @@ def test_recorded_batches_equal_single_ones(make):
 def test_recordings_do_not_pile_up(monkeypatch):
     """Memory of recordings that are no longer used goes back: a long fit holds no more than a short one of its size."""
     torch.cuda.empty_cache()
-    monkeypatch.setattr(step_graphs, "DEAD_BYTES", 2**22)
+    monkeypatch.setattr(step, "DEAD_BYTES", 2**22)
     fit, _ = fitted(photos(4), recorded=True)
     held = []
     for _ in range(40):
@@ -108,13 +108,13 @@ def test_too_little_capacity_is_found_and_fixed(monkeypatch, batch):
     """Steps that would overflow change nothing; they are captured anew and taken, and the result is the same."""
     config = dataclasses.replace(BUSY, batch=batch)
     reference, _ = fitted(photos(4), recorded=False, config=config)
-    honest, tries = step_graphs.instance_capacity, []
+    honest, tries = step.instance_capacity, []
 
     def scarce(*args):
         tries.append(honest(*args))
         return 16 if len(tries) % 2 else tries[-1]
 
-    monkeypatch.setattr(step_graphs, "instance_capacity", scarce)
+    monkeypatch.setattr(step, "instance_capacity", scarce)
     fit, reports = fitted(photos(4), recorded=True, config=config)
     assert len(tries) >= 4
     a, b = reference.state()[0], fit.state()[0]

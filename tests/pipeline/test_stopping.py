@@ -10,18 +10,17 @@ import torch
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.checkpoint import load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.complexity import complexity_figures, complexity_summary
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.folder import load_checkpoint, save_checkpoint
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.sampling import SamplerConfig
 from warpgs.pipeline.train.schedule import PhaseConfig
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.stopping import Stopping, StoppingConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
 from warpgs.pipeline.train.strategies.mcmc import MCMCConfig
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.strategies.sampling_event import MethodConfig
-from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.trainer import Trainer, complexity_figures, complexity_summary
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from warpgs.pipeline.study.plots import BETTER, UNDECIDED, WORSE, Line, Panel, forest
-from warpgs.pipeline.study.statistics import paired_difference
-from warpgs.report.crops import crops, disagreement
-from warpgs.report.sheet import BOXES, Cell, Strip, sheet
+from warpgs.pipeline.study.tables import BETTER, UNDECIDED, WORSE, Line, Panel, forest, paired_difference
+from warpgs.report.images import BOXES, Cell, Strip, crops, disagreement, sheet
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -7,8 +7,7 @@ import re
 
 import pytest
 
-from warpgs.pipeline.study.statistics import paired_difference, sample
-from warpgs.pipeline.study.table import Metric, Row, Table, csv_text, interval, latex, markdown
+from warpgs.pipeline.study.tables import Metric, Row, Table, csv_text, interval, latex, markdown, paired_difference, sample
 
 PSNR, SSIM, LPIPS = Metric("psnr", "PSNR", True, 2), Metric("ssim", "SSIM", True, 3), Metric("lpips", "LPIPS", False, 3)
 BASE, OTHER = [20.0, 20.2, 20.1], [20.6, 20.7, 20.8]

@@ -9,10 +9,8 @@ import torch
 from tests.scenes import photos
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
-from warpgs.pipeline.train import time_budget
-from warpgs.pipeline.train.by_views import steps_by_views
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.time_budget import MIN_STEPS, within_budget
+from warpgs.pipeline.train import settings
+from warpgs.pipeline.train.settings import MIN_TIMED_STEPS, FitConfig, steps_by_views, within_budget
 from warpgs.synthetic.demo import split_spec, write_demo
 
 CPU = torch.device("cpu")
@@ -27,9 +25,9 @@ def scene(tmp_path_factory):
 
 def test_more_time_more_steps(monkeypatch):
     """By the costs of a probe of 10 ms, the predicted time keeps the budget, and one step more would not."""
-    monkeypatch.setattr(time_budget, "probe_seconds", lambda *_: 0.01)
+    monkeypatch.setattr(settings, "probe_seconds", lambda *_: 0.01)
     views, config = photos(3), FitConfig(seed=7, rule="fast")
-    setup, step = 0.01 * time_budget.SETUP * 3, 0.01 * time_budget.STEP
+    setup, step = 0.01 * settings.SETUP * 3, 0.01 * settings.STEP
     for seconds in (setup + 150 * step, setup + 777.5 * step):
         chosen, why = within_budget(config, seconds, views, CPU)
         assert setup + chosen.steps * step <= seconds < setup + (chosen.steps + 1) * step + 1e-9
@@ -37,13 +35,13 @@ def test_more_time_more_steps(monkeypatch):
     for count in (3, 20):
         most, why = within_budget(config, 1e9, photos(count), CPU)
         assert most.steps == steps_by_views(count) and why.count(f"{count} views need no more") == 1
-    with pytest.raises(UsageError, match=f"too short: {MIN_STEPS} steps"):
-        within_budget(config, setup + (MIN_STEPS - 1) * step, views, CPU)
+    with pytest.raises(UsageError, match=f"too short: {MIN_TIMED_STEPS} steps"):
+        within_budget(config, setup + (MIN_TIMED_STEPS - 1) * step, views, CPU)
 
 
 def test_the_probe_measures(device):
     """A positive time; how long is the machine's affair."""
-    assert 0 < time_budget.probe_seconds(32, 24, device) < math.inf
+    assert 0 < settings.probe_seconds(32, 24, device) < math.inf
 
 
 @pytest.mark.parametrize(

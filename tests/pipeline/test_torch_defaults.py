@@ -8,7 +8,7 @@ import torch
 
 import warpgs
 from tests.scenes import photos, seeds
-from warpgs.pipeline.train.time_budget import probe_seconds
+from warpgs.pipeline.train.settings import probe_seconds
 from warpgs.scene import Scene
 
 ROOT = Path(warpgs.__file__).parent
@@ -33,9 +33,9 @@ def other_default(request):
     torch.set_default_dtype(torch.float32)
 
 
-def fitted(preset: str, scene: Scene, **changes) -> list[torch.Tensor]:
+def fitted(preset: str, scene: Scene, device: torch.device, **changes) -> list[torch.Tensor]:
     """The Gaussians of a short fit."""
-    result = warpgs.fit(scene, preset, steps=12, split="every:4", device="cpu", verbose=False, **changes)
+    result = warpgs.fit(scene, preset, steps=12, split="every:4", device=device, verbose=False, **changes)
     return list(result.gaussians().tensors().values())
 
 
@@ -46,19 +46,19 @@ def fitted(preset: str, scene: Scene, **changes) -> list[torch.Tensor]:
         *(pytest.param(p, {}, marks=pytest.mark.slow) for p in ("quick", "paper-literal")),
     ],
 )  # fmt: skip
-def test_a_fit_makes_its_own_types_and_devices(other_default, preset, changes):
+def test_a_fit_makes_its_own_types_and_devices(other_default, device, preset, changes):
     """The second of two fits in one process, whose launches were recorded by the first."""
     scene = Scene("three Gaussians", "test", tuple(photos(6)), seeds())
-    first = fitted(preset, scene, **changes)
+    first = fitted(preset, scene, device, **changes)
     other_default()
-    second = fitted(preset, scene, **changes)
+    second = fitted(preset, scene, device, **changes)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
 
 
-def test_the_step_of_a_time_budget_too(other_default):
+def test_the_step_of_a_time_budget_too(other_default, device):
     """It is made of numbers of its own."""
     other_default()
-    assert probe_seconds(20, 16, torch.device("cpu")) > 0
+    assert probe_seconds(20, 16, device) > 0
 
 
 def test_new_tensors_name_their_type_and_device():

@@ -16,16 +16,15 @@ import torch
 from tests.scenes import photos, seeds
 from warpgs.errors import DataError, NotFiniteError, UsageError
 from warpgs.geometry import look_at
-from warpgs.kernels.knn import morton_codes
-from warpgs.pipeline.metrics.region import counted_region
-from warpgs.pipeline.model.init import InitConfig, initial_gaussians, initial_points
-from warpgs.pipeline.model.random_points import empty_votes, nearest, random_points
-from warpgs.pipeline.runs.checkpoint import TENSORS, load_checkpoint, save_checkpoint
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss_terms.photometric import photometric_loss
+from warpgs.kernels.neighbours import morton_codes
+from warpgs.pipeline.metrics.scores import counted_region
+from warpgs.pipeline.model.start import InitConfig, empty_votes, initial_gaussians, initial_points, nearest, random_points
+from warpgs.pipeline.run.folder import TENSORS, load_checkpoint, save_checkpoint
+from warpgs.pipeline.train.loss import photometric_loss
 from warpgs.pipeline.train.presets import PRESETS
 from warpgs.pipeline.train.schedule import OptimizerConfig, log_linear, sh_degree
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
 from warpgs.scene import Camera, PointCloud, View
 from warpgs.synthetic.demo import split_spec, write_demo
@@ -319,7 +318,7 @@ def test_resume_after_kill_gives_the_same_ply(tmp_path):
     ]  # fmt: skip
     # stands still after the first checkpoint, says so, and waits for the end
     stand_still = (
-        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.runs import checkpoint, fit_steps\n"
+        "import sys\nfrom warpgs.app.cli import main\nfrom warpgs.pipeline.run import checkpoint, fit_steps\n"
         "def save(*a, **k):\n    made(*a, **k)\n    print('saved', flush=True)\n    sys.stdin.read()\n"
         "made = checkpoint.save_checkpoint\nfit_steps.save_checkpoint = save\nsys.exit(main(sys.argv[1:]))"
     )

@@ -10,11 +10,11 @@ import pytest
 from tests.io import scenes
 from warpgs.app.cli import main
 from warpgs.pipeline.films.film import render_path
-from warpgs.pipeline.metrics import evaluate
-from warpgs.pipeline.metrics.evaluate import score, summarize
-from warpgs.pipeline.runs import schemas
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.runs.results import score_line
+from warpgs.pipeline.metrics import scores
+from warpgs.pipeline.metrics.scores import score, summarize
+from warpgs.pipeline.run import folder as schemas
+from warpgs.pipeline.run.folder import open_run
+from warpgs.pipeline.run.results import score_line
 from warpgs.report.images import png, straight_alpha
 from warpgs.scene import Camera, View
 
@@ -40,7 +40,7 @@ def test_scores_of_opacity_are_over_the_pixels_of_each_kind():
     assert m.opacity["alpha_empty"] == pytest.approx(0.25) and m.opacity["alpha_object"] == pytest.approx(0.9)
     assert m.opacity["psnr_whole"] == pytest.approx(10 * np.log10(4 * 25)) and m.opacity["psnr_foreground"] == np.inf
     assert score(view(), image, alpha=rendered).opacity == {} == score(view(alpha), image).opacity
-    assert set(m.opacity) == set(evaluate.ALPHA_VARIANTS) == set(schemas.OPACITY)
+    assert set(m.opacity) == set(scores.ALPHA_VARIANTS) == set(schemas.OPACITY)
 
 
 def test_means_are_over_the_views_that_have_such_pixels():

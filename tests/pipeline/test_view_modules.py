@@ -9,16 +9,14 @@ import torch
 
 from tests.scenes import photos, seeds
 from warpgs.app.cli import main
-from warpgs.app.commands.fit import request_of
+from warpgs.app.fit import request_of
 from warpgs.errors import UsageError
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.runs.failed_step import failed_step, findings
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.run.failed_step import failed_step, findings
+from warpgs.pipeline.run.folder import open_run
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.base import VIEW_MODULES, ViewModule
-from warpgs.pipeline.train.view_modules.exposure import Exposure
-from warpgs.pipeline.train.view_modules.poses import RefinePoses
+from warpgs.pipeline.train.view_modules import VIEW_MODULES, Exposure, RefinePoses, ViewModule
 from warpgs.pipeline.train.views import current
 from warpgs.synthetic.demo import split_spec, write_demo
 

@@ -9,19 +9,17 @@ import torch
 
 from tests.scenes import photos, priors, seeds
 from warpgs.errors import DataError
-from warpgs.pipeline.model import init
-from warpgs.pipeline.model.init import InitConfig
+from warpgs.pipeline.model import start
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.pipeline.train import setup
-from warpgs.pipeline.train import warmup as warmups
-from warpgs.pipeline.train.by_views import settings_by_views
-from warpgs.pipeline.train.loop import run
+from warpgs.pipeline.train import trainer as warmups
 from warpgs.pipeline.train.presets import PRESETS
+from warpgs.pipeline.train.sampling import SamplerConfig
+from warpgs.pipeline.train.settings import settings_by_views
 from warpgs.pipeline.train.setup import prepare
 from warpgs.pipeline.train.strategies.importance_sampling import ImportanceSampling
-from warpgs.pipeline.train.strategies.sampler import SamplerConfig
-from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.warmup import POINTS, STEPS, background_warmup, warm_up
-from warpgs.priors.view_prior import PriorConfig
+from warpgs.pipeline.train.trainer import POINTS, STEPS, Trainer, background_warmup, run, warm_up
+from warpgs.priors.views import PriorConfig
 from warpgs.scene import ViewDepth
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
@@ -99,7 +97,7 @@ def test_the_device_is_asked_for_last(changes, monkeypatch):
     order = []
     views = photos(3)
     monkeypatch.setattr(setup, "view_priors", lambda *a, depths, **k: (order.append("semantics"), depths(), ([], []))[-1])
-    monkeypatch.setattr(init, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
+    monkeypatch.setattr(start, "sweep_depths", lambda v, b, c, device, progress: (order.append(str(device)), consistent(v))[1])
     method = dataclasses.replace(PRESETS["default"].method, s_semantic=True)
     config = dataclasses.replace(PRESETS["default"], method=method, **changes)
     made = prepare(views, None, config, np.random.default_rng(0), CUDA, None, lambda: order.append("ready"))

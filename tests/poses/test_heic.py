@@ -8,10 +8,9 @@ import pytest
 from PIL import Image
 
 from warpgs.errors import DataError, UsageError
-from warpgs.poses import heic
-from warpgs.poses.heic import is_heic, to_jpeg
-from warpgs.poses.photographs import prepare
-from warpgs.runtime.subprocesses import ProcessFailed
+from warpgs.poses import photographs
+from warpgs.poses.photographs import is_heic, prepare, to_jpeg
+from warpgs.process import ProcessFailed
 
 HEIC = base64.b64decode(
     "AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAaFtZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAAAAAAAAAAADRpbG9jAAAAAERA"
@@ -68,7 +67,7 @@ def test_a_file_that_ends_its_reader_is_named(tmp_path, monkeypatch):
         raise ProcessFailed(-11, "")
 
     pytest.importorskip("pi_heif")
-    monkeypatch.setattr(heic, "python_lines", lines)
+    monkeypatch.setattr(photographs, "python_lines", lines)
     with pytest.raises(DataError, match=r"a\.heic: the image cannot be decoded: the decoder ended with code -11\. Restore it"):
         convert(tmp_path, HEIC)
 

@@ -15,13 +15,12 @@ from PIL import Image
 from tests.poses.conftest import film, with_exif
 from tests.test_input_files import special
 from warpgs.errors import DataError
-from warpgs.io.exif import Exif, parse_exif, read_exif
-from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.runs.with_poses import with_poses
+from warpgs.io.images import Exif, parse_exif, read_exif
+from warpgs.pipeline.run.fit import with_poses
+from warpgs.pipeline.run.request import SceneRequest
 from warpgs.poses import find
 from warpgs.poses.find import find_poses, source_digest
-from warpgs.poses.photographs import prepare
-from warpgs.poses.video import write_frames
+from warpgs.poses.photographs import prepare, write_frames
 
 BOMB = bytes.fromhex("524946461a0000005745425056503 84c0e0000002ffebfff0f071011fd0f4444ff03".replace(" ", ""))
 """A lossless WebP file of 34 bytes that unpacks to 16,383 x 16,383 px of one colour."""
@@ -225,7 +224,7 @@ def test_a_playlist_is_no_video(text, tmp_path):
 ])  # fmt: skip
 def test_videos_are_bounded(name, most, why, tmp_path, monkeypatch):
     film(tmp_path / "a.avi", 12)
-    monkeypatch.setattr(f"warpgs.poses.video.{name}", most)
+    monkeypatch.setattr(f"warpgs.poses.photographs.{name}", most)
     with pytest.raises(DataError, match=rf"a\.avi: .*{why}"):
         write_frames(tmp_path / "a.avi", tmp_path, 3, lambda line: None)
 
@@ -245,14 +244,14 @@ def test_any_error_of_the_heic_decoder_names_the_file(tmp_path, monkeypatch, cap
     """Whatever it raises becomes a line for the caller."""
     import json
 
-    from warpgs.poses import heic
+    from warpgs.poses import photographs
 
     def bomb(source, max_pixels):
         raise Image.DecompressionBombError("too large")
 
-    monkeypatch.setattr(heic, "_coded_again", bomb)
+    monkeypatch.setattr(photographs, "_coded_again", bomb)
     (tmp_path / "job.json").write_text(json.dumps({"max_pixels": 1, "files": [["a.heic", "b.jpg"]]}))
-    heic.main(str(tmp_path / "job.json"))
+    photographs.main(str(tmp_path / "job.json"))
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [{"file": 0}, {"error": "too large"}]
 
 

@@ -8,14 +8,19 @@ import pytest
 
 from tests.poses.conftest import film, with_exif
 from warpgs.errors import DataError
-from warpgs.poses.advice import advice, reason
-from warpgs.poses.find import _check_found
+from warpgs.poses.find import _check_found, advice, reason, record_of, report_lines
 from warpgs.poses.mapping import FoundCamera, FoundView, Mapping
-from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
-from warpgs.poses.pairs import choose_pairs, similarity
-from warpgs.poses.photographs import Photograph, find_photographs, folder_notes, prepare
-from warpgs.poses.record import record_of, report_lines
-from warpgs.poses.video import sharpest, write_frames
+from warpgs.poses.matching import choose_pairs, similarity
+from warpgs.poses.photographs import (
+    Photograph,
+    find_photographs,
+    folder_notes,
+    prepare,
+    sharpest,
+    without_jpeg_metadata,
+    without_png_metadata,
+    write_frames,
+)
 
 
 def descriptors(places: int, each: int, seed: int = 0) -> list[np.ndarray]:

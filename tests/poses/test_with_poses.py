@@ -6,12 +6,11 @@ from types import SimpleNamespace
 import pytest
 
 from warpgs.errors import UsageError
-from warpgs.pipeline.runs import with_poses as module
-from warpgs.pipeline.runs.fit import fit
-from warpgs.pipeline.runs.folder import StoredRun, run_folder
-from warpgs.pipeline.runs.request import SceneRequest
-from warpgs.pipeline.runs.with_poses import lost_lines, with_poses
-from warpgs.poses.record import write_record
+from warpgs.pipeline.run import fit as module
+from warpgs.pipeline.run.fit import fit, lost_lines, with_poses
+from warpgs.pipeline.run.folder import StoredRun, run_folder
+from warpgs.pipeline.run.request import SceneRequest
+from warpgs.poses.find import write_record
 
 
 def test_poses_are_kept_in_the_run_folder(tmp_path, photographs, found, monkeypatch):

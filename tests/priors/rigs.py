@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 from warpgs.geometry import look_at
-from warpgs.priors.epipolar import pixel_grid
+from warpgs.priors.flow import pixel_grid
 from warpgs.scene import Camera, View
 from warpgs.synthetic import demo, raycast
 

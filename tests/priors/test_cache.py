@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from warpgs.priors import cache as cache_module
-from warpgs.priors.cache import MapCache, cache_folder
+from warpgs.priors import networks as cache_module
+from warpgs.priors.networks import MapCache, cache_folder
 
 IMAGE = np.random.default_rng(0).random((6, 9, 3), np.float32)
 NAMES = ("a", "b")

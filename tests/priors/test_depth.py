@@ -9,9 +9,18 @@ import pytest
 
 from tests.priors import networks as nw
 from warpgs.errors import DataError, UsageError
-from warpgs.priors.depth import DEFAULTS, complete_disparity, network_disparity, unit_range
-from warpgs.priors.preprocess import HALF, IMAGENET, Preprocessing, describe, resize
-from warpgs.priors.session import open_network
+from warpgs.priors.networks import (
+    DEFAULTS,
+    HALF,
+    IMAGENET,
+    Preprocessing,
+    complete_disparity,
+    describe,
+    network_disparity,
+    open_network,
+    resize,
+    unit_range,
+)
 
 MEAN, STD = (0.4, 0.5, 0.6), (0.2, 0.25, 0.5)
 

@@ -8,7 +8,7 @@ import pytest
 from tests.priors.rigs import rig, still_life
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
-from warpgs.priors.epipolar import (
+from warpgs.priors.flow import (
     EpipolarConfig,
     blend,
     epipolar_depth,
@@ -18,7 +18,7 @@ from warpgs.priors.epipolar import (
     pixel_grid,
     round_trip,
 )
-from warpgs.priors.sweep_planes import plane_homography, project_inverse
+from warpgs.priors.sweep import plane_homography, project_inverse
 from warpgs.scene import Camera, View
 
 

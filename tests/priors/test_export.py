@@ -12,10 +12,10 @@ import torch
 
 from warpgs.app.cli import main
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.poses.matcher import mutual_matches, open_matcher
+from warpgs.poses.matching import mutual_matches, open_matcher
 from warpgs.priors.export import ExportRequest, build, export_network
-from warpgs.priors.session import open_network
-from warpgs.priors.view_prior import PriorConfig, view_priors
+from warpgs.priors.networks import open_network
+from warpgs.priors.views import PriorConfig, view_priors
 from warpgs.scene import Camera, View
 
 MISSING = [n for n in ("transformers", "onnx", "onnxscript") if importlib.util.find_spec(n) is None]

@@ -9,10 +9,9 @@ import pytest
 from tests.priors.rigs import exact_depth, still_life
 from warpgs.errors import DataError, UsageError
 from warpgs.geometry import back_project
-from warpgs.pipeline.model.init import InitConfig, initial_points
+from warpgs.pipeline.model.start import InitConfig, initial_points
 from warpgs.priors import given_depth
-from warpgs.priors.given_depth import align, check_given, fit_line, votes, with_given_depth
-from warpgs.priors.pinhole_views import lens_depth, pinhole_view
+from warpgs.priors.given_depth import align, check_given, fit_line, lens_depth, pinhole_view, votes, with_given_depth
 from warpgs.priors.sweep import SweepConfig, sweep_depths
 from warpgs.scene import GivenDepth, PointCloud, View, ViewDepth
 from warpgs.synthetic import demo

@@ -10,7 +10,7 @@ import torch
 from tests.gaussians import cloud
 from tests.lens_cameras import lens_camera
 from warpgs.errors import UsageError
-from warpgs.priors.pinhole_views import lens_depth, pinhole_view
+from warpgs.priors.given_depth import lens_depth, pinhole_view
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, View, ViewDepth
 

@@ -5,8 +5,8 @@ import pytest
 
 from tests.priors import networks as nw
 from warpgs.errors import DataError
-from warpgs.priors.preprocess import Preprocessing
-from warpgs.priors.semantics import (
+from warpgs.priors.networks import Preprocessing, open_network
+from warpgs.priors.views import (
     SemanticMaps,
     _fast_length,
     boundary_weight,
@@ -15,7 +15,6 @@ from warpgs.priors.semantics import (
     knows_foreground,
     network_semantics,
 )
-from warpgs.priors.session import open_network
 
 PLAIN = Preprocessing(32, 32, (0.0,) * 3, (1.0,) * 3, "classes")
 

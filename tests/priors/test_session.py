@@ -7,7 +7,7 @@ import pytest
 
 from tests.priors import networks as nw
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.priors.session import open_network
+from warpgs.priors.networks import open_network
 
 EYE, ZERO = np.eye(3), np.zeros(3)
 

@@ -8,19 +8,22 @@ from tests.priors.rigs import rig, still_life
 from tests.reference.scanlines import scanline_costs
 from warpgs.errors import UsageError
 from warpgs.geometry import back_project, project_points
-from warpgs.kernels.plane_depths import best_inverses
-from warpgs.priors.completion import complete
-from warpgs.priors.epipolar import pixel_grid
-from warpgs.priors.sweep import consistent_depth, sweep_depths
-from warpgs.priors.sweep_cpu import inverse_depths, matching_costs, path_costs
-from warpgs.priors.sweep_planes import (
+from warpgs.kernels.sweep import best_inverses
+from warpgs.priors.flow import pixel_grid
+from warpgs.priors.sweep import (
     MAX_LARGE_STEP,
     UNIT,
     SweepConfig,
+    complete,
+    consistent_depth,
+    inverse_depths_cpu,
+    matching_costs_cpu,
+    path_costs,
     plane_homographies,
     plane_homography,
     plane_inverses,
     project_inverse,
+    sweep_depths,
 )
 from warpgs.scene import Camera, View
 
@@ -63,7 +66,7 @@ def test_cost_is_least_at_the_true_plane():
         View("a", Camera(np.eye(4), K, 40, 30), texture[:, :40]),
         View("b", Camera(shifted, K, 40, 30), 0.5 * texture[:, 5:45] + 0.2),  # another exposure
     ]
-    costs = matching_costs(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5).numpy().transpose(2, 0, 1) / UNIT
+    costs = matching_costs_cpu(views[0], views[1:], np.array([0.15, 0.25, 0.35]), 5).numpy().transpose(2, 0, 1) / UNIT
     seen = (slice(3, -3), slice(9, -3))
     assert costs.shape == (16, 30, 40) and (costs[3:] == 1).all() and costs[1][seen].max() < 0.01
     assert costs[0][seen].min() > 0.1 and costs[2][seen].min() > 0.1
@@ -113,7 +116,7 @@ def test_depths_are_the_same_bits_on_any_number_of_threads():
     found, before = [], torch.get_num_threads()
     for threads in (1, 3):
         torch.set_num_threads(threads)
-        found.append(inverse_depths(views[1], [views[0], views[2]], np.linspace(1 / 12, 1 / 2, 40), SweepConfig()))
+        found.append(inverse_depths_cpu(views[1], [views[0], views[2]], np.linspace(1 / 12, 1 / 2, 40), SweepConfig()))
     torch.set_num_threads(before)
     assert np.array_equal(*found)
 

@@ -8,10 +8,9 @@ from tests.priors.rigs import still_life
 from tests.reference.plane_costs import matching_costs
 from tests.reference.plane_depths import best_inverse
 from tests.reference.scanlines import scanline_costs
-from warpgs.kernels.plane_costs import NEUTRAL
-from warpgs.priors import sweep, sweep_cpu, sweep_cuda
-from warpgs.priors.sweep import sweep_depths
-from warpgs.priors.sweep_planes import UNIT, SweepConfig, plane_inverses, step_limits
+from warpgs.kernels.sweep import NEUTRAL
+from warpgs.priors import sweep
+from warpgs.priors.sweep import UNIT, SweepConfig, plane_inverses, step_limits, sweep_depths
 from warpgs.scene import Camera, View
 
 CPU = torch.device("cpu")
@@ -26,7 +25,7 @@ def device(request):
 
 def computed(view: View, others: list[View], inverses: np.ndarray, window: int, device: torch.device) -> np.ndarray:
     """Return costs in the layout of the reference, [D, H, W]."""
-    found = sweep_cuda.matching_costs(view, others, inverses, window, device)
+    found = sweep.matching_costs_cuda(view, others, inverses, window, device)
     return found.cpu().numpy().transpose(2, 0, 1) / UNIT
 
 
@@ -62,7 +61,7 @@ def test_paths_agree(device):
     image = generator.uniform(0.4, 0.55, (9, 7, 3)).astype(np.float32)
     limits = [step_limits(colors, 0.05, 0.6) for colors in (image, image.swapaxes(0, 1))]
     wanted = scanline_costs(costs, limits[0], limits[1].T, round(0.05 * UNIT))
-    found = sweep_cpu.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
+    found = sweep.path_costs(torch.from_numpy(costs).to(device), image, 0.05, 0.6)
     assert np.array_equal(found.cpu().numpy(), wanted)
 
 
@@ -72,7 +71,7 @@ def test_parabola_agrees(device):
     costs = generator.integers(0, 1000, (6, 5, 40)).astype(np.float32)
     costs[0], costs[1, :, 0], costs[2, :, -1] = 7.0, -1.0, -1.0
     wanted = best_inverse(costs, PLANES)
-    assert np.allclose(sweep_cuda.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
+    assert np.allclose(sweep.best_inverse(torch.from_numpy(costs).to(device), PLANES), wanted, rtol=1e-12)
 
 
 def test_depths_agree(device):
@@ -80,8 +79,8 @@ def test_depths_agree(device):
     views, depths = still_life()
     config, others = SweepConfig(), [views[0], views[2]]
     planes = plane_inverses(views[1].camera, [o.camera for o in others], (2, 12), config.spacing, config.max_planes)
-    wanted = sweep_cpu.inverse_depths(views[1], others, planes, config)
-    found = sweep_cuda.inverse_depths(views[1], others, planes, config, device)
+    wanted = sweep.inverse_depths_cpu(views[1], others, planes, config)
+    found = sweep.inverse_depths_cuda(views[1], others, planes, config, device)
     assert found.shape == depths[1].shape and np.quantile(np.abs(found / wanted - 1), 0.95) < 2e-4
     error = np.abs(1 / (found * depths[1]) - 1)
     assert np.median(error) < 0.008
@@ -116,11 +115,11 @@ def test_the_gpu_takes_no_more_than_it_says():
     """Peak memory of a view is below `needed_bytes`."""
     views, _ = still_life()
     device, planes = torch.device("cuda"), np.linspace(1 / 12, 1 / 2, 200)
-    sweep_cuda.inverse_depths(views[1], [views[0], views[2]], planes, SweepConfig(), device)
+    sweep.inverse_depths_cuda(views[1], [views[0], views[2]], planes, SweepConfig(), device)
     torch.cuda.reset_peak_memory_stats(device)
     before = torch.cuda.memory_allocated(device)
-    sweep_cuda.inverse_depths(views[1], [views[0], views[2]], planes, SweepConfig(), device)
-    assert torch.cuda.max_memory_allocated(device) - before < sweep_cuda.needed_bytes(views[1], len(planes))
+    sweep.inverse_depths_cuda(views[1], [views[0], views[2]], planes, SweepConfig(), device)
+    assert torch.cuda.max_memory_allocated(device) - before < sweep.needed_bytes(views[1], len(planes))
 
 
 @pytest.mark.cuda

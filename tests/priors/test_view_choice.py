@@ -3,7 +3,7 @@
 import numpy as np
 
 from warpgs.geometry import look_at
-from warpgs.priors.view_choice import matching_views, shared_sight, spread_views
+from warpgs.priors.sweep import matching_views, shared_sight, spread_views
 from warpgs.scene import Camera
 
 K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])

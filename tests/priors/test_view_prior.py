@@ -10,8 +10,8 @@ from tests.priors import networks as nw
 from tests.priors.test_depth import response, scaled, two_planes
 from tests.priors.test_semantics import shapes
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.priors.view_prior import PriorConfig, view_priors
-from warpgs.runtime.terminal import Detail
+from warpgs.priors.views import PriorConfig, view_priors
+from warpgs.process import Detail
 from warpgs.scene import Camera, View
 
 PLAIN = {"segmentation_size": 32, "segmentation_mean": (0.0, 0.0, 0.0), "segmentation_std": (1.0, 1.0, 1.0)}
@@ -155,7 +155,7 @@ def test_many_names_are_cut_short(tmp_path):
 
 def test_both_networks_are_opened_before_one_runs(tmp_path, monkeypatch):
     config = PriorConfig(depth_model=nw.depth_network(tmp_path / "d.onnx"), segmentation_model=str(tmp_path / "none.onnx"))
-    monkeypatch.setattr("warpgs.priors.view_prior.network_disparity", lambda *a: pytest.fail("ran"))
+    monkeypatch.setattr("warpgs.priors.views.network_disparity", lambda *a: pytest.fail("ran"))
     with pytest.raises(DataError, match=r"none\.onnx: the model cannot be read"):
         view_priors([view(shapes()[0])], config)
 

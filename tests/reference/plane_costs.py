@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from warpgs.kernels.plane_costs import NEUTRAL
-from warpgs.priors.sweep_planes import NOISE, gray_of, plane_homography
+from warpgs.kernels.sweep import NEUTRAL
+from warpgs.priors.sweep import NOISE, gray_of, plane_homography
 from warpgs.scene import View
 
 

@@ -12,7 +12,8 @@ from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
 from warpgs.constants import ALPHA_CUT, RULES
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, Gaussians
 
 ANTIALIASED = RasterizeOptions(antialiased=True)

@@ -8,7 +8,8 @@ import torch
 
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 SIZE = (75, 53)  # no multiple of a tile

@@ -10,7 +10,8 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.lens_cameras import LENSES, lens_camera
 from tests.tolerances import close
 from warpgs.geometry import rotation_matrices
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
 MODELS = ["pinhole", *LENSES]

@@ -11,7 +11,8 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed
 from tests.reference.project import rotations
 from tests.tolerances import close
 from warpgs.geometry import gaussian_normals, rotation_matrices
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians
 
 ANTIALIASED = RasterizeOptions(antialiased=True)

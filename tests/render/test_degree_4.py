@@ -11,8 +11,9 @@ from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from tests.tolerances import close
-from warpgs.pipeline.model.filters import rotate, rotation_about
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.pipeline.model.edit import rotate, rotation_about
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 
 def test_images_and_gradients_equal_reference(device, dtype):

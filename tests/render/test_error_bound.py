@@ -9,7 +9,8 @@ from tests.gaussians import camera, cloud
 from tests.render.bound_scenes import HEIGHT, KINDS, WIDTH, bound_scene
 from warpgs.constants import RULES, Rule
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 from warpgs.scene import Gaussians
 

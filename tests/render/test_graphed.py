@@ -12,14 +12,14 @@ import torch
 from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.kernels.project_inputs import ProjectInputs
+from warpgs.kernels.ellipse import ProjectInputs
+from warpgs.kernels.graphs import MIN_REPLAYS, GraphPool
 from warpgs.means2d import projected_means
 from warpgs.render import graphed
-from warpgs.render.compose import inputs_of
+from warpgs.render.compose import RenderSettings, inputs_of
 from warpgs.render.graphed import MIN_CALLS, SPARE, Capacity, Recorder, call_key
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.render.settings import RenderSettings
-from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphPool
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians
 
 CPU = torch.device("cpu")

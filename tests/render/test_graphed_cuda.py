@@ -11,7 +11,8 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.geometry import rotation_matrices
 from warpgs.render import graphed
 from warpgs.render.graphed import MIN_CALLS
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, CovarianceGaussians, Gaussians
 
 pytestmark = pytest.mark.cuda

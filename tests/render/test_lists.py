@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from tests.gaussians import camera, cloud, leaves
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians
 
 

@@ -8,7 +8,8 @@ import torch
 
 from tests.gaussians import camera, cloud, hand_placed, leaves
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 
 def scalar(render):

@@ -9,7 +9,8 @@ import torch
 from tests.gaussians import camera, cloud, leaves
 from tests.lens_cameras import LENSES, lens_camera
 from warpgs.constants import FAR, RULES
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 PLANES = {"near": 3.5, "far": 4.5}
 """Depths between which about half of `cloud` lies, whose depths are 3 to 5 u."""

@@ -7,7 +7,8 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Render
 
 OUTPUTS = [f.name for f in dataclasses.fields(Render) if f.name not in ("absgrad", "overflow")]

@@ -9,7 +9,8 @@ from tests.gaussians import camera, cloud
 from warpgs.errors import UsageError
 from warpgs.kernels import tiles
 from warpgs.render import compose
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 SIZE = (75, 53)
 MAPS = ("rgb", "alpha", "depth", "median_depth", "features", "heaviest_ids", "heaviest_weights", "blend_counts")

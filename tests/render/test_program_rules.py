@@ -9,7 +9,8 @@ from tests.gaussians import camera, cloud
 from tests.reference.project import project_reference
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import Gaussians
 
 

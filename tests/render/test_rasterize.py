@@ -11,7 +11,8 @@ import warpgs
 from tests.gaussians import SMOOTH, camera, cloud, hand_placed, leaves
 from tests.scenes import ring, three_gaussians
 from warpgs.errors import ResourceError, UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians
 
 

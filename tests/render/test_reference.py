@@ -9,7 +9,8 @@ from tests.gaussians import camera, cloud, hand_placed
 from tests.reference.blend import blend_reference
 from tests.reference.project import project_reference
 from warpgs.constants import RULES
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 from warpgs.render.reference import reference_image
 
 BACKGROUND = torch.tensor([0.2, 0.5, 0.7], dtype=torch.float64)

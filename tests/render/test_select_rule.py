@@ -8,8 +8,8 @@ import torch
 import warpgs
 from tests.gaussians import camera, cloud
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.render.select_rule import FASTEST_FIRST, select_rule
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import FASTEST_FIRST, rasterize, select_rule
 from warpgs.scene import Camera
 
 BACKGROUND = torch.tensor([1.0, 0.5, 0.0])

@@ -8,14 +8,14 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from tests.scenes import photos, seeds
-from warpgs.pipeline.model.init import InitConfig
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.strategies.gradient_growth import DensityConfig
+from warpgs.pipeline.model.start import InitConfig
+from warpgs.pipeline.train.settings import FitConfig
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
 from warpgs.pipeline.train.trainer import Trainer
-from warpgs.pipeline.train.view_modules.exposure import Exposure
-from warpgs.pipeline.train.view_modules.poses import RefinePoses
+from warpgs.pipeline.train.view_modules import Exposure, RefinePoses
 from warpgs.render.graphed import MIN_CALLS
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 pytestmark = pytest.mark.cuda
 CUDA = torch.device("cuda", 0)

@@ -10,7 +10,8 @@ import torch
 
 from tests.gaussians import camera, cloud, leaves
 from warpgs.errors import UsageError
-from warpgs.render.rasterize import RasterizeOptions, rasterize
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 
 def scene():

@@ -9,9 +9,9 @@ from tests.gaussians import camera, cloud, leaves
 from warpgs.constants import RULES
 from warpgs.errors import UsageError
 from warpgs.render.chunked import ChunkedFrame, chunks
-from warpgs.render.compose import inputs_of
-from warpgs.render.rasterize import RasterizeOptions, rasterize
-from warpgs.render.settings import RenderSettings
+from warpgs.render.compose import RenderSettings, inputs_of
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
 
 SIZE = (75, 53)  # no multiple of a tile
 WINDOWS = [(0, 0, 75, 53), (0, 16, 75, 16), (32, 0, 16, 53), (16, 32, 59, 21), (64, 48, 11, 5), (48, 16, 16, 32)]

@@ -2,15 +2,25 @@
 
 import numpy as np
 
-from warpgs.report.contact_sheet import GAP, HEAD, MARGIN, PAPER, TITLE_SIZE, Tile, contact_sheet
-from warpgs.report.images import colored
+from warpgs.report.images import (
+    CONTACT_GAP,
+    CONTACT_HEAD,
+    CONTACT_MARGIN,
+    CONTACT_PAPER,
+    TITLE_SIZE,
+    Tile,
+    colored,
+    contact_sheet,
+)
 
-TOP = MARGIN + TITLE_SIZE + 18
+TOP = CONTACT_MARGIN + TITLE_SIZE + 18
 
 
 def corner(index, width, height, columns):
     """Return the left upper corner x, y of a tile's image [px]."""
-    return MARGIN + index % columns * (width + GAP), TOP + HEAD + index // columns * (HEAD + height + GAP)
+    return CONTACT_MARGIN + index % columns * (width + CONTACT_GAP), TOP + CONTACT_HEAD + index // columns * (
+        CONTACT_HEAD + height + CONTACT_GAP
+    )
 
 
 def test_tiles_keep_their_pixels_and_order():
@@ -21,7 +31,9 @@ def test_tiles_keep_their_pixels_and_order():
     tiles = [Tile("photo", image), *(Tile(f"map {i}", m, "VIRIDIS") for i, m in enumerate(maps))]
     sheet = contact_sheet("a view", ["one sentence"], tiles, columns=3, tile_width=200)
     assert (
-        sheet.shape == (TOP + 2 * (HEAD + 150) + GAP + MARGIN, 2 * MARGIN + 3 * 200 + 2 * GAP, 3) and sheet.dtype == np.float32
+        sheet.shape
+        == (TOP + 2 * (CONTACT_HEAD + 150) + CONTACT_GAP + CONTACT_MARGIN, 2 * CONTACT_MARGIN + 3 * 200 + 2 * CONTACT_GAP, 3)
+        and sheet.dtype == np.float32
     )
     for i, wanted in enumerate([image, *(colored(m, "VIRIDIS") for m in maps)]):
         x, y = corner(i, 200, 150, 3)
@@ -32,15 +44,17 @@ def test_labels_ranges_and_text_are_drawn_on_paper():
     """Labels, colour bars and text have ink in their places and paper around them; longer text has more."""
 
     def ink(part):
-        return int((np.abs(part - np.float32(PAPER) / 255).max(-1) > 0.1).sum())
+        return int((np.abs(part - np.float32(CONTACT_PAPER) / 255).max(-1) > 0.1).sum())
 
     tiles = [Tile("image", np.zeros((60, 300, 3))), Tile("map", np.zeros((60, 300)), largest=2.5)]
     short = contact_sheet("title", ["Depth: none."], tiles, columns=2, tile_width=300)
     long = contact_sheet("title", ["Depth: none.", "Semantics: saliency and edges."], tiles, columns=2, tile_width=300)
     (ax, ay), (bx, by), (cx, cy) = (corner(i, 300, 60, 2) for i in range(3))
-    assert ink(short[ay - HEAD : ay, ax : ax + 100]) > 50 and ink(short[ay - HEAD : ay, ax + 200 : ax + 300]) == 0
-    assert ink(short[by - HEAD : by, bx + 200 : bx + 300]) > 200, "a colour bar with its range"
-    assert ink(short[:TOP, MARGIN:]) > 50 and ink(short[:, :MARGIN]) == 0 == ink(short[:, -MARGIN:])
+    assert (
+        ink(short[ay - CONTACT_HEAD : ay, ax : ax + 100]) > 50 and ink(short[ay - CONTACT_HEAD : ay, ax + 200 : ax + 300]) == 0
+    )
+    assert ink(short[by - CONTACT_HEAD : by, bx + 200 : bx + 300]) > 200, "a colour bar with its range"
+    assert ink(short[:TOP, CONTACT_MARGIN:]) > 50 and ink(short[:, :CONTACT_MARGIN]) == 0 == ink(short[:, -CONTACT_MARGIN:])
     assert ink(long[cy + 4 :, cx:]) > ink(short[cy + 4 :, cx:]) > 50
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from warpgs.errors import ResourceError
 from warpgs.files import write_bytes, write_json
-from warpgs.report.events import EventLog, read_events
+from warpgs.report.progress import EventLog, read_events
 
 
 def fill(path, steps, start=0):

@@ -4,8 +4,7 @@ import io
 
 from rich.console import Console
 
-from warpgs.report.farm_page import JobCard, farm_page
-from warpgs.report.farm_table import FarmTable, JobRow
+from warpgs.report.farm import FarmTable, JobCard, JobRow, farm_page
 
 ROWS = [
     JobRow("a", "done", 500, 61.0, 25.5, 1200), JobRow("b\x1b[31m", "running", 40, 3.0), JobRow("c", "waiting"),

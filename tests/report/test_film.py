@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.report.animation import MAX_FPS, _with_one_palette
-from warpgs.report.film import write_film
+from warpgs.report.film import MAX_FPS, _with_one_palette, write_film
 
 
 @pytest.mark.parametrize(("name", "shape"), [("a.mp4", (48, 64)), ("a.webm", (49, 65))])
@@ -143,7 +142,7 @@ def test_films_that_cannot_be_are_refused(tmp_path, monkeypatch):
         write_film(tmp_path / "a.webp", [])
     with pytest.raises(DataError, match="frame 1 is 32 x 32 px, the first 16 x 16 px"):
         write_film(tmp_path / "a.gif", [np.zeros((16, 16, 3)), np.zeros((32, 32, 3))])
-    monkeypatch.setattr("warpgs.report.animation.MAX_BYTES", 500)
+    monkeypatch.setattr("warpgs.report.film.MAX_BYTES", 500)
     with pytest.raises(UsageError, match="at most 2 frames of this size"):
         write_film(tmp_path / "a.gif", np.zeros((9, 8, 8, 3)))
     assert not list(tmp_path.iterdir())

@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from warpgs.report.curve import curve
+from warpgs.process import Detail
 from warpgs.report.images import png, webp
-from warpgs.report.page import Page, SamplingReport, ViewImages, write_page
-from warpgs.runtime.terminal import Detail
+from warpgs.report.page import Page, SamplingReport, ViewImages, curve, write_page
 
 VOID = {"meta", "img", "input", "br", "hr", "link"}
 

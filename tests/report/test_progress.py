@@ -2,9 +2,9 @@ import io
 
 import pytest
 
+from warpgs.process import counted, say
 from warpgs.report import progress as module
 from warpgs.report.progress import Progress, Stages, duration, waiting
-from warpgs.runtime.terminal import counted, say
 
 
 class Terminal(io.StringIO):

@@ -9,9 +9,8 @@ from PIL import Image
 
 from tests.scenes import ring
 from warpgs.errors import ResourceError
-from warpgs.report import scene_plot as module
-from warpgs.report.overview import TRAIN_COLOR
-from warpgs.report.scene_plot import ScenePlot, render_plot
+from warpgs.report import overview as module
+from warpgs.report.overview import TRAIN_COLOR, ScenePlot, render_plot
 
 
 def plot(count: int = 400) -> ScenePlot:

@@ -3,8 +3,8 @@
 import torch
 import warp as wp
 
-from warpgs.runtime.allocator import ALIGNMENT, TORCH, Arena, SizingAllocator, fetch, part
-from warpgs.runtime.cuda_graph import CapturedGraph
+from warpgs.kernels.graphs import CapturedGraph
+from warpgs.kernels.launch import ALIGNMENT, TORCH, Arena, SizingAllocator, fetch, part
 
 CPU = torch.device("cpu")
 BYTE = torch.empty(0, dtype=torch.uint8)

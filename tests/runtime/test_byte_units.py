@@ -2,8 +2,8 @@
 
 import pytest
 
+from warpgs.device import format_bytes, parse_bytes
 from warpgs.errors import UsageError
-from warpgs.runtime.byte_units import format_bytes, parse_bytes
 
 
 @pytest.mark.parametrize(

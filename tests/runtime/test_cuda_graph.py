@@ -5,18 +5,9 @@ import warnings
 import pytest
 import torch
 
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.step_buffers import Setting
-from warpgs.runtime.allocator import Arena
-from warpgs.runtime.cuda_graph import (
-    FREE_CAPTURES,
-    MAX_GRAPHS,
-    MIN_REPLAYS,
-    CapturedGraph,
-    GraphedFunction,
-    GraphMemory,
-    GraphPool,
-)
+from warpgs.kernels.graphs import FREE_CAPTURES, MAX_GRAPHS, MIN_REPLAYS, CapturedGraph, GraphedFunction, GraphMemory, GraphPool
+from warpgs.kernels.launch import Arena
+from warpgs.kernels.update import Setting, opacity_dropout
 
 CPU = torch.device("cpu")
 

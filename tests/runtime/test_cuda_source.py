@@ -5,7 +5,7 @@ import fnmatch
 import tomllib
 from pathlib import Path
 
-from warpgs.runtime.cuda_source import FOLDER, source
+from warpgs.kernels.native import FOLDER, source
 
 ROOT = Path(__file__).parents[2]
 FILES = {p.name for p in (ROOT / "warpgs/kernels/cuda").iterdir()}

@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from warpgs.runtime import device_memory, processor
-from warpgs.runtime.device_memory import Memory, available_bytes, container_memory, installed_bytes, machine_memory
+from warpgs import device
+from warpgs.device import Memory, available_bytes, container_memory, installed_bytes, machine_memory
 
 CPU, GIB = torch.device("cpu"), 2**30
 
@@ -28,11 +28,11 @@ def psutil_like(found):
 @pytest.fixture
 def elsewhere(monkeypatch, tmp_path):
     """A machine without /proc and /sys, of 16 GiB, 10 of them free; nothing is remembered of this one."""
-    monkeypatch.setattr(device_memory, "OWN_CGROUPS", tmp_path / "proc")
-    monkeypatch.setattr(device_memory, "CGROUPS", tmp_path / "sys")
-    monkeypatch.setattr(processor, "CPU_INFO", tmp_path / "cpuinfo")
+    monkeypatch.setattr(device, "OWN_CGROUPS", tmp_path / "proc")
+    monkeypatch.setattr(device, "CGROUPS", tmp_path / "sys")
+    monkeypatch.setattr(device, "CPU_INFO", tmp_path / "cpuinfo")
     monkeypatch.setitem(sys.modules, "psutil", psutil_like(SimpleNamespace(total=16 * GIB, available=10 * GIB)))
-    forgotten = (device_memory.installed_bytes, device_memory._say_assumed)
+    forgotten = (device.installed_bytes, device._say_assumed)
     for f in forgotten:
         f.cache_clear()
     yield tmp_path
@@ -51,7 +51,7 @@ def group(root, parts: str, **files):
 def test_this_machine():
     """Something between a small computer and a large one; free is less than installed."""
     assert 2**28 < installed_bytes(CPU) < 2**46 and 2**20 < available_bytes(CPU) <= installed_bytes(CPU)
-    assert 1 <= processor.usable_cores() <= (os.cpu_count() or 1) and processor.processor_name()
+    assert 1 <= device.usable_cores() <= (os.cpu_count() or 1) and device.processor_name()
 
 
 def test_without_control_groups(elsewhere):
@@ -110,7 +110,7 @@ def test_a_system_that_says_nothing(elsewhere, monkeypatch, capsys, found):
     """A stated amount is assumed, with one line; a container's limit still counts."""
     monkeypatch.setitem(sys.modules, "psutil", found and psutil_like(found))  # None: it cannot be imported
     assert machine_memory() is None
-    assert [available_bytes(CPU), available_bytes(CPU), installed_bytes(CPU)] == [device_memory.ASSUMED_BYTES] * 3
+    assert [available_bytes(CPU), available_bytes(CPU), installed_bytes(CPU)] == [device.ASSUMED_BYTES] * 3
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and "2 GiB are assumed" in said
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
@@ -132,15 +132,15 @@ def test_a_processor_without_affinity_or_proc(elsewhere, monkeypatch, system):
     monkeypatch.setattr(os, "cpu_count", lambda: 12)
     monkeypatch.setattr(platform, "processor", lambda: {"Darwin": "arm", "Windows": ""}[system])
     monkeypatch.setattr(platform, "machine", lambda: "AMD64")
-    assert processor.usable_cores() == 12
-    assert processor.processor_name() == {"Darwin": "arm", "Windows": "AMD64"}[system]
+    assert device.usable_cores() == 12
+    assert device.processor_name() == {"Darwin": "arm", "Windows": "AMD64"}[system]
     monkeypatch.setattr(os, "cpu_count", lambda: None)
     monkeypatch.setattr(platform, "machine", lambda: "")
-    assert processor.usable_cores() == 1 and processor.processor_name()
+    assert device.usable_cores() == 1 and device.processor_name()
 
 
 def test_a_processor_that_linux_names(elsewhere, monkeypatch):
     """The model, and the cores that the process is bound to."""
     (elsewhere / "cpuinfo").write_text("processor : 0\nmodel name\t: Some Processor: 3\n", "utf-8")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5}, raising=False)
-    assert processor.processor_name() == "Some Processor: 3" and processor.usable_cores() == 2
+    assert device.processor_name() == "Some Processor: 3" and device.usable_cores() == 2

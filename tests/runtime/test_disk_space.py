@@ -8,12 +8,12 @@ import sys
 
 import pytest
 
+from warpgs import files as disk_space
 from warpgs.errors import ResourceError
+from warpgs.files import disk_is_full
 from warpgs.poses import mapping
+from warpgs.process import ProcessFailed
 from warpgs.report.overview import remedy_for, run_pyvista
-from warpgs.runtime import disk_space
-from warpgs.runtime.disk_space import disk_is_full
-from warpgs.runtime.subprocesses import ProcessFailed
 
 FULL = f"[Errno {errno.ENOSPC}] {os.strerror(errno.ENOSPC)}"
 

@@ -14,17 +14,15 @@ import cv2
 import numpy as np
 import pytest
 
+from warpgs import process
 from warpgs.app.cli import main
 from warpgs.errors import UsageError
 from warpgs.files import readable, write_text
 from warpgs.io.load import load_scene
-from warpgs.poses.photographs import scene_name
-from warpgs.poses.video import _frames
+from warpgs.poses.photographs import _frames, scene_name
+from warpgs.process import utf8_name
 from warpgs.report.film import write_film
-from warpgs.runtime import file_names
-from warpgs.runtime.file_names import utf8_name
-from warpgs.synthetic.cut_out import write_object
-from warpgs.synthetic.demo import write_demo
+from warpgs.synthetic.demo import write_demo, write_object
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="names are text on this system")
 BYTES = os.fsdecode(b"b\xe4\xc3\xbc")
@@ -50,7 +48,7 @@ def test_a_name_that_a_library_can_take(tmp_path, monkeypatch):
     with utf8_name(folder / "new") as name:
         Path(name).write_bytes(b"new")
     assert (folder / "new").read_bytes() == b"new"
-    monkeypatch.setattr(file_names, "DESCRIPTORS", tmp_path / "none")
+    monkeypatch.setattr(process, "DESCRIPTORS", tmp_path / "none")
     with pytest.raises(UsageError, match=r"b\\xe4ü/file: the name is not UTF-8"), utf8_name(folder / "file"):
         pass
 
@@ -97,7 +95,7 @@ def test_a_fit_and_what_follows(scene, tmp_path, capsys):
     assert record["scene"]["path"] == str(scene) and f"{BYTES}.png" in record["cameras"]
     page = (run / "report.html").read_text("utf-8")
     assert "b\\xe4ü" in page and not any("\ud800" <= c <= "\udfff" for c in page)
-    assert all(file_names.is_utf8(p.name) for p in (run / "renders").iterdir())
+    assert all(process.is_utf8(p.name) for p in (run / "renders").iterdir())
     assert main(["fit", "--out", str(run), "--resume"]) == 0
     assert main(["eval", str(run), *CPU]) == 0
     assert main(["render", str(run), "--frames", "2", "--path", "turntable", *CPU]) == 0
@@ -210,6 +208,6 @@ def test_starting_again_keeps_the_command(monkeypatch):
     monkeypatch.setattr(sys, "getfilesystemencoding", lambda: "iso8859-1")
     monkeypatch.setattr(sys, "orig_argv", ["python", "-P", "-m", "warpgs", "fit"])
     with contextlib.suppress(SystemExit):
-        file_names.use_utf8_names()
+        process.use_utf8_names()
     mode = [] if sys.flags.utf8_mode else [[sys.executable, sys.executable, "-X", "utf8", "-P", "-m", "warpgs", "fit"]]
     assert called == mode and (not mode or os.environ["PYTHONUTF8"] == "1")

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from warpgs.runtime import folders
-from warpgs.runtime.kernel_cache import choose_kernel_cache
+from warpgs import folders
+from warpgs.device import choose_kernel_cache
 
 POSIX = pytest.mark.skipif(not hasattr(os, "getuid"), reason="mode bits say nothing on Windows")
 HOMES = ("HOME", "USERPROFILE", "HOMEDRIVE", "HOMEPATH", "LOCALAPPDATA", "XDG_CACHE_HOME", "WARP_CACHE_PATH", "WARPGS_CACHE")
@@ -18,7 +18,7 @@ import os
 import torch
 import warp as wp
 from warpgs.kernels import tiles
-from warpgs.runtime import interop
+from warpgs.kernels import launch as interop
 
 module = tiles.make_kernels(wp.float32, False).pack_counts.module
 made = module.load(interop.warp_device(torch.device("cpu")), block_dim=1).binary_path
@@ -30,7 +30,7 @@ print(folder, oct(os.stat(os.path.dirname(os.path.dirname(folder))).st_mode & 0o
 UNKNOWN = """
 import grp, os, pwd, random, shutil, tempfile
 import warp
-from warpgs.runtime.kernel_cache import prepare_kernel_cache
+from warpgs.device import prepare_kernel_cache
 os.setgroups([])
 os.setgid(54321)
 os.setuid(54321)  # after the imports: where Python lies may not be for everyone
@@ -129,14 +129,14 @@ def test_a_folder_that_others_can_write_to_is_refused(monkeypatch, tmp_path, whe
 @POSIX
 def test_groups_links_and_owners(monkeypatch, tmp_path):
     """A group of other users may not write, the user's own may; links in a cache and folders of others are not followed."""
-    from warpgs.runtime import permissions
+    from warpgs import locks
 
     cache = tmp_path / "cache"
     cache.mkdir()
     cache.chmod(0o775)
-    monkeypatch.setattr(permissions, "_is_own_group", lambda gid: True)
+    monkeypatch.setattr(locks, "_is_own_group", lambda gid: True)
     assert not chosen(monkeypatch, cache)[1]
-    monkeypatch.setattr(permissions, "_is_own_group", lambda gid: False)
+    monkeypatch.setattr(locks, "_is_own_group", lambda gid: False)
     assert "other users" in chosen(monkeypatch, cache)[1]
     cache.chmod(0o755)
     (cache / "1.0").symlink_to(tmp_path)
@@ -190,7 +190,7 @@ def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
         monkeypatch.delenv("WARP_CACHE_PATH")
         monkeypatch.delenv("LOCALAPPDATA", raising=False)
         assert folders.cache_home() is None and "no home" in choose_kernel_cache().refused
-    from warpgs.priors.cache import cache_folder
+    from warpgs.priors.networks import cache_folder
 
     for name in ("HOME", "USERPROFILE"):
         monkeypatch.setenv(name, str(tmp_path / "home"))

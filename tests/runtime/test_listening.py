@@ -4,17 +4,9 @@ import socket
 
 import pytest
 
+from warpgs import ranks
 from warpgs.errors import UsageError
-from warpgs.runtime import listening
-from warpgs.runtime.listening import (
-    Allowance,
-    WebGuard,
-    listeners,
-    loopback_interface,
-    loopback_of,
-    loopback_socket,
-    say_what_is_open,
-)
+from warpgs.ranks import Allowance, WebGuard, listeners, loopback_interface, loopback_of, loopback_socket, say_what_is_open
 
 OWN = "127.0.0.1:8080"
 
@@ -40,7 +32,7 @@ def test_hosts_that_are_this_machine(monkeypatch):
             raise socket.gaierror(-2, "not known")
         return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", (address, 0)) for address in known[name]]
 
-    monkeypatch.setattr(listening.socket, "getaddrinfo", found)
+    monkeypatch.setattr(ranks.socket, "getaddrinfo", found)
     assert [loopback_of(name) for name in (*known, "none")] == ["127.0.0.1", None, None, None]
     assert loopback_interface()
 

@@ -10,14 +10,15 @@ import torch
 import warp as wp
 
 from warpgs.errors import ResourceError
-from warpgs.runtime import interop, load_module
+from warpgs.kernels import launch, native
 
 ROOT = Path(__file__).parent.parent.parent
 OTHER = """
 import torch
 from tests.runtime.test_load_module import mark
 from warpgs.errors import ResourceError
-from warpgs.runtime import interop, load_module
+from warpgs.kernels import launch as interop
+from warpgs.kernels import native as load_module
 import warp
 def refuse(*_, **__): raise AssertionError("compiled a second time")
 warp._src.build.build_cpu = refuse
@@ -52,7 +53,7 @@ def test_two_processes_compile_a_module_once(cache):
     environment = os.environ | {"PYTHONPATH": str(ROOT), "CUDA_VISIBLE_DEVICES": ""}
     name, cpu = mark.module.get_module_identifier(1), wp.get_device("cpu")
     (cache / "locks").mkdir(parents=True)
-    with load_module.exclusive(cache / "locks" / f"{name}.0"):
+    with native.exclusive(cache / "locks" / f"{name}.0"):
         other = subprocess.Popen([sys.executable, "-c", OTHER], env=environment, stdout=subprocess.PIPE, text=True)
         assert other.stdout.readline() == "waits\n"
         mark.module.load(cpu, block_dim=1)
@@ -63,8 +64,8 @@ def test_a_loaded_module_takes_no_lock(cache, monkeypatch):
     """Neither the second launch nor any later one opens a file."""
     seen = torch.zeros(3, dtype=torch.int32)
     for _ in range(2):
-        interop.launch(mark, 3, [interop.view(seen, wp.int32)], torch.device("cpu"))
-        monkeypatch.setattr(load_module, "exclusive", None)
+        launch.launch(mark, 3, [launch.view(seen, wp.int32)], torch.device("cpu"))
+        monkeypatch.setattr(native, "exclusive", None)
     assert seen.tolist() == [1, 2, 3]
 
 
@@ -72,26 +73,26 @@ def test_a_listener_hears_of_modules_that_the_cache_lacks(cache, monkeypatch):
     """Once: not of one that the cache holds by now, nor after the block."""
     cpu, heard, took = wp.get_device("cpu"), [], []
     for _ in range(2):
-        monkeypatch.setattr(load_module, "_LOADED", set())
+        monkeypatch.setattr(native, "_LOADED", set())
         mark.module.unload()
-        with load_module.told_of_compiling(heard.append) as seconds:
-            load_module.load_module(mark.module, cpu, 1)
+        with native.told_of_compiling(heard.append) as seconds:
+            native.load_module(mark.module, cpu, 1)
         took.append(len(seconds))
         assert heard == [mark.module.get_module_identifier(1)]
-    assert not load_module._LISTENERS and took == [1, 0]
+    assert not native._LISTENERS and took == [1, 0]
 
 
 def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch):
     def refuse(_):
         raise OSError(95, "not supported")
 
-    monkeypatch.setattr(load_module, "lock_descriptor", refuse)
-    with load_module.exclusive(tmp_path / "lock"):
+    monkeypatch.setattr(native, "lock_descriptor", refuse)
+    with native.exclusive(tmp_path / "lock"):
         pass
-    with pytest.raises(OSError, match="of the body"), load_module.exclusive(tmp_path / "lock"):
+    with pytest.raises(OSError, match="of the body"), native.exclusive(tmp_path / "lock"):
         raise OSError("of the body")
 
 
 def test_a_lock_that_cannot_be_made_is_named_with_a_remedy(tmp_path):
-    with pytest.raises(ResourceError, match="WARP_CACHE_PATH"), load_module.exclusive(tmp_path / "no" / "lock"):
+    with pytest.raises(ResourceError, match="WARP_CACHE_PATH"), native.exclusive(tmp_path / "no" / "lock"):
         pytest.fail("held")

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from warpgs import process
 from warpgs.app.cli import main
 from warpgs.export.ply import read_ply
-from warpgs.pipeline.runs.checkpoint import load_checkpoint
-from warpgs.runtime import terminal
-from warpgs.runtime.native_output import hidden_stderr, output_to
-from warpgs.runtime.output_streams import CarefulStream, careful_output, open_missing_descriptors
-from warpgs.runtime.terminal import answer, say
+from warpgs.pipeline.run.folder import load_checkpoint
+from warpgs.process import CarefulStream, answer, careful_output, hidden_stderr, open_missing_descriptors, output_to, say
 from warpgs.synthetic.demo import split_spec, write_demo
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="the shell of these tests is sh")
@@ -112,7 +110,7 @@ def test_the_same_without_the_command_line(scene, tmp_path, monkeypatch, capfd):
 
     stream = Broken(1, errno.EPIPE)
     monkeypatch.setattr(sys, "stdout", stream)
-    monkeypatch.setattr(terminal, "_lost", False)
+    monkeypatch.setattr(process, "_lost", False)
     assert warpgs.fit(scene, warpgs.FitConfig(steps=2), out=tmp_path / "run", device="cpu").metrics["steps"] == 2
     assert sys.stdout is stream
     assert capfd.readouterr().err.count(GOES_ON) == 1
@@ -132,7 +130,7 @@ def test_a_table_that_cannot_be_written(monkeypatch, capsys):
 def test_an_answer_that_nobody_reads_is_an_error(monkeypatch, capsys):
     """A process that works for another one ends with it."""
     monkeypatch.setattr(sys, "stdout", Broken(0, errno.EPIPE))
-    monkeypatch.setattr(terminal, "_lost", False)
+    monkeypatch.setattr(process, "_lost", False)
     say("a line")
     say("a line")
     assert capsys.readouterr().err.count("\n") == 1
@@ -158,7 +156,7 @@ CLOSED = """
 import os, sys
 for number in {closed}:
     os.close(number)
-from warpgs.runtime.output_streams import open_missing_descriptors
+from warpgs.process import open_missing_descriptors
 open_missing_descriptors()
 file = os.open({path!r}, os.O_RDWR | os.O_CREAT)
 os.write(1, b"out"); os.write(2, b"error")
@@ -186,7 +184,7 @@ def test_native_output_without_streams(monkeypatch, tmp_path):
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="this system has no SIGHUP")
 def test_a_terminal_that_hangs_up(scene, tmp_path, monkeypatch):
     """SIGHUP comes and both streams fail: the step in progress is saved, and --resume continues from it."""
-    from warpgs.report.events import EventLog
+    from warpgs.report.progress import EventLog
 
     write, streams = EventLog.write, [Broken(1000, errno.EIO), Broken(1000, errno.EIO)]
 

@@ -6,8 +6,8 @@ import threading
 import pytest
 
 from warpgs.app.cli import main
-from warpgs.pipeline.runs.checkpoint import load_checkpoint
-from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals, noted_signals
+from warpgs.pipeline.run.folder import load_checkpoint
+from warpgs.process import ignored_signals, interrupting_signals, noted_signals
 from warpgs.synthetic.demo import split_spec, write_demo
 
 SIGNALS = [pytest.param(s, id=n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None))]
@@ -104,7 +104,7 @@ STAGES = [
 @pytest.mark.parametrize(("stage", "number"), [(s, SIGNALS[i % len(SIGNALS)].values[0]) for i, s in enumerate(STAGES)])
 def test_outside_the_steps_the_end_is_the_same(scene, tmp_path, capsys, monkeypatch, stage, number):
     """While the scene is read, priors are made, results are scored and written: code 130, and nothing but the sentence."""
-    monkeypatch.setattr(f"warpgs.pipeline.runs.{stage}", lambda *_, **__: signal.raise_signal(number))
+    monkeypatch.setattr(f"warpgs.pipeline.run.{stage}", lambda *_, **__: signal.raise_signal(number))
     assert fit(scene, tmp_path / "run") == 130
     early = STAGES.index(stage) < 3
     assert capsys.readouterr().err == (UNSAVED if early else SENTENCE)
@@ -115,7 +115,7 @@ def test_outside_the_steps_the_end_is_the_same(scene, tmp_path, capsys, monkeypa
 @pytest.mark.parametrize("number", SIGNALS)
 def test_within_the_steps_the_one_in_progress_is_saved(scene, tmp_path, capsys, monkeypatch, number):
     """And a second signal in the same step ends the fit without it."""
-    from warpgs.report.events import EventLog
+    from warpgs.report.progress import EventLog
 
     write, times = EventLog.write, [1]
 
@@ -146,7 +146,7 @@ def test_more_signals_while_the_program_ends(monkeypatch, capsys):
 
     from warpgs.app import cli
 
-    monkeypatch.setattr("warpgs.pipeline.runs.export_model.export", tidy)
+    monkeypatch.setattr("warpgs.pipeline.run.export.export", tidy)
     say = cli.say
     monkeypatch.setattr(cli, "say", lambda *a, **k: (signal.raise_signal(signal.SIGINT), say(*a, **k)))
     try:

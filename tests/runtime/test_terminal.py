@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from warpgs.app.cli import main
-from warpgs.runtime.terminal import printable, say
+from warpgs.process import printable, say
 from warpgs.synthetic.demo import write_demo
 
 ROOT = Path(__file__).parent.parent.parent
@@ -33,10 +33,10 @@ def test_letters_that_a_terminal_does_not_have(monkeypatch, encoding):
 
 
 def test_one_place_prints():
-    """Only two files call `print` or write to stdout or stderr; a table of the doctor goes through rich, cell by cell."""
+    """Only one file calls `print` or writes to stdout or stderr; a table of the doctor goes through rich, cell by cell."""
     for path in (ROOT / "warpgs").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            if isinstance(node, ast.Call) and path.name not in ("terminal.py", "output_streams.py"):
+            if isinstance(node, ast.Call) and path.name != "process.py":
                 name = ast.unparse(node.func) if isinstance(node.func, (ast.Name, ast.Attribute)) else ""
                 assert name != "print" and not name.startswith(("sys.stdout.w", "sys.stderr.w")), path
 

@@ -10,7 +10,7 @@ from warpgs.errors import UsageError
 from warpgs.geometry import rotation_matrices
 from warpgs.io.load import load_scene
 from warpgs.scene import Camera
-from warpgs.synthetic import cut_out, demo, raycast
+from warpgs.synthetic import demo, raycast
 
 SIZE = {"views": 9, "width": 48, "height": 40}
 
@@ -20,7 +20,7 @@ def read(path):
 
 
 def test_two_formats_show_the_same_object_to_the_same_cameras(tmp_path):
-    specs = [cut_out.write_object(tmp_path / form, form=form, seed=3, **SIZE) for form in cut_out.FORMATS]
+    specs = [demo.write_object(tmp_path / form, form=form, seed=3, **SIZE) for form in demo.FORMATS]
     assert specs[0] == specs[1] and specs[0].startswith("train=000.png,001.png") and specs[0].endswith(";test=008.png")
     transforms = json.loads((tmp_path / "transforms" / "transforms.json").read_text())
     rows = [r for r in (tmp_path / "colmap/sparse/0/images.txt").read_text().splitlines() if not r.startswith("#")][::2]
@@ -37,7 +37,7 @@ def test_two_formats_show_the_same_object_to_the_same_cameras(tmp_path):
         np.testing.assert_allclose(-R.T @ np.array(row.split()[5:8], float), pose[:3, 3], atol=1e-9)
         assert 0.05 < alpha.mean() < 0.5 and ((alpha > 0) & (alpha < 1)).mean() > 0.02  # edges are soft
     assert len((tmp_path / "colmap/sparse/0/points3D.txt").read_text().splitlines()) > 10
-    a, b = (load_scene(tmp_path / form, masks="cutout").views for form in cut_out.FORMATS)
+    a, b = (load_scene(tmp_path / form, masks="cutout").views for form in demo.FORMATS)
     for left, right in zip(a, b, strict=True):
         np.testing.assert_array_equal(left.alpha, right.alpha)
         np.testing.assert_allclose(left.image, right.image, atol=1e-6)
@@ -45,12 +45,12 @@ def test_two_formats_show_the_same_object_to_the_same_cameras(tmp_path):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_objects_have_holes_and_stay_in_the_frame(seed):
-    shapes = cut_out.cut_out_object(seed)
+    shapes = demo.cut_out_object(seed)
     thin = [s for s in shapes if isinstance(s, raycast.Cylinder) and s.size < 0.05]
     assert len(thin) >= 10 and any(isinstance(s, raycast.Torus) for s in shapes)
     holes = 0
-    for camera in cut_out.ring_cameras(9, 90, 90)[::4]:
-        empty = raycast.render_rgba(shapes, cut_out.LIGHT, camera.K, camera.viewmat, 90, 90, 1)[..., 3] == 0
+    for camera in demo.ring_cameras(9, 90, 90)[::4]:
+        empty = raycast.render_rgba(shapes, demo.LIGHT, camera.K, camera.viewmat, 90, 90, 1)[..., 3] == 0
         assert empty[[0, -1]].all() and empty[:, [0, -1]].all()
         _, _, stats, _ = cv2.connectedComponentsWithStats(empty.astype(np.uint8), connectivity=4)
         holes += (stats[1:, cv2.CC_STAT_AREA] > 3).sum() - 1  # all but the surroundings
@@ -58,13 +58,13 @@ def test_objects_have_holes_and_stay_in_the_frame(seed):
 
 
 def test_seeds_differ_and_wishes_are_checked(tmp_path):
-    a, b = (raycast.render_rgba(cut_out.cut_out_object(s), cut_out.LIGHT, c.K, c.viewmat, 32, 32, 1)[..., 3]
-            for s, c in zip((0, 1), 2 * cut_out.ring_cameras(9, 32, 32)[:1]))  # fmt: skip
+    a, b = (raycast.render_rgba(demo.cut_out_object(s), demo.LIGHT, c.K, c.viewmat, 32, 32, 1)[..., 3]
+            for s, c in zip((0, 1), 2 * demo.ring_cameras(9, 32, 32)[:1]))  # fmt: skip
     assert (a != b).mean() > 0.05
     with pytest.raises(UsageError, match="transforms or colmap"):
-        cut_out.write_object(tmp_path / "a", form="llff", **SIZE)
+        demo.write_object(tmp_path / "a", form="llff", **SIZE)
     with pytest.raises(UsageError, match="9 views or more"):
-        cut_out.write_object(tmp_path / "a", views=8)
+        demo.write_object(tmp_path / "a", views=8)
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from warpgs.errors import DataError
-from warpgs.viewer.frames import MAX_FRAME, control_value, read_frame, write_frame
+from warpgs.viewer.server import MAX_FRAME, control_value, read_frame, write_frame
 
 msgspec = pytest.importorskip("msgspec")
 CAMERA = {

@@ -9,13 +9,11 @@ import pytest
 
 from tests.viewer.chromium import Chromium
 from warpgs.synthetic.demo import split_spec, write_demo
-from warpgs.viewer import connections
-from warpgs.viewer.content import content_of_run
+from warpgs.viewer import server as connections
 from warpgs.viewer.html import write_html
-from warpgs.viewer.saved import CROP, PATH
 from warpgs.viewer.server import address, open_server, stop_server
 from warpgs.viewer.watch import live_view
-from warpgs.viewer.window import Window
+from warpgs.viewer.window import CROP, PATH, Window, content_of_run
 
 viser = pytest.importorskip("viser")
 pytestmark = pytest.mark.browser

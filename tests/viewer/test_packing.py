@@ -8,13 +8,11 @@ import torch
 
 from tests.gaussians import cloud
 from tests.scenes import ring, three_gaussians
-from warpgs.coordinates import convert_camera, convert_gaussians
-from warpgs.geometry import rotation_matrices
-from warpgs.pipeline.films.rig import up_of
+from warpgs.geometry import convert_camera, convert_gaussians, rotation_matrices
+from warpgs.pipeline.films.paths import up_of
 from warpgs.scene import Normalization
-from warpgs.viewer.camera_conventions import camera_at, camera_before, distance_ahead, fov_y, stands_at, wxyz_of
-from warpgs.viewer.packing import LARGEST_HALF, packed
-from warpgs.viewer.saved import CropBox, keyframe
+from warpgs.viewer.html import LARGEST_HALF, camera_at, camera_before, distance_ahead, fov_y, packed, stands_at, wxyz_of
+from warpgs.viewer.window import CropBox, keyframe
 
 
 def test_half_precision_keeps_gaussians_of_any_scene():

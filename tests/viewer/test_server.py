@@ -12,11 +12,9 @@ import pytest
 
 from tests.viewer.test_frames import CAMERA, VALUE
 from warpgs.errors import UsageError
-from warpgs.runtime.listening import HOST
-from warpgs.viewer import connections
-from warpgs.viewer.callbacks import guarded
-from warpgs.viewer.frames import MAX_FRAME, write_frame
-from warpgs.viewer.server import address, open_server, stop_server
+from warpgs.ranks import HOST
+from warpgs.viewer import server as connections
+from warpgs.viewer.server import MAX_FRAME, address, guarded, open_server, stop_server, write_frame
 
 pytest.importorskip("viser")
 

@@ -15,18 +15,32 @@ from PIL import Image
 
 import warpgs
 from warpgs.app.cli import main
-from warpgs.coordinates import convert_gaussians
 from warpgs.errors import DataError
-from warpgs.pipeline.model.init import InitConfig
+from warpgs.geometry import convert_gaussians
+from warpgs.pipeline.model.start import InitConfig
 from warpgs.synthetic.demo import split_spec, write_demo
 from warpgs.viewer import watch
-from warpgs.viewer.content import content_of_file, content_of_run, views_of
 from warpgs.viewer.html import middle_first
-from warpgs.viewer.maps import COVERAGE, DEPTH, ERROR, GAUSSIANS, MAPS, RENDER, placed
-from warpgs.viewer.panel import COARSE, FINE
-from warpgs.viewer.saved import CROP, MAX_KEYFRAMES, PATH, keyframe
 from warpgs.viewer.server import open_server, stop_server
-from warpgs.viewer.window import Window
+from warpgs.viewer.window import (
+    COARSE_LAYER,
+    COVERAGE,
+    CROP,
+    DEPTH,
+    ERROR,
+    FINE_LAYER,
+    GAUSSIANS,
+    MAPS,
+    MAX_KEYFRAMES,
+    PATH,
+    RENDER,
+    Window,
+    content_of_file,
+    content_of_run,
+    keyframe,
+    placed,
+    views_of,
+)
 
 pytest.importorskip("viser")
 zstandard = pytest.importorskip("zstandard")
@@ -103,11 +117,11 @@ def test_layers_and_the_crop_box_choose_what_is_shown(window):
     """Fine and coarse make the whole; the box that is saved is the one that is seen, in file units."""
     panel, count = window.panel, len(window.content.model.gaussians())
     shown = {}
-    for layer in (FINE, COARSE):
+    for layer in (FINE_LAYER, COARSE_LAYER):
         panel._layer.value = layer
         shown[layer] = len(window.shown())
     panel._layer.value = "all"
-    assert shown[FINE] == (count + 2) // 3 and sum(shown.values()) == len(window.shown()) == count
+    assert shown[FINE_LAYER] == (count + 2) // 3 and sum(shown.values()) == len(window.shown()) == count
     panel._crop.value = True
     assert 0 < len(window.shown()) < count
     n = window.content.model.normalization

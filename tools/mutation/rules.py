@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 
 SPEED = {
-    "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES", "BATCH", "BLOCK", "BOX",
+    "AHEAD", "SHORT", "CHUNKS_PER_THREAD", "FEW_THREADS", "SERIAL_WORK", "SEGMENT", "LANES",
+    "ERROR_SEGMENT", "ERROR_LANES", "BATCH", "BLOCK", "BOX",
     "MAX_TILES", "WARPS", "STRIP", "ABREAST", "MAX_GRAPHS", "MIN_REPLAYS", "FREE_CAPTURES", "SMALL_BYTES",
 }  # fmt: skip
 """Sizes of portions of work, and numbers of graphs; results are equal for every value allowed by the constant's comment."""
@@ -20,20 +21,18 @@ SLACK = {"margin", "slack", "slack_x", "slack_y", "limit_of"}
 """Safety margins of bounds: a margin larger by a hundredth lists an additional tile, without effect. Operators are mutated."""
 
 MUTATED = (
-    "warpgs/kernels/*.py", "warpgs/kernels/cameras/*.py", "warpgs/kernels/cuda/*.cu", "warpgs/runtime/interop.py",
-    "warpgs/runtime/allocator.py", "warpgs/runtime/cuda_graph.py",
+    "warpgs/kernels/*.py", "warpgs/kernels/cuda/*.cu",
 )  # fmt: skip
 """The files that are mutated."""
 
-CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim_cuda.py", "warpgs/kernels/native.py")
+CUDA_FILES = ("warpgs/kernels/blend_cuda.py", "warpgs/kernels/ssim.py", "warpgs/kernels/native.py")
 CUDA_FUNCTIONS = {
-    "warpgs/runtime/interop.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
-    "warpgs/runtime/cuda_graph.py": (
+    "warpgs/kernels/launch.py": ("_Recorded", "_recorded", "warp_stream", "_warp_stream", "stream_of", "warp_device"),
+    "warpgs/kernels/graphs.py": (
         "CapturedGraph", "GraphMemory", "GraphPool.capture", "GraphPool.pool", "GraphPool.release",
     ),
-    "warpgs/kernels/adam.py": ("make_scheduled_kernel",),
-    "warpgs/kernels/heaviest.py": ("make_native",),
-    "warpgs/kernels/median_depth.py": ("make_native",),
+    "warpgs/kernels/update.py": ("make_scheduled_kernel",),
+    "warpgs/kernels/walk.py": ("make_heaviest_native", "make_median_native",),
     "warpgs/kernels/ssim.py": ("make_kernels", "_Launcher.padded", "_Launcher.launch"),
 }  # fmt: skip
 """Code that only a CUDA device runs, in addition to code that `sides` and `ends_cpu` find."""
@@ -79,7 +78,15 @@ OPS = {
     "tsdf": ["kernels/test_tsdf.py"],
     "tiles": ["kernels/test_tiles.py", LIMITS_BLEND, RECORDS, "render/test_rasterize.py", "render/test_window.py"],
 }  # fmt: skip
-"""Tests by the longest matching prefix of a file's name (for cameras: folder/name); tests that fail soonest come first."""
+"""Tests by the longest matching prefix of a file's name tests that fail soonest come first."""
+
+ROOMS = {
+    "blend": ["blend", "blend_channels"], "cameras": ["cameras/"], "ellipse": ["functions", "covariance", "project_backward"],
+    "graphs": ["cuda_graph"], "launch": ["interop", "allocator"], "native": ["native", "compiler"],
+    "neighbours": ["knn", "camera_reach", "pixel_size"], "sweep": ["plane_costs", "plane_depths", "scanlines"],
+    "update": ["adam", "step_buffers", "opacity_decay", "dropout"], "walk": ["heaviest", "median_depth"],
+}  # fmt: skip
+"""Entries of the table above for files that hold several ops."""
 
 CUDA_OPS = {
     "adam": [GUARDS, "pipeline/test_step.py"], "blend_cuda": [BODIES, GUARDS, "render/test_channels.py"], "cameras/": [GUARDS],
@@ -98,12 +105,12 @@ SKIPPED = ("tests/kernels/test_blend.py::test_gradcheck",)
 def tests_of(file: str, cuda: bool) -> list[str]:
     """Return the test files for a file that is mutated, on CUDA or on the CPU."""
     path = Path(file)
-    stem = f"cameras/{path.stem}" if path.parent.name == "cameras" else path.stem
-    op = max((name for name in OPS if stem.startswith(name)), key=len)
-    if file.endswith(".cu") and op == "blend":
-        op = "blend_cuda"
-    more = CUDA_OPS.get(op, []) if cuda else [CUTS]
-    return [f"tests/{name}" for name in dict.fromkeys([*OPS[op], *more])]
+    ops = ROOMS.get(path.stem) if path.suffix == ".py" else None
+    if ops is None:
+        op = max((name for name in OPS if path.stem.startswith(name)), key=len)
+        ops = ["blend_cuda" if file.endswith(".cu") and op == "blend" else op]
+    more = [test for op in ops for test in CUDA_OPS.get(op, [])] if cuda else [CUTS]
+    return [f"tests/{name}" for name in dict.fromkeys([*(test for op in ops for test in OPS[op]), *more])]
 
 
 def left_out(node: ast.AST) -> bool:

@@ -5,20 +5,143 @@ import importlib
 import os
 import sys
 
-from warpgs.app.failures import report_defect, report_no_memory
-from warpgs.app.fit_help import help_lines, wants_help
-from warpgs.errors import UsageError, WarpgsError
+from warpgs.device import is_out_of_memory, no_memory_message
+from warpgs.errors import ResourceError, UsageError, WarpgsError, did_you_mean
+from warpgs.folders import system_folder
+from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
+from warpgs.plugins import own_frame
+from warpgs.process import (
+    accept_all_letters,
+    careful_output,
+    fast_imports,
+    ignored_signals,
+    interrupting_signals,
+    say,
+    use_utf8_names,
+)
+from warpgs.ranks import last_words
 from warpgs.report.progress import waiting
-from warpgs.runtime.device_memory import is_out_of_memory
-from warpgs.runtime.file_names import use_utf8_names
-from warpgs.runtime.imports import fast_imports
-from warpgs.runtime.output_streams import careful_output
-from warpgs.runtime.ranks import last_words
-from warpgs.runtime.stop_signals import ignored_signals, interrupting_signals
-from warpgs.runtime.terminal import accept_all_letters, say
-from warpgs.suggestion import did_you_mean
-from warpgs.temporary import system_folder
 from warpgs.version import __version__
+
+FITTING = ("fit", "farm", "compare", "ablate")
+"""Commands that fit, and take the flags of a fit."""
+
+
+def report_no_memory(error: Exception, command: str) -> int:
+    """Print that the memory is exhausted, and the fix; return the exit code."""
+    return last_words(f"warpgs: {no_memory_message(error, fitting=command in FITTING)}", ResourceError.exit_code)
+
+
+def missing_package(error: Exception) -> str:
+    """Return the package that an import of warpgs's own code did not find; empty for other errors."""
+    name = error.name or "" if isinstance(error, ModuleNotFoundError) and not own_frame(error) else ""
+    package = name.partition(".")[0]
+    return "" if package == "warpgs" else package
+
+
+def report_defect(error: Exception, arguments: list[str]) -> int:
+    """Store the traceback in a file for a bug report, and print one line; return the exit code.
+
+    An uninstalled dependency is not a defect of warpgs: the line then only names the package.
+    """
+    import tempfile
+    import traceback
+
+    gone = missing_package(error)
+    if gone:
+        line = f"warpgs: this command needs the Python package {gone}, which is missing; reinstall warpgs with pip"
+        return last_words(line, UsageError.exit_code)
+    details = f"warpgs {__version__} {' '.join(arguments)}\n\n{''.join(traceback.format_exception(error))}"
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="warpgs-error-", suffix=".txt", delete=False, encoding="utf-8", errors="backslashreplace"
+        ) as f:
+            f.write(details)
+        where = f"in {f.name}"
+    except OSError:  # no folder can be written
+        for line in details.splitlines():
+            say(line, error=True)
+        where = "above"
+    own = own_frame(error)
+    if own:
+        line = f"warpgs: {type(error).__name__}: {error} (in your own code, {own}; the details are {where})"
+        return last_words(line, UsageError.exit_code)
+    line = (
+        f"warpgs: internal error, {type(error).__name__}: {error}. This is a bug in warpgs; please report it with the "
+        f"details {where}"
+    )
+    return last_words(line, WarpgsError.exit_code)
+
+
+FLAGS = (
+    ("--out", "RUN", "", "run folder to fill; new or empty"),
+    ("--split", "SPEC", "", "views to hold out for scores; default: none"),
+    ("--preset", "NAME", DEFAULT_PRESET, "a preset listed below, or a .toml file"),
+    ("--steps", "N", "", "number of optimisation steps; default: from the preset"),
+    ("--device", "NAME", "auto", "auto, cpu or cuda"),
+    ("--downscale", "F", "", "divide both sides of the images by F"),
+    ("--max-side", "N", "", "longest side [px]; default: 1600, CPU 800; 0: no limit"),
+    ("--seed", "N", "0", "seed of all random numbers"),
+    ("--background", "COLOR", "auto", "auto, mean, scene, black, white, #rrggbb or r,g,b"),
+    ("--masks", "HOW", "ignore", "masked-out pixels: ignore or cutout (transparent)"),
+    ("--depths", "FOLDER", "", "depth maps, named like the images (docs/scenes.md)"),
+    ("--exposure", "", "False", "learn brightness and colour of each photograph"),
+    ("--refine-poses", "", "False", "correct slightly wrong poses while training"),
+    ("--resume", "", "False", "continue the run in --out from its last checkpoint"),
+    ("--view", "", "False", "watch in a browser while it trains"),
+)
+"""Flags that most fits need: name, placeholder of the value, default (empty for none; False for a switch), description."""
+
+SPLITS = {
+    "every:N": "hold out every Nth view",
+    "llff:K, mip360:K": "hold out every 8th, train on K of the rest",
+    "dtu:3|6|9, blender:8": "the published ids of these data sets",
+    "train=NAMES;test=NAMES": "by name, with commas; either part alone is enough",
+    "all": "hold out no view: no scores",
+}
+"""Kinds of splits, each in a line."""
+
+EXAMPLES = (
+    "warpgs fit scene --out run --preset quick",
+    "warpgs fit scene --out run --split every:8 --max-side 800",
+    "warpgs fit scene --out run --resume",
+)
+"""Commands to begin with."""
+
+SCENE = (
+    "folder with cameras, in a format that --help-all lists;",
+    "or photographs or a video; fit then finds the poses",
+)
+"""Description of the positional argument."""
+
+
+def wants_help(arguments: list[str]) -> bool:
+    """Return whether the arguments after `fit` request the short help."""
+    return any(word in ("-h", "--help") for word in arguments)
+
+
+def help_lines(about: str) -> list[str]:
+    """Return the help of `warpgs fit` in at most 45 lines of 80 columns.
+
+    Args:
+        about: Description of the command.
+    """
+
+    def rows(pairs: list[tuple[str, str]]) -> list[str]:
+        width = max(len(left) for left, _ in pairs)
+        return [f"  {left:<{width}}  {right}".rstrip() for left, right in pairs]
+
+    flags = [("SCENE", SCENE[0]), ("", SCENE[1])]
+    for name, word, default, text in FLAGS:
+        stated = f" [{default}]" if default not in ("", "False") else ""
+        flags.append((f"{name} {word}".strip(), text + stated))
+    return [
+        f"warpgs fit: {about}", "", "usage: warpgs fit SCENE --out RUN [flags]", "",
+        "flags most fits need, and their [defaults]:", *rows(flags), "",
+        "presets (--preset):", *rows([*PRESETS.described().items()]), "", "splits (--split):", *rows([*SPLITS.items()]), "",
+        "examples:", *(f"  {line}" for line in EXAMPLES), "", "`warpgs fit --help-all` lists every flag by topic.",
+    ]  # fmt: skip
+
 
 COMMANDS = {
     "demo": "write a synthetic scene",
@@ -54,6 +177,8 @@ GROUPS = {
 
 PRINTING = ("doctor", "compare", "ablate")
 """Commands that print their result on the terminal."""
+OWN_FILES = ("fit", "farm", "doctor")
+"""Commands with a file of their own, so that their imports delay no other command."""
 ASKING = {"-h", "--help", "--help-all", "help", "--version", "-V"}
 """Arguments for which a command only prints text."""
 
@@ -117,8 +242,9 @@ def _run(arguments: list[str]) -> int:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
             with fast_imports():
-                command = importlib.import_module(f"warpgs.app.commands.{name.replace('-', '_')}")
-            code: int = command.run(arguments[1:], COMMANDS[name])
+                module = importlib.import_module(f"warpgs.app.{name if name in OWN_FILES else 'commands'}")
+            command = getattr(module, f"run_{name.replace('-', '_')}")
+            code: int = command(arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
         return last_words(f"warpgs: {e}", e.exit_code)

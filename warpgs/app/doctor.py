@@ -1,6 +1,4 @@
-"""Report on this machine: what a fit needs, what is missing, and how to install it."""
-
-from __future__ import annotations
+"""`warpgs doctor`: checks of this machine, each by itself."""
 
 import contextlib
 import importlib
@@ -17,14 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from warpgs.errors import ResourceError
-from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.device_memory import ASSUMED_BYTES, machine_memory
-from warpgs.runtime.kernel_cache import prepare_kernel_cache
-from warpgs.runtime.native_output import hidden_stderr
-from warpgs.runtime.processor import processor_name, usable_cores
-from warpgs.runtime.terminal import counted, printable
-from warpgs.suggestion import install_extras
+from warpgs.app.flags import parse_flags
+from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
+from warpgs.errors import ResourceError, UsageError, install_extras
+from warpgs.process import counted, fast_imports, hidden_stderr, printable, say
+from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
 PYTHON = ((3, 11), (3, 14))  # lowest version, and the first one that is too new
@@ -231,7 +226,7 @@ def _size(folder: Path) -> int:
 
 def _prior_cache() -> Iterable[Finding]:
     """Check the cache folder for maps of networks; a fit works without it."""
-    from warpgs.priors.cache import cache_folder
+    from warpgs.priors.networks import cache_folder
 
     folder = cache_folder()
     try:
@@ -286,8 +281,8 @@ def _video() -> Iterable[Finding]:
     try:
         import numpy as np
 
+        from warpgs.folders import temporary_folder
         from warpgs.report.film import write_film
-        from warpgs.temporary import temporary_folder
 
         with temporary_folder() as folder:
             write_film(folder.path / "probe.mp4", (np.full((64, 64, 3), level) for level in (0, 0.5, 1)), 10)
@@ -384,3 +379,46 @@ def print_report(findings: list[Finding], console=None) -> int:
         return ResourceError.exit_code
     console.print("[bold green]A fit can run here.[/]")
     return 0
+
+
+# `warpgs doctor`: check this machine. Parses, calls, prints; no logic.
+
+
+def run_doctor(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` describes it in its help.
+
+    Raises:
+        UsageError: Flags exclude each other, or a value is invalid.
+    """
+
+    @dataclass(frozen=True)
+    class Doctor:
+        warm: bool = False
+        """Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks."""
+        repeat: Path | None = None
+        """File not_finite.safetensors of a run: repeat the saved step, name the non-finite values, and skip the checks."""
+        device: str = "auto"
+        """Device for --repeat: auto, cpu or cuda."""
+
+    a = parse_flags(Doctor, arguments, "warpgs doctor", about)
+    if a.repeat is None and a.device != "auto":
+        raise UsageError("--device requires --repeat")
+    if a.repeat is not None:
+        from warpgs.pipeline.run.commands import repeat_failed_step
+
+        for line in repeat_failed_step(a.repeat, a.device):
+            say(line)
+        return 0
+    if a.warm:
+        with fast_imports():
+            from warpgs.pipeline.run.precompile import print_warming
+        waiting()("compiling kernels")
+        print_warming()
+        return 0
+
+    stages = Stages()
+    stages("checking this machine")
+    with fast_imports():
+        findings = diagnose(waiting())
+    stages.clear()
+    return print_report(findings)

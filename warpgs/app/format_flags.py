@@ -5,12 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import either, flags_of, listed, settings_of, word_after
-from warpgs.app.own_code import load_own
+from warpgs.app.flags import either, flags_of, listed, load_own, settings_of, word_after
 from warpgs.errors import UsageError
-from warpgs.export.base import FORMATS, Format
-from warpgs.export.formats import all_formats, find_format
-from warpgs.pipeline.runs.export_filters import Filters
+from warpgs.export.base import FORMATS, Format, all_formats, find_format
+from warpgs.pipeline.run.export import Filters
 from warpgs.plugins import flag_group
 
 

@@ -15,14 +15,12 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.export.arrays import Arrays
-    from warpgs.export.base import Format
+    from warpgs.export.base import Arrays, Format, read_gaussians, write_gaussians
     from warpgs.export.base import register as register_format
-    from warpgs.export.formats import read_gaussians, write_gaussians
 else:
     __getattr__, __dir__ = lazy(
         __name__,
-        ("warpgs.export.arrays", "Arrays"),
+        ("warpgs.export.base", "Arrays"),
         ("warpgs.export.base", "Format", "register as register_format"),
-        ("warpgs.export.formats", "read_gaussians", "write_gaussians"),
+        ("warpgs.export.base", "read_gaussians", "write_gaussians"),
     )

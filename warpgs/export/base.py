@@ -1,30 +1,182 @@
-"""The interface of a file format of Gaussians, and the formats by name.
-
-One module of `warpgs.export` holds one format and registers it. A format of your own is one class in one file, named as
-``module:Class`` or ``path/to/file.py:Class``.
-"""
+"""Formats of files of Gaussians: the interface, the arrays, the formats by suffix, and .splat."""
 
 from __future__ import annotations
 
+import copy
 import io
 import os
+import re
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
 import numpy as np
 
-from warpgs.coordinates import checked_normalization, convert_gaussians
 from warpgs.errors import DataError, UsageError
-from warpgs.export.arrays import Arrays, arrays_of, check_finite, gaussians_of, malformed
-from warpgs.files import write_bytes
-from warpgs.input_files import open_input, read_input, unread_reason
+from warpgs.files import open_input, read_input, unread_reason, write_bytes
+from warpgs.geometry import checked_normalization, convert_gaussians
 from warpgs.plugins import Registry
-from warpgs.scene import Gaussians, Normalization
+from warpgs.scene import Gaussians, Normalization, base_coefficients, base_colors
+
+ROWS = 16384
+"""Number of Gaussians decoded at a time, so that float64 copies of a whole model never exist."""
+Arrays = dict[str, np.ndarray]
+"""The five tensors of `Gaussians` by field name, as numpy arrays of any float type, means and log scales in file units."""
+
+SH_SIZES = (1, 4, 9, 16)
+"""Numbers of spherical-harmonics coefficients of degrees 0 to 3."""
+SQRT2 = 1.4142135623730951
+_AXES = ("", "y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+"""Axes that flip the sign of each harmonic, in the order of docs/sh.md."""
+
+
+def malformed(path: Path, what: str) -> DataError:
+    """Return a DataError about a file that does not match its suffix, with the fix."""
+    return DataError(
+        f"{path}: not a usable {path.suffix or 'model'} file: {what}. Export the model again, or use another format."
+    )
+
+
+def by_rows(n: int, shape: tuple[int, ...], rows: Callable[[slice], np.ndarray]) -> np.ndarray:
+    """Return an array, float32 [n, *shape], made of pieces of at most `ROWS` rows that are requested in order.
+
+    Values beyond float32 become infinities, which `gaussians_of` reports.
+    """
+    out = np.empty((n, *shape), np.float32)
+    for part in parts(n):
+        out[part] = rows(part)
+    return out
+
+
+def parts(n: int) -> Iterator[slice]:
+    """Yield slices of at most `ROWS` rows that make up ``n``."""
+    return (slice(start, min(start + ROWS, n)) for start in range(0, n, ROWS))
+
+
+def arrays_of(gaussians: Gaussians) -> Arrays:
+    """Return the tensors of Gaussians as arrays on the CPU."""
+    return {name: t.detach().cpu().numpy() for name, t in gaussians.tensors().items()}
+
+
+def check_finite(path: Path, arrays: Arrays) -> None:
+    """Check the values before they are written.
+
+    Raises:
+        DataError: A tensor holds a NaN or an infinity; the message names the first such tensor.
+    """
+    for name, array in arrays.items():
+        bad = array.size - int(np.isfinite(array).sum())
+        if bad:
+            raise DataError(
+                f"{path}: not written, {bad} of {array.size} values of {name} are not finite, and no viewer can show them. "
+                "Export an earlier checkpoint, or fit again with a lower learning rate."
+            )
+
+
+def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
+    """Return Gaussians of decoded arrays, as float32 tensors.
+
+    Raises:
+        DataError: A value is not finite in float32, or a rotation has zero length; the message names the first.
+    """
+    import torch
+
+    with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinities, which the error below names
+        single = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in arrays.items()}
+    for name, array in single.items():
+        for part in parts(len(array)):
+            bad = ~np.isfinite(array[part])
+            if bad.any():
+                row = part.start + int(np.argwhere(bad)[0][0])
+                raise malformed(path, f"{name} of Gaussian {row} is not finite in float32")
+    zero = ~single["quats"].any(axis=1)
+    if zero.any():
+        raise malformed(path, f"the rotation of Gaussian {int(np.argmax(zero))} has zero length")
+    return Gaussians(**{name: torch.from_numpy(array) for name, array in single.items()})
+
+
+def sigmoid(logits: np.ndarray) -> np.ndarray:
+    """Return 1 / (1 + exp(-x)) in float64 without overflow, in the shape [N] of ``logits``."""
+    small = np.exp(-np.abs(logits.astype(np.float64)))
+    result: np.ndarray = np.where(logits >= 0, 1, small) / (1 + small)
+    return result
+
+
+def logits(opacities: np.ndarray, quantum: float) -> np.ndarray:
+    """Return finite log(p / (1 - p)) [N] in float64; 0 and 1 are moved inwards by a quarter of a quantum."""
+    p = np.clip(opacities.astype(np.float64), 0.25 * quantum, 1 - 0.25 * quantum)
+    return np.log(p) - np.log1p(-p)
+
+
+def unit_quats(quats: np.ndarray) -> np.ndarray:
+    """Return rotations [N, 4] of length 1 in float64; lengths from 1e-15 to 1e15 are fine, zero becomes the identity."""
+    q = quats.astype(np.float64)
+    length = np.sqrt((q * q).sum(axis=1, keepdims=True))
+    return np.where(length > 0, q / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+
+
+def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split unit quaternions into the index of their largest component and the other three.
+
+    Args:
+        quats: Rotations [N, 4], components in any order.
+
+    Returns:
+        Index of the largest component, int64 [N], and the other components in their order [N, 3]. Each is at most 1/sqrt(2) in
+        magnitude. The sign of the quaternion is chosen so that the largest component is positive.
+    """
+    q = unit_quats(quats)
+    largest = np.abs(q).argmax(axis=1)
+    rows = np.arange(len(q))
+    q = q * np.where(q[rows, largest] < 0, -1.0, 1.0)[:, None]
+    keep = np.arange(4)[None] != largest[:, None]
+    return largest, q[keep].reshape(len(q), 3)
+
+
+def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the quaternions [N, 4] that `smallest_three` split."""
+    q = np.empty((len(others), 4))
+    keep = np.arange(4)[None] != largest[:, None]
+    q[keep] = others.reshape(-1)
+    q[~keep] = np.sqrt(np.clip(1 - (others * others).sum(axis=1), 0, None))
+    return q
+
+
+def half_turn(arrays: Arrays, axis: str) -> Arrays:
+    """Turn Gaussians by 180 degrees about a coordinate axis: exact, and its own inverse.
+
+    Args:
+        arrays: The Gaussians.
+        axis: x (converts between SPZ's axes, RUB, and PLY's, RDF) or z (between PLY's axes and the y-up axes of glTF).
+    """
+    copies = arrays | {name: np.array(arrays[name]) for name in ("means", "quats", "sh")}
+    half_turn_in_place(copies, axis)
+    return copies
+
+
+def half_turn_in_place(arrays: Arrays, axis: str) -> None:
+    """Turn arrays of a float type as `half_turn` does, without a copy."""
+    turned = {a: 1.0 if a == axis else -1.0 for a in "xyz"}
+    signs = np.array([turned[a] for a in "xyz"], np.float32)
+    harmonics = np.array([np.prod([turned[a] for a in axes]) for axes in _AXES], np.float32)[: arrays["sh"].shape[1]]
+    arrays["means"] *= signs
+    arrays["quats"] *= np.concatenate([[1], signs]).astype(np.float32)
+    arrays["sh"] *= harmonics[:, None]
+
+
+def rounded(values: np.ndarray, most: int) -> np.ndarray:
+    """Return values [N, ...] rounded to integers and clamped to 0 .. ``most``, int64."""
+    return np.clip(np.floor(values + 0.5), 0, most).astype(np.int64)
+
+
+# The interface of a file format of Gaussians, and the formats by name.
+#
+# One module of `warpgs.export` holds one format and registers it. A format of your own is one class in one file, named
+# as ``module:Class`` or ``path/to/file.py:Class``.
 
 BROKEN = (
     struct.error, zlib.error, zipfile.BadZipFile, EOFError, ValueError, KeyError, TypeError, IndexError, OverflowError,
@@ -150,3 +302,195 @@ def warn_of_antialiasing(path: Path) -> None:
 FORMATS: Registry[Format] = Registry("format", Format, __package__)
 """File formats of Gaussians by name; those in the modules of `warpgs.export` are built in."""
 register = FORMATS.register
+
+
+# The .splat format of antimatter15's viewer: 32 bytes a Gaussian, without spherical harmonics above degree 0.
+#
+# Position and axis lengths as float32, colour and opacity as bytes, rotation wxyz as bytes (128 is 0). Axes are those
+# of PLY.
+
+_ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+_TINY = 1e-37
+"""Least axis length that is written and read: the logarithm of 0 is not finite."""
+
+
+def encode(arrays: Arrays) -> list[bytes]:
+    """Return the bytes of a file; harmonics above degree 0 are lost, and colours outside of [0, 1] clamped."""
+    rows = np.empty(len(arrays["means"]), _ROW)
+    rows["mean"] = arrays["means"]
+    rows["scale"] = np.clip(np.exp(arrays["log_scales"].astype(np.float64)), _TINY, 3e38)
+    rows["rgba"][:, :3] = rounded(255 * base_colors(arrays["sh"][:, :1].astype(np.float64)), 255)
+    rows["rgba"][:, 3] = rounded(255 * sigmoid(arrays["logit_opacities"]), 255)
+    rows["quat"] = rounded(128 * unit_quats(arrays["quats"]) + 128, 255)
+    return [rows.tobytes()]
+
+
+def decode(path: Path, data: bytes) -> Arrays:
+    """Return the Gaussians of a file's bytes.
+
+    Raises:
+        DataError: The file is empty, its size is not a multiple of 32 bytes, or an axis length is negative.
+    """
+    if not data:
+        raise malformed(path, "it is empty")
+    if len(data) % _ROW.itemsize:
+        raise malformed(path, f"its {len(data)} bytes are not a multiple of {_ROW.itemsize}")
+    rows = np.frombuffer(data, _ROW)
+    n = len(rows)
+    for part in parts(n):
+        if (rows["scale"][part] < 0).any():
+            row = part.start + int(np.argwhere(rows["scale"][part] < 0)[0][0])
+            raise malformed(path, f"an axis of Gaussian {row} has a negative length")
+    return {
+        "means": by_rows(n, (3,), lambda p: rows["mean"][p]),
+        "quats": by_rows(n, (4,), lambda p: (rows["quat"][p].astype(np.float64) - 128) / 128),
+        "log_scales": by_rows(n, (3,), lambda p: np.log(np.maximum(rows["scale"][p].astype(np.float64), _TINY))),
+        "logit_opacities": by_rows(n, (), lambda p: logits(rows["rgba"][p, 3] / 255, 1 / 255)),
+        "sh": by_rows(n, (1, 3), lambda p: base_coefficients(rows["rgba"][p, None, :3].astype(np.float64) / 255)),
+    }
+
+
+@register("splat")
+class Splat(Format):
+    """The .splat format."""
+
+    suffix = ".splat"
+    description = "antimatter15, 8 bits, no view-dependent colours; small viewers"
+    max_degree = 0
+    encode = staticmethod(encode)
+    decode = staticmethod(decode)
+
+
+def all_formats() -> list[Format]:
+    """Return every registered format with its default options: longer suffixes first, so .compressed.ply before .ply."""
+    found = [FORMATS.find(name)() for name in FORMATS.names()]
+    return sorted(found, key=lambda f: (-len(f.suffix), not type(f).__module__.startswith("warpgs."), f.suffix))
+
+
+def suffixes() -> list[str]:
+    """Return the suffix of every registered format, the longer ones first."""
+    return [f.suffix for f in all_formats()]
+
+
+def find_format(choice: str | type[Format] | Format) -> Format:
+    """Return a format that is given as a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object.
+
+    A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
+
+    Raises:
+        UsageError: There is no such format, it does not derive from `Format`, or it has no suffix.
+    """
+    if not isinstance(choice, (str, type, Format)):
+        raise UsageError(
+            f"{choice!r} is not a format; give a name, module:Class, or a class or object derived from warpgs.Format"
+        )
+    found = (
+        choice if isinstance(choice, Format) else FORMATS.load(choice)() if isinstance(choice, str) else FORMATS.find(choice)()
+    )
+    if not re.fullmatch(r"(\.[a-z0-9_-]+)+", found.suffix):
+        raise UsageError(
+            f"the format {type(found).__name__} has the suffix {found.suffix!r}; set it to a dot and lower-case letters or "
+            "digits, such as '.mine'"
+        )
+    return found
+
+
+def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format | None = None) -> Format:
+    """Return the given format, or else the format of the file's suffix.
+
+    Raises:
+        UsageError: No format has the suffix, or the given format has another suffix.
+    """
+    if choice is not None:
+        chosen = find_format(choice)
+        if not chosen.fits(path):
+            raise UsageError(f"{path}: expected a name that ends in {chosen.suffix}, for the format {chosen.name}")
+        return chosen
+    known = all_formats()
+    for kind in known:
+        if kind.fits(path):
+            return kind
+    name = Path(path).name.lower()
+    if name.endswith(".htm"):
+        raise UsageError(f"{path}: format .htm is not supported; did you mean {path}l?")
+    cameras = "; cameras are named cameras.json, transforms.json or sparse" if name.endswith(".json") else ""
+    raise UsageError(
+        f"{path}: format {Path(path).suffix or '(none)'} is not supported; use one of {', '.join(k.suffix for k in known)}, or "
+        f"give a format of your own{cameras}. `warpgs export` makes a page, too (.html), and `warpgs mesh` a mesh (.ply, .glb)"
+    )
+
+
+def write_gaussians(
+    path: str | os.PathLike[str],
+    gaussians: Gaussians,
+    normalization: Normalization | None = None,
+    *,
+    units: str = "scene",
+    format: str | type[Format] | Format | None = None,
+    antialiased: bool = False,
+) -> None:
+    """Write Gaussians to a file, in the format of its suffix and in the units of the scene's files.
+
+    The order of the Gaussians is kept. The write is atomic.
+
+    Args:
+        path: The file; an existing one is replaced.
+        gaussians: N Gaussians, on any device; at least one, except in a .ply file.
+        normalization: Similarity from file to scene units; needed where ``units`` is scene.
+        units: Units of ``gaussians``: scene, or file to write them unchanged.
+        format: Name of a format, or a `Format` of your own: an object, a class, ``module:Class`` or
+            ``path/to/file.py:Class``. None for the format of the suffix.
+        antialiased: True for Gaussians to be rendered with `RasterizeOptions.antialiased`. PLY, SPZ and SOG declare it.
+
+    Raises:
+        warpgs.DataError: A tensor contains a non-finite number, or one that the format cannot store; there are no
+            Gaussians; or their spherical-harmonics degree is too high for the format.
+        warpgs.ResourceError: The file cannot be written.
+        TypeError: The Gaussians have other parameters; ``stored()`` of `ActivatedGaussians` converts them.
+        warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+            normalization.
+        ValueError: A tensor has the wrong shape.
+    """
+    chosen = copy.copy(format_of(path, format))
+    chosen.antialiased = antialiased
+    chosen.write(Path(path), gaussians, normalization, units)
+
+
+def read_gaussians(
+    path: str | os.PathLike[str],
+    normalization: Normalization | None = None,
+    *,
+    units: str = "file",
+    format: str | type[Format] | Format | None = None,
+) -> Gaussians:
+    """Read Gaussians from a file, in the format of its suffix; a .ply file may be compressed.
+
+    A file that declares antialiasing causes a warning: render it with `RasterizeOptions.antialiased`.
+
+    Args:
+        path: The file.
+        normalization: Similarity from file to scene units; needed where ``units`` is scene.
+        units: Units of the result: file as stored, or scene to go with a scene's cameras.
+        format: As in `write_gaussians`.
+
+    Returns:
+        N Gaussians, torch float32 tensors on the CPU.
+
+    Raises:
+        warpgs.DataError: The file is missing, malformed, truncated, declares more data than its size allows, or contains
+            a NaN, an infinity that `read_ply` does not replace, or a rotation of zero length.
+        warpgs.UsageError: The suffix, the format or the units are unknown, or scene units are given without a
+            normalization.
+    """
+    gaussians, antialiased = read_with_antialiasing(Path(path), normalization, units, format)
+    if antialiased:
+        warn_of_antialiasing(Path(path))
+    return gaussians
+
+
+def read_with_antialiasing(
+    path: Path, normalization: Normalization | None, units: str, format: str | type[Format] | Format | None = None
+) -> tuple[Gaussians, bool]:
+    """Return the result of `read_gaussians`, and whether the file declares antialiasing."""
+    chosen = format_of(path, format)
+    return chosen.read(path, normalization, units), chosen.is_antialiased(path)

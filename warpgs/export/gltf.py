@@ -17,19 +17,20 @@ from typing import Any
 
 import numpy as np
 
-from warpgs.export.arrays import (
+from warpgs.export.base import (
     SH_SIZES,
     Arrays,
+    Format,
     by_rows,
     half_turn,
     half_turn_in_place,
     logits,
     malformed,
     parts,
+    register,
     sigmoid,
     unit_quats,
 )
-from warpgs.export.base import Format, register
 
 EXTENSION = "KHR_gaussian_splatting"
 COLOR_SPACE = "srgb_rec709_display"

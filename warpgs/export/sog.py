@@ -20,21 +20,23 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.export.arrays import (
+from warpgs.export.base import (
+    BROKEN,
     SH_SIZES,
     SQRT2,
     Arrays,
+    Format,
     by_rows,
     from_smallest_three,
     logits,
     malformed,
     parts,
+    register,
     rounded,
     sigmoid,
     smallest_three,
 )
-from warpgs.export.base import BROKEN, Format, register
-from warpgs.input_files import open_input, unread_reason
+from warpgs.files import open_input, unread_reason
 
 LEVELS = 256
 """Number of entries of a codebook."""

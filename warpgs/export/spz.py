@@ -19,11 +19,13 @@ from typing import BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError, UsageError
-from warpgs.export.arrays import (
+from warpgs.errors import DataError, UsageError, install_extras
+from warpgs.export.base import (
+    BROKEN,
     SH_SIZES,
     SQRT2,
     Arrays,
+    Format,
     by_rows,
     from_smallest_three,
     half_turn,
@@ -31,14 +33,13 @@ from warpgs.export.arrays import (
     logits,
     malformed,
     parts,
+    register,
     rounded,
     sigmoid,
     smallest_three,
     unit_quats,
 )
-from warpgs.export.base import BROKEN, Format, register
-from warpgs.input_files import open_input, unread_reason
-from warpgs.suggestion import install_extras
+from warpgs.files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""

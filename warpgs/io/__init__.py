@@ -21,18 +21,16 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.io.folders import SceneFolder, ViewList, view_name
-    from warpgs.io.given_maps import NamedMaps
+    from warpgs.io.folder import Probe, Reader, ReadOptions, SceneFolder, ViewList, view_name
+    from warpgs.io.folder import register as register_reader
     from warpgs.io.images import Lens, LoadedImage
-    from warpgs.io.map_files import MapOptions
-    from warpgs.io.readers import Probe, Reader, ReadOptions
-    from warpgs.io.readers import register as register_reader
+    from warpgs.io.maps import MapOptions, NamedMaps
 else:
     __getattr__, __dir__ = lazy(
         __name__,
-        ("warpgs.io.folders", "SceneFolder", "ViewList", "view_name"),
-        ("warpgs.io.given_maps", "NamedMaps"),
+        ("warpgs.io.folder", "SceneFolder", "ViewList", "view_name"),
+        ("warpgs.io.maps", "NamedMaps"),
         ("warpgs.io.images", "Lens", "LoadedImage"),
-        ("warpgs.io.map_files", "MapOptions"),
-        ("warpgs.io.readers", "Probe", "Reader", "ReadOptions", "register as register_reader"),
+        ("warpgs.io.maps", "MapOptions"),
+        ("warpgs.io.folder", "Probe", "Reader", "ReadOptions", "register as register_reader"),
     )

@@ -14,11 +14,20 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.input_files import read_input, unread_reason
-from warpgs.io.folders import SceneFolder, ViewList, has_folder, view_name
+from warpgs.files import read_input, unread_reason
+from warpgs.io.folder import (
+    Probe,
+    Reader,
+    ReadOptions,
+    SceneFolder,
+    ViewList,
+    has_folder,
+    quat_rotation,
+    register,
+    rigid,
+    view_name,
+)
 from warpgs.io.images import Lens, list_images
-from warpgs.io.pose_matrices import quat_rotation, rigid
-from warpgs.io.readers import Probe, Reader, ReadOptions, register
 from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}

@@ -1,19 +1,344 @@
-"""Images: orientation, undistortion and resizing, with matching intrinsics."""
+"""Images of a scene: decoded, turned as the camera was, resized, masked."""
 
 from __future__ import annotations
 
 import functools
+import os
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 
-from warpgs import lenses
-from warpgs.errors import DataError, UsageError
-from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
-from warpgs.io.exif import read_exif
-from warpgs.scene import GivenDepth
+from warpgs import geometry
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.files import read_input, read_start, unread_reason
+from warpgs.io.image_formats import avif, bmp, jpeg, png, tiff, webp
+from warpgs.io.image_formats.avif import kind
+from warpgs.scene import GivenDepth, View
+
+FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
+    (b"\xff\xd8\xff", "JPEG", jpeg),
+    (png.SIGNATURE, "PNG", png),
+    (b"BM", "BMP", bmp),
+    (b"II*\0", "TIFF", tiff),
+    (b"MM\0*", "TIFF", tiff),
+    (b"II+\0", "TIFF", tiff),
+    (b"MM\0+", "TIFF", tiff),
+    (b"RIFF", "WEBP", webp),
+)
+"""First bytes, Pillow's name, and module of each supported format; AVIF is recognised by its brand."""
+READ = "JPEG, PNG, BMP, TIFF, WebP or AVIF"
+"""The formats that are read, for messages."""
+
+
+def format_of(data: bytes) -> tuple[str, ModuleType]:
+    """Return name and module of the format of an image file, by its first bytes.
+
+    Raises:
+        ValueError: The format is not supported.
+    """
+    for start, name, module in FORMATS:
+        if data.startswith(start):
+            return name, module
+    if avif.kind(data) == "AVIF":
+        return "AVIF", avif
+    raise ValueError(f"it is not a {READ} file" if data else "it is empty")
+
+
+# Unsupported formats of photographs, and remedies.
+#
+# HEIC is supported only for finding poses (`warpgs.poses.photographs`). RAW is left to a converter, in which the user
+# chooses the same colour and exposure for all photographs.
+
+RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
+"""Suffixes of RAW files of cameras; many begin like a TIFF, and their first image is a small preview."""
+HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all HEIC files to JPEG"
+RAW = (
+    "a RAW file, which is not supported; convert all RAW files to JPEG or 16-bit PNG, with the same settings and white balance"
+)
+
+
+def unread_format(path: Path, head: bytes) -> str | None:
+    """Return a remedy for a photograph of an unsupported format, as the end of a sentence; None for any other file.
+
+    Args:
+        path: Name of the file; only RAW is detected by suffix.
+        head: First bytes of the file; they identify damaged files, too.
+    """
+    if path.suffix.lower() in RAW_SUFFIXES or kind(head) == "RAW":
+        return RAW
+    return HEIC if kind(head) == "HEIC" else None
+
+
+def unread_note(folder: Path) -> str:
+    """Return a sentence on the RAW files of a folder, known by their suffix; empty for none."""
+    files = (
+        sorted(p for p in folder.glob("*") if p.suffix.lower() in RAW_SUFFIXES and p.name[0] != ".") if folder.is_dir() else []
+    )
+    if not files:
+        return ""
+    return f"{files[0].name} is {RAW}" if len(files) == 1 else f"{files[0].name} is {RAW} ({len(files)} such files)"
+
+
+MAX_PIXELS = 100_000_000
+"""Default limit on the pixels of an image; decoded, an image of this size takes 1.2 GB."""
+FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
+"""Bytes that a pixel may take in a file (four channels as float32), and bytes for everything else in the file."""
+BYTES_PER_PIXEL = 32
+"""Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
+
+
+def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
+    """Return the bytes of an image file; files too large for ``max_pixels`` pixels are rejected.
+
+    Raises:
+        DataError: The file is missing, cannot be read, or is not a regular file.
+    """
+    try:
+        return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
+    except OSError as e:
+        raise _unreadable(path, e) from e
+
+
+def read_image_start(path: Path, count: int) -> bytes:
+    """Return the first bytes of an image file, at most ``count``.
+
+    Raises:
+        DataError: The file is missing, cannot be read, or is not a regular file.
+    """
+    try:
+        return read_start(path, count)
+    except OSError as e:
+        raise _unreadable(path, e) from e
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    if not os.path.exists(path):  # False for broken and circular links
+        what = "is a broken link" if path.is_symlink() else "the image file is missing"
+        return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
+    return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
+
+
+def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
+    """Return the pixels as stored, [H, W] or [H, W, C] with colours in BGR order, of any type that OpenCV has."""
+    import cv2
+
+    pixels = 0
+    unread = unread_format(path, data[:32])
+    if unread is not None:
+        raise DataError(f"{path}: is {unread}")
+    try:
+        _, module = format_of(data)
+        width, height = module.size(data)
+        pixels = width * height
+        if pixels > max_pixels:
+            raise DataError(
+                f"{path}: the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels; shrink it, or "
+                f"raise the limit with --max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
+            )
+        if not pixels:
+            raise ValueError(f"it has {width} x {height} px")
+        raster: np.ndarray | None = None
+        if module in (jpeg, avif):
+            raster = module.decode(data)
+        else:
+            module.check(data)
+        if raster is None:
+            # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
+            raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if raster is None or raster.shape[:2] != (height, width):
+            raise ValueError("its pixels cannot be read")
+    except (ValueError, cv2.error) as e:
+        if isinstance(e, cv2.error) and e.code == cv2.Error.StsNoMem:
+            raise ResourceError(_too_large(path, pixels)) from e
+        reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else str(e)
+        raise DataError(
+            f"{path}: the image cannot be decoded: {reason}. Restore it from its source; if it looks right, save it as PNG"
+        ) from e
+    except MemoryError as e:
+        raise ResourceError(_too_large(path, pixels)) from e
+    return raster
+
+
+def _too_large(path: Path, pixels: int) -> str:
+    needed = BYTES_PER_PIXEL * pixels / 2**30
+    return f"{path}: decoding the image needs {needed:.1f} GiB of free memory; shrink the image, or end other programs"
+
+
+def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Decode a PNG to its numbers as stored, uint8 or uint16, shape [H, W] or [H, W, C] with colours in RGB order.
+
+    Raises:
+        DataError: The file is missing, not a PNG, too large, or damaged.
+        ResourceError: There is not enough memory for the image.
+    """
+    data = read_image_file(path, max_pixels)
+    if not data.startswith(png.SIGNATURE):
+        raise DataError(f"{path}: is not a PNG file; save it as 16-bit PNG or NPY")
+    raw = _raster(path, data, max_pixels)
+    return raw if raw.ndim == 2 else np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[2]]])
+
+
+def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Decode an image file as stored, without rotation by its EXIF tag.
+
+    Gray, palette, 8- and 16-bit images and straight alpha are supported.
+
+    Args:
+        path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.
+        max_pixels: Largest number of pixels that its header may announce.
+        data: Bytes of the file, if they have been read already.
+
+    Returns:
+        Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
+
+    Raises:
+        DataError: The file is missing, of another format, too large, or damaged, as far as its format reveals damage.
+        ResourceError: There is not enough memory for the image.
+    """
+    raw = _raster(path, read_image_file(path, max_pixels) if data is None else data, max_pixels)
+    if raw.dtype in (np.uint8, np.uint16):
+        values = raw.astype(np.float32)
+        values /= np.iinfo(raw.dtype).max
+    elif raw.dtype == np.float32:
+        values = np.clip(raw, 0, 1)
+        if not np.isfinite(raw).all():
+            raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
+    else:
+        raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
+    del raw  # free it before copies are made
+    if values.ndim == 2:
+        values = values[..., None]
+    channels = values.shape[2]
+    if channels > 4:
+        raise DataError(f"{path}: has {channels} channels; save it as gray, RGB or RGBA")
+    alpha = np.ascontiguousarray(values[..., -1]) if channels in (2, 4) else None
+    color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values[..., 2::-1]
+    return np.ascontiguousarray(color), alpha
+
+
+# EXIF of a photograph and its lens: five tags, read from the first directory and the block of exposure data.
+#
+# The layout is that of TIFF (CIPA DC-008). Only the values of these tags are read, because libraries that read all of
+# EXIF copy overlapping values again and again.
+
+MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
+"""Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
+ASCII = 2
+NUMBERS = {3: "H", 4: "I"}
+"""Layouts of the integers that EXIF tags may hold, by type."""
+MAX_ENTRIES = 1000
+"""Largest number of tags in a directory."""
+MAX_TEXT = 100
+"""Longest maker or model that is read [bytes]."""
+MAX_FOCAL = 10_000
+"""Longest equivalent focal length that is accepted [mm]."""
+PREFIX = b"Exif\0\0"
+"""First bytes of EXIF in JPEG, and in some WebP files."""
+
+
+@dataclass(frozen=True)
+class Exif:
+    """Values of EXIF; missing values have the defaults."""
+
+    orientation: int = 1
+    """Orientation of the stored raster, 1 to 8."""
+    maker: str = ""
+    """Maker of the device."""
+    model: str = ""
+    """Model of the device."""
+    focal: float | None = None
+    """Focal length [mm] that gives the same field of view on 35 mm film."""
+
+    @property
+    def device(self) -> str:
+        """Maker and model, as far as known."""
+        return " ".join(filter(None, (self.maker, self.model)))[:MAX_TEXT]
+
+
+def read_exif(data: bytes) -> Exif:
+    """Return the EXIF values of an image file; damaged values count as missing."""
+    try:
+        return parse_exif(_block(data))
+    except ValueError:
+        return Exif()
+
+
+def parse_exif(block: bytes) -> Exif:
+    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged values count as missing."""
+    block = block.removeprefix(PREFIX)
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
+    if order is None:
+        return Exif()
+    try:
+        first = _Directory(block, order, *struct.unpack_from(order + "I", block, 4))
+        orientation, place = first.number(ORIENTATION), first.number(EXPOSURE)
+        maker, model = first.text(MAKE), first.text(MODEL)
+        focal = None if place is None else _Directory(block, order, place).number(FOCAL_35MM)
+    except (ValueError, struct.error):
+        return Exif()
+    if orientation is None or not 1 <= orientation <= 8:
+        orientation = 1
+    return Exif(orientation, maker, model, float(focal) if focal and focal <= MAX_FOCAL else None)
+
+
+def _block(data: bytes) -> bytes:
+    """Return the bytes of EXIF in an image file, which begin as a TIFF file does; maybe empty."""
+    name, _ = format_of(data)
+    found: bytes | memoryview = b""
+    if name == "TIFF":
+        found = data
+    elif name == "JPEG":
+        for marker, body in jpeg.segments(data):
+            if marker == jpeg.SOS:
+                break
+            if marker == jpeg.APP1 and body.startswith(PREFIX):
+                found = body
+                break
+    elif name == "PNG":
+        found = next((body for kind, body in png.chunks(data) if kind == b"eXIf"), b"")
+    elif name == "WEBP":
+        found = next((body for kind, body in webp.chunks(data) if kind == b"EXIF"), b"")
+    elif name == "AVIF":
+        with avif.open_image(data) as image:
+            found = image.info.get("exif", b"")
+    return bytes(found)
+
+
+class _Directory:
+    """Entries of a directory of tags."""
+
+    def __init__(self, block: bytes, order: str, at: int):
+        self.block, self.order = block, order
+        (count,) = struct.unpack_from(order + "H", block, at)
+        if count > MAX_ENTRIES:
+            raise ValueError(f"a directory of {count} tags")
+        self.entries: dict[int, tuple[int, int, int]] = {}
+        for i in range(count):
+            place = at + 2 + 12 * i
+            tag, kind, length = struct.unpack_from(order + "HHI", block, place)
+            self.entries[tag] = kind, length, place + 8
+
+    def number(self, tag: int) -> int | None:
+        """Return a single integer, or None."""
+        kind, length, place = self.entries.get(tag, (0, 0, 0))
+        if kind not in NUMBERS or length != 1:
+            return None
+        value: int = struct.unpack_from(self.order + NUMBERS[kind], self.block, place)[0]
+        return value
+
+    def text(self, tag: int) -> str:
+        """Return the text of a tag, maybe empty, without the zero bytes and spaces around it."""
+        kind, length, place = self.entries.get(tag, (0, 0, 0))
+        if kind != ASCII:
+            return ""
+        if length > 4:
+            (place,) = struct.unpack_from(self.order + "I", self.block, place)
+        return self.block[place : place + min(length, MAX_TEXT)].decode("latin-1").strip("\0 ")
+
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
@@ -190,7 +515,7 @@ def _reached(model: str, distortion: tuple[float, ...], intrinsics: tuple[float,
     fx, fy, cx, cy = intrinsics
     x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
     with np.errstate(all="ignore"):
-        return np.asarray(np.isfinite(lenses.from_plane(model, np.array(distortion), np.stack([x, y], -1))).all(-1))
+        return np.asarray(np.isfinite(geometry.from_plane(model, np.array(distortion), np.stack([x, y], -1))).all(-1))
 
 
 def _native(loaded: LoadedImage, lens: Lens) -> LoadedImage:
@@ -358,3 +683,64 @@ def load_image(
         raise DataError(f"{path}: no pixel is left after its mask, its lens distortion and --downscale; check all three")
     loaded = replace(loaded, orientation=orientation, full_size=(height, width), undone=undone)
     return _over_background(loaded, background)
+
+
+DARK = 16 / 255
+"""A pixel is dark if its brightest channel is below this value, in [0, 1]."""
+DARK_FRACTION = 0.3
+"""An image with a dark border shows an object on black if at least this fraction of its pixels is dark."""
+
+HOLE = 0.001
+"""An enclosed dark region is a hole in the object if it covers at least this fraction of the image."""
+
+
+def dark_pixels(image: np.ndarray) -> np.ndarray | None:
+    """Return the dark pixels, bool [H, W], of an image [H, W, 3] that shows an object on black; None for any other image.
+
+    In such an image, at least `DARK_FRACTION` of the pixels and half of the border are dark, but not all pixels.
+    """
+    dark: np.ndarray = image.max(-1) < DARK
+    border = np.concatenate([dark[0], dark[-1], dark[:, 0], dark[:, -1]])
+    return dark if dark.mean() >= DARK_FRACTION and border.mean() >= 0.5 and not dark.all() else None
+
+
+def empty_pixels(dark: np.ndarray) -> np.ndarray:
+    """Return the dark pixels without an object in front of them, bool [H, W].
+
+    The region of adjacent dark pixels (4 neighbours) around such a pixel touches the border, or covers at least `HOLE` of the
+    image.
+    """
+    import cv2
+
+    _, labels, found, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
+    empty = found[:, cv2.CC_STAT_AREA] >= HOLE * dark.size
+    empty[np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])] = True
+    pixels: np.ndarray = dark & empty[labels]
+    return pixels
+
+
+def cut_from_black(views: list[View]) -> tuple[list[View], str]:
+    """Make the dark pixels around an object and in its holes transparent, if all views show an object on black.
+
+    All other pixels get an opacity of 1, and so do dark specks and cracks that the object encloses. If any view has an alpha
+    channel or a mask, or shows something else, all views stay unchanged.
+
+    Args:
+        views: The views of a scene.
+
+    Returns:
+        The views, and a note for the user; an empty note if nothing is changed.
+    """
+    done, empty = [], 0.0
+    for v in views:
+        dark = dark_pixels(v.image) if v.alpha is None and v.mask is None else None
+        if dark is None:
+            return views, ""
+        nothing = empty_pixels(dark)
+        empty += float(nothing.mean()) / len(views)
+        alpha = 1 - nothing.astype(np.float32)
+        done.append(replace(v, image=v.image * alpha[..., None], alpha=alpha, alpha_estimated=True))
+    return done, (
+        f"every image shows an object on black: the dark pixels around the object and in its holes ({empty:.1%} of all "
+        f"pixels) become transparent; --no-black-is-empty keeps them"
+    )

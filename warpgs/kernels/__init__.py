@@ -12,10 +12,10 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.kernels.cameras.base import CameraModel
-    from warpgs.kernels.cameras.base import register as register_camera_model
+    from warpgs.kernels.cameras import CameraModel
+    from warpgs.kernels.cameras import register as register_camera_model
 else:
     __getattr__, __dir__ = lazy(
         __name__,
-        ("warpgs.kernels.cameras.base", "CameraModel", "register as register_camera_model"),
+        ("warpgs.kernels.cameras", "CameraModel", "register as register_camera_model"),
     )

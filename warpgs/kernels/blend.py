@@ -1,22 +1,20 @@
-"""Compositing of binned Gaussians front to back: colour, alpha, expected depth, and each Gaussian's blending weight."""
+"""Blending: sorted Gaussians become pixels, front to back, with gradients; colours, depth and further channels."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from warpgs.constants import Rule
-from warpgs.kernels import blend_cpu, blend_cuda
-from warpgs.kernels.blend_records import COLORS, VALUES
-from warpgs.kernels.blend_settings import BlendSettings
-from warpgs.kernels.compiler import ROLLED
+from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
+from warpgs.kernels import blend_cpu, blend_cuda, launch
+from warpgs.kernels.falloff import COLORS, VALUES, WIDTHS, BlendSettings
+from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
+from warpgs.kernels.native import ROLLED
 from warpgs.kernels.tiles import Tiles, grid
-from warpgs.runtime import interop
-from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.runtime.derivatives import first_order, keep, kept
-from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
@@ -103,21 +101,21 @@ def is_native(projected: torch.Tensor) -> bool:
 
 def _launch(kernel, tiles: int, inputs: list, device: torch.device) -> None:
     """Launch a generic kernel, one task per tile."""
-    interop.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
+    launch.launch(kernel, tiles, inputs, device, cost=10_000, block_dim=32)
 
 
-def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[interop.View]:
+def tile_inputs(projected: torch.Tensor, tiles: Tiles, real) -> list[launch.View]:
     """Return the inputs of the generic kernels: projected Gaussians [C, N, 9 + D], and the instances of each tile."""
     return [
-        interop.rows(projected, real),
-        interop.view(tiles.ranges, wp.int32),
-        interop.view(tiles.gaussian_ids, wp.int32),
+        launch.rows(projected, real),
+        launch.view(tiles.ranges, wp.int32),
+        launch.view(tiles.gaussian_ids, wp.int32),
     ]
 
 
-def _span(image: torch.Tensor, real) -> tuple[interop.View, int]:
+def _span(image: torch.Tensor, real) -> tuple[launch.View, int]:
     """Return an image [C, H, W, D], which may be a slice of channels, as one axis, and the stride of its pixels."""
-    found = interop.span(image, real)
+    found = launch.span(image, real)
     return found, found.row_stride()
 
 
@@ -151,7 +149,7 @@ def composite(
     """
     if is_native(projected):
         return blend_cuda.forward(projected, tiles, backgrounds, settings, save=save, allocator=allocator, image=image)
-    real, device = interop.real_of(projected), projected.device
+    real, device = launch.real_of(projected), projected.device
     cameras, channels = backgrounds.shape
     shape = (cameras, settings.height, settings.width)
     rgb = allocator.output((*shape, channels), projected.dtype, device) if image is None else image
@@ -160,9 +158,9 @@ def composite(
     ends = allocator.saved(shape, torch.int32, device)
     inputs = [
         settings.struct(tiles.size, real), *tile_inputs(projected, tiles, wp.types.vector(9 + channels, real)),
-        interop.view(backgrounds, real), *_span(rgb, real),
-        *(interop.flat(t, real) for t in (alpha, depth, transmittances, weights)),
-        interop.flat(ends, wp.int32),
+        launch.view(backgrounds, real), *_span(rgb, real),
+        *(launch.flat(t, real) for t in (alpha, depth, transmittances, weights)),
+        launch.flat(ends, wp.int32),
     ]  # fmt: skip
     _launch(blend_cpu.make_kernels(real, tiles.size, channels).forward, len(tiles.ranges), inputs, device)
     return rgb, alpha, depth, transmittances, weights, ends, allocator.saved((0,), projected.dtype, device)
@@ -172,7 +170,7 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     """Return what `blend_cuda.backward` returns, by the generic kernels."""
     _, depth, transmittances, weights, ends, _ = saved
     v_rgb, v_alpha, v_depth = v_images
-    real, device, channels = interop.real_of(projected), projected.device, backgrounds.shape[1]
+    real, device, channels = launch.real_of(projected), projected.device, backgrounds.shape[1]
     values = VALUES + channels - COLORS + 2 * settings.absgrad
     v_projected = allocator.output(projected.shape, projected.dtype, device)
     v_slots = allocator.workspace((len(tiles.slots), values), projected.dtype, device).zero_()
@@ -180,22 +178,22 @@ def _backward(projected, tiles, backgrounds, settings: BlendSettings, saved, v_i
     upstream: list = [*_span(v_rgb, real)]
     for v in (v_alpha, v_depth):
         v = (torch.zeros_like(depth) if deep else depth.new_empty(0)) if v is None else v.contiguous()
-        upstream.append(interop.flat(v, real))
+        upstream.append(launch.flat(v, real))
     record = wp.types.vector(projected.shape[-1], real)
     inputs = [
-        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, record), interop.view(tiles.slots, wp.int32),
-        interop.view(backgrounds, real),
-        *(interop.flat(t, real) for t in (transmittances, weights, depth)), interop.flat(ends, wp.int32),
-        *upstream, interop.view(v_slots, real),
+        settings.struct(tiles.size, real), *tile_inputs(projected, tiles, record), launch.view(tiles.slots, wp.int32),
+        launch.view(backgrounds, real),
+        *(launch.flat(t, real) for t in (transmittances, weights, depth)), launch.flat(ends, wp.int32),
+        *upstream, launch.view(v_slots, real),
     ]  # fmt: skip
     kernels = blend_cpu.make_kernels(real, tiles.size, channels, settings.absgrad, deep)
     _launch(kernels.backward, len(tiles.ranges), inputs, device)
     inputs = [
-        interop.rows(v_slots, wp.types.vector(values, real)), interop.view(tiles.starts, wp.int32),
-        interop.view(tiles.counts, wp.int32), interop.rows(v_projected, record),
+        launch.rows(v_slots, wp.types.vector(values, real)), launch.view(tiles.starts, wp.int32),
+        launch.view(tiles.counts, wp.int32), launch.rows(v_projected, record),
     ]  # fmt: skip
     tasks, kernel = -(-len(tiles.counts) // SUMMED), make_segments(real, values, projected.shape[-1]).sum_gradients
-    interop.launch(kernel, tasks, inputs, device, cost=5 * SUMMED)
+    launch.launch(kernel, tasks, inputs, device, cost=5 * SUMMED)
     return v_projected
 
 
@@ -284,7 +282,7 @@ def check_tiles(projected: torch.Tensor, tiles: Tiles, width: int, height: int, 
         TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
         ValueError: A shape or device is wrong, or the tiles belong to another image size.
     """
-    sizes = interop.check(projected=(projected, "C N 12"), **backgrounds)
+    sizes = launch.check(projected=(projected, "C N 12"), **backgrounds)
     columns, rows = grid(width, height, tiles.size)
     if len(tiles.ranges) != sizes["C"] * columns * rows:
         raise ValueError(
@@ -359,7 +357,7 @@ def contributions(
     """
     check_tiles(projected, tiles, width, height)
     projected = projected.detach().contiguous()
-    real, device = interop.real_of(projected), projected.device
+    real, device = launch.real_of(projected), projected.device
     settings = BlendSettings(origin, width, height, rule)
     check_slots(tiles)
     ends = composite(projected, tiles, projected.new_zeros(len(projected), 3), settings, save=False)[5]
@@ -368,14 +366,226 @@ def contributions(
     else:
         weights = projected.new_zeros(len(tiles.slots), 2)
         inputs = [
-            settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), interop.view(tiles.slots, wp.int32),
-            interop.flat(ends, wp.int32), interop.view(weights, real),
+            settings.struct(tiles.size, real), *tile_inputs(projected, tiles, real), launch.view(tiles.slots, wp.int32),
+            launch.flat(ends, wp.int32), launch.view(weights, real),
         ]  # fmt: skip
         _launch(blend_cpu.make_kernels(real, tiles.size).contributions, len(tiles.ranges), inputs, device)
     sums, maxima = projected.new_empty(projected.shape[:2]), projected.new_empty(projected.shape[:2])
     inputs = [
-        interop.view(weights, real), interop.view(tiles.starts, wp.int32), interop.view(tiles.counts, wp.int32),
-        interop.flat(sums, real), interop.flat(maxima, real),
+        launch.view(weights, real), launch.view(tiles.starts, wp.int32), launch.view(tiles.counts, wp.int32),
+        launch.flat(sums, real), launch.flat(maxima, real),
     ]  # fmt: skip
-    interop.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
+    launch.launch(make_segments(real).gather_weights, len(tiles.counts), inputs, device)
     return sums, maxima
+
+
+# Compositing of any number of channels: each Gaussian has D values instead of a colour.
+#
+# The kernels of `blend` are compiled for a few numbers of channels (`WIDTHS`). More channels take several passes over
+# the same instances, but no memory besides the image and the gradient (docs/blend.md, section 3).
+
+GEOMETRY = 6
+"""Number of values of a projected Gaussian before its colour; its depth and its box follow the colour."""
+
+
+def width_of(channels: int, widths: tuple[int, ...] = WIDTHS) -> int:
+    """Return the number of channels of a pass: the smallest of ``widths`` with the least number of passes."""
+    passes = -(-channels // widths[-1])
+    return next(width for width in widths if width * passes >= channels)
+
+
+def _width(projected: torch.Tensor, channels: int, absgrad: bool) -> int:
+    """Return the number of channels of a pass over projected Gaussians [C, N, 12].
+
+    The generic kernels hold a tile in local memory, which CUDA reserves for every thread that fits the device: 25 GB on an H100
+    for float64 and 11 channels, 12 GB for 3. So float64 on CUDA has the smallest width, except with ``absgrad``, which needs a
+    single pass.
+    """
+    narrow = projected.is_cuda and not is_native(projected) and not absgrad
+    return width_of(channels, WIDTHS[:1] if narrow else WIDTHS)
+
+
+@functools.cache
+def make_kernels(real, width: int):
+    """Make two kernels: one gives Gaussians the ``width`` channels of a pass, the other takes the pass's gradient apart."""
+    module = f"warpgs.kernels.blend_channels.{real.__name__}.{width}"
+    geometry, box = wp.constant(GEOMETRY), wp.constant(GEOMETRY + COLORS)
+    own, rest = wp.constant(width), wp.constant(GEOMETRY + width)
+
+    @wp.kernel(enable_backward=False, module=module)
+    def color(
+        begin: int, projected: wp.array2d(dtype=real), counts: wp.array(dtype=int), colors: wp.array2d(dtype=real), first: int,
+        # outputs
+        colored: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        if counts[i] > 0:  # rows of others are not read
+            row = i % colors.shape[0]
+            for c in range(own):
+                value = real(0.0)
+                if first + c < colors.shape[1]:
+                    value = colors[row, first + c]
+                colored[i, geometry + c] = value
+            if first == 0:
+                for k in range(geometry):
+                    colored[i, k] = projected[i, k]
+                for k in range(3):
+                    colored[i, rest + k] = projected[i, box + k]
+
+    @wp.kernel(enable_backward=False, module=module)
+    def add(
+        begin: int, v: wp.array2d(dtype=real), counts: wp.array(dtype=int), first: int,
+        # outputs, which the kernel adds to
+        v_projected: wp.array2d(dtype=real), v_colors: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        row = begin + wp.tid()
+        rows = v_colors.shape[0]
+        for camera in range(counts.shape[0] // rows):
+            i = camera * rows + row
+            if counts[i] > 0:  # the gradient of others is 0
+                for k in range(geometry):
+                    v_projected[i, k] = v_projected[i, k] + v[i, k]
+                for k in range(3):
+                    v_projected[i, box + k] = v_projected[i, box + k] + v[i, rest + k]
+                for c in range(wp.min(own, v_colors.shape[1] - first)):
+                    v_colors[row, first + c] = v_colors[row, first + c] + v[i, geometry + c]
+
+    return SimpleNamespace(color=color, add=add)
+
+
+class _Group(NamedTuple):
+    """The channels of one pass."""
+
+    channels: slice
+    """Slice of all D channels."""
+    projected: torch.Tensor
+    """Projected Gaussians that have these channels instead of a colour, shape [C, N, 9 + G]. All groups share the memory."""
+    backgrounds: torch.Tensor
+    """Background of the channels, shape [C, G]: zeros fill up the last group."""
+
+
+def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
+    """Return values [..., F], filled up with zeros to [..., width]."""
+    return torch.nn.functional.pad(values, (0, width - values.shape[-1]))
+
+
+def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
+    """Return the gradient of a pass [..., F] as its kernels take it: generic kernels read ``width`` channels."""
+    return v_image if native or v_image.shape[-1] == width else _padded(v_image, width)
+
+
+def _groups(
+    projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
+) -> Iterator[_Group]:  # fmt: skip
+    """Yield the groups of ``width`` channels, in order; use each group before you request the next."""
+    count, real = colors.shape[-1], launch.real_of(colors)
+    colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
+    inputs = [launch.rows(projected, real), launch.view(tiles.counts, wp.int32), launch.rows(colors, real)]
+    for first in range(0, count, width):
+        channels = slice(first, min(first + width, count))
+        arguments = [*inputs, first, launch.rows(colored, real)]
+        launch.launch(make_kernels(real, width).color, len(tiles.counts), arguments, projected.device, cost=5)
+        yield _Group(channels, colored, _padded(backgrounds[:, channels], width).contiguous())
+
+
+class _BlendChannels(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, projected, colors, backgrounds, tiles, settings):
+        save = any(ctx.needs_input_grad)
+        if save:
+            check_slots(tiles)
+        projected, colors = projected.contiguous(), colors.contiguous()
+        image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
+        found = None
+        for group in _groups(projected, tiles, colors, backgrounds, _width(projected, colors.shape[-1], settings.absgrad)):
+            # the first pass computes everything that does not depend on the channels
+            part = image[..., group.channels]
+            whole = part.shape[-1] == group.backgrounds.shape[-1]
+            rgb, *rest = composite(
+                group.projected, tiles, group.backgrounds, settings, save=save and found is None,
+                image=part if whole or is_native(projected) else None,
+            )  # fmt: skip
+            if rgb is not part:
+                part.copy_(rgb[..., : part.shape[-1]])
+            found = found or rest
+        alpha, depth, *saved = found
+        if save:
+            keep(ctx, projected, colors, backgrounds, image, depth, *saved, *tiles.tensors())
+            ctx.tile_size, ctx.visible, ctx.settings = tiles.size, tiles.visible, settings
+        ctx.set_materialize_grads(False)
+        return image, alpha, depth
+
+    @staticmethod
+    @first_order
+    def backward(ctx, v_image, v_alpha, v_depth):
+        projected, colors, backgrounds, image, *tensors = kept(ctx)
+        shared, tiles = tensors[:5], Tiles(ctx.tile_size, *tensors[5:], ctx.visible)
+        v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
+        v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))
+        real, width = launch.real_of(projected), _width(projected, colors.shape[-1], ctx.settings.absgrad)
+        outputs = [launch.rows(t, real) for t in (v_projected, v_colors)]
+        for group in _groups(projected, tiles, colors, backgrounds, width):
+            first = group.channels.start
+            if v_image is None and first > 0:
+                break
+            saved = [image[..., group.channels], *shared]
+            if is_native(projected) and first > 0:
+                # states hold the channels of one group, so that memory does not grow with the number of channels
+                again = composite(
+                    group.projected, tiles, group.backgrounds, ctx.settings, save=True, image=image[..., :0]
+                )  # fmt: skip
+                saved[1:] = again[2:]
+            v_rgb = None if v_image is None else _given(v_image[..., group.channels], width, is_native(projected))
+            v_images = (v_rgb, v_alpha, v_depth) if first == 0 else (v_rgb, None, None)
+            v = composite_gradients(group.projected, tiles, group.backgrounds, ctx.settings, saved, v_images)
+            arguments = [launch.rows(v, real), launch.view(tiles.counts, wp.int32), first, *outputs]
+            count = v_colors.shape[0] * v_colors.shape[1]
+            launch.launch(make_kernels(real, width).add, count, arguments, v.device, cost=5)
+        v_backgrounds = background_gradient(shared[1], v_image, colors.shape[-1]) if ctx.needs_input_grad[2] else None
+        return v_projected, v_colors, v_backgrounds, None, None
+
+
+def blend_channels(
+    projected: torch.Tensor,
+    tiles: Tiles,
+    colors: torch.Tensor,
+    backgrounds: torch.Tensor,
+    *,
+    width: int,
+    height: int,
+    rule: Rule,
+    deterministic: bool = True,
+    origin: tuple[int, int] = (0, 0),
+    absgrad: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Composite C images of H x W pixels and D channels, as `blend` does with the colours of projected Gaussians.
+
+    Differentiable in ``colors``, ``backgrounds`` and the projected Gaussians, except their colours and boxes. The channels
+    are blended in several passes. The gradients of position, covariance factor and opacity are summed over the passes in a
+    fixed order, so they are as repeatable as those of `blend`.
+
+    Args:
+        projected: Projected Gaussians of `project`, shape [C, N, 12].
+        tiles: Result of `bin_tiles` for the same image size.
+        colors: Finite values of any size and sign, shape [C, N, D] with D at least 1; or [1, N, D], the same for all images.
+        backgrounds: Values behind everything, shape [C, D].
+        width: Image width [px].
+        height: Image height [px].
+        rule: Cut-offs.
+        deterministic: True to sum gradients in a fixed order, see `blend`.
+        origin: Left and top [px] of the window that the tiles were made for.
+        absgrad: True to also sum magnitudes, see `blend`; with more than 11 channels, the magnitudes of the passes are added.
+
+    Returns:
+        The image [C, H, W, D], not clamped; ``alpha`` and ``depth`` [C, H, W], as `blend` returns them.
+
+    Raises:
+        TypeError: A scalar type is neither float32 nor float64, or scalar types differ.
+        ValueError: A shape or device is wrong, there is no channel, or the tiles belong to another image size.
+    """
+    shared = "1" if len(colors) == 1 else "C"
+    check_tiles(projected, tiles, width, height, colors=(colors, f"{shared} N D"), backgrounds=(backgrounds, "C D"))
+    if colors.shape[-1] == 0:
+        raise ValueError(f"colors must have at least one channel, not shape {list(colors.shape)}")
+    settings = BlendSettings(origin, width, height, rule, deterministic, absgrad)
+    return _BlendChannels.apply(*without_gradients(projected, colors, backgrounds), tiles, settings)

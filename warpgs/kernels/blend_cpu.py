@@ -1,8 +1,4 @@
-"""Blending kernels in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
-
-A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches and are
-kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
-"""
+"""Blending kernels in plain Warp, one task per tile; used on the CPU, and for float64 on every device."""
 
 import functools
 from types import SimpleNamespace
@@ -10,16 +6,462 @@ from types import SimpleNamespace
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT
-from warpgs.kernels.blend_contributions import make_contributions
-from warpgs.kernels.blend_cpu_backward import make_backward
-from warpgs.kernels.blend_records import COLORS
-from warpgs.kernels.compiler import ROLLED
-from warpgs.kernels.falloff import ABREAST, STRIP, make_functions
+from warpgs.kernels.falloff import ABREAST, BATCH, COLORS, STRIP, TOGETHER, VALUES, make_batches, make_functions, make_records
+from warpgs.kernels.native import ROLLED
 
-BATCH = 64
+
+@functools.cache
+def make_contributions(real, tile_size: int):
+    """Make the contribution kernel for one scalar type and tile size."""
+    f = make_functions(real)
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
+    strip_reals = wp.types.vector(STRIP, real)
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def contributions(
+        begin: int, settings: f.Blending, projected: wp.array2d(dtype=real), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), ends: wp.array(dtype=int),
+        # outputs, zero on entry: sum and maximum of the weight of each instance
+        weights: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        tile = begin + wp.tid()
+        place = f.place_of(tile, side, settings)
+        camera = place[0]
+        left = place[1]
+        top = place[2]
+        ramp = strip_reals()
+        t = tile_reals()
+        end = tile_ints()
+        last = int(0)
+        for row in range(wp.min(side, settings.height - top)):
+            for lane in range(wp.min(side, settings.width - left)):
+                p = row * side + lane
+                t[p] = real(1.0)
+                end[p] = ends[(camera * settings.height + top + row) * settings.width + left + lane]
+                last = wp.max(last, end[p])
+        for instance in range(ranges[tile, 0], last):
+            i = gaussian_ids[instance]
+            u11 = projected[i, 2]
+            bounds = f.bounds_of(
+                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
+            )
+            for lane in range(strip):
+                ramp[lane] = f.apart(u11 * real(lane))
+            weight_sum = real(0.0)
+            weight_max = real(0.0)
+            for row in range(side):
+                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
+                e2 = projected[i, 4] * dy
+                e12 = f.apart(projected[i, 3] * dy)
+                e22 = f.apart(e2 * e2)
+                for part in range(parts):
+                    x = real(settings.origin_x + left + part * strip) + real(0.5)
+                    start = f.apart(u11 * (x - projected[i, 0])) + e12
+                    if f.reaches(start, u11, e22, bounds[0], bounds[1]):
+                        for lane in range(strip):
+                            p = row * side + part * strip + lane
+                            e1 = start + ramp[lane]
+                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
+                            if alpha >= settings.alpha_cut and instance < end[p]:
+                                w = alpha * t[p]
+                                t[p] = t[p] * (real(1.0) - alpha)
+                                weight_sum += w
+                                weight_max = wp.max(weight_max, w)
+            weights[slots[instance], 0] = weight_sum
+            weights[slots[instance], 1] = weight_max
+
+    return contributions
+
+
+# The backward blending kernel in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
+#
+# The kernel walks the Gaussians of its tile back to front. A Gaussian's whole effect on a pixel is one number d = c .
+# v_rgb + z v_z + v_w (docs/blend.md, section 3). Loops over channels have a static length and are unrolled, so they are
+# kept apart from loops that must stay rolled.
+
+
+@functools.cache
+def make_pixels(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
+    """Make the function that loads the pixels of a tile; arguments are those of `make_backward`."""
+    f = make_functions(real)
+    r = make_records(real, tile_size, channels, absgrad)
+    b = make_batches(real, tile_size, channels)
+    stride = wp.constant(tile_size * (tile_size + 1))
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+    strips = wp.constant(tile_size * (tile_size // STRIP))
+    pixels_of_tile = wp.constant(tile_size * tile_size)
+    bits = wp.constant(tile_size * tile_size - 1)
+    smallest = wp.constant(real(SMALLEST_WEIGHT))
+    at = b.at
+    at_int = b.at_int
+
+    @wp.func(inline=True)
+    def load_channels(o: wp.int32, p: wp.int32, v_rgb: wp.array(dtype=real), pixels: wp.ref[r.Pixels]):
+        """Load the upstream gradient of a pixel's channels, whose first has the index ``o``."""
+        for c in range(wp.static(channels)):
+            pixels.g[c * stride + p] = v_rgb[o + c]
+
+    @wp.func(inline=True)
+    def behind_of(
+        p: wp.int32, camera: wp.int32, backgrounds: wp.array2d(dtype=real), pixels: wp.ref[r.Pixels]
+    ) -> real:  # fmt: skip
+        """Return the product of a pixel's upstream gradient with the background."""
+        product = backgrounds[camera, 0] * at(pixels.g[p])
+        for c in range(1, wp.static(channels)):
+            product = product + backgrounds[camera, c] * at(pixels.g[c * stride + p])
+        return product
+
+    @wp.func(inline=True)
+    def load_depth(
+        o: wp.int32, p: wp.int32, weights: wp.array(dtype=real), depth: wp.array(dtype=real), v_alpha: wp.array(dtype=real),
+        v_depth: wp.array(dtype=real), pixels: wp.ref[r.Pixels],
+    ):  # fmt: skip
+        """Load what the gradients of depth and alpha add to the effect of a Gaussian on a pixel."""
+        if wp.static(deep):
+            v_w = real(0.0)
+            if weights[o] >= smallest:
+                v_z = v_depth[o] / weights[o]
+                pixels.v_z[p] = v_z
+                v_w = -v_z * depth[o]
+            pixels.v_w[p] = v_w + v_alpha[o]
+
+    @wp.func(inline=True)
+    def load_pixels(
+        place: wp.vec3i, settings: f.Blending, backgrounds: wp.array2d(dtype=real), transmittances: wp.array(dtype=real),
+        weights: wp.array(dtype=real), depth: wp.array(dtype=real), ends: wp.array(dtype=int),
+        v_rgb: wp.array(dtype=real), pitch: wp.int32, v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        pixels: wp.ref[r.Pixels], until: wp.ref[b.strip_ints],
+    ) -> wp.int32:  # fmt: skip
+        """Load the pixels, and for each strip one past the last instance that it blended; return the largest of these."""
+        camera = place[0]
+        left = place[1]
+        top = place[2]
+        rows = wp.min(side, settings.height - top)
+        across = wp.min(side, settings.width - left)
+        row = int(0)
+        while row < rows:
+            first = (camera * settings.height + top + row) * settings.width + left
+            for part in range(parts):
+                base = ((part * side + row) * strip) & bits
+                o = wp.max(first + part * strip, 0)
+                if across == side:
+                    for lane in range(strip):
+                        pixels.t[base + lane] = transmittances[o + lane]
+                        pixels.end[base + lane] = ends[o + lane]
+                lane = int(0)
+                while lane < wp.min(across - part * strip, strip):
+                    q = first + part * strip + lane
+                    if q < 0:
+                        break  # never; but vectorised, these loads would be slow gathers
+                    p = wp.max(base + lane, 0)
+                    lane += 1
+                    if across < side:
+                        pixels.t[p] = transmittances[q]
+                        pixels.end[p] = ends[q]
+                    load_channels(q * pitch, p, v_rgb, pixels)
+                    load_depth(q, p, weights, depth, v_alpha, v_depth, pixels)
+            row += 1
+        for p in range(pixels_of_tile):
+            pixels.behind[p] = at(pixels.t[p]) * behind_of(p, camera, backgrounds, pixels)
+        last = int(0)
+        for s in range(strips):
+            end = int(0)
+            for lane in range(strip):
+                end = wp.max(end, at_int(pixels.end[s * strip + lane]))
+            until[s] = end
+            last = wp.max(last, end)
+        return last
+
+    return load_pixels
+
+
+@functools.cache
+def make_walk(real, tile_size: int, channels: int, absgrad: bool, deep: bool):
+    """Make the functions that walk past one Gaussian and sum its gradient; arguments are those of `make_backward`."""
+    f = make_functions(real)
+    r = make_records(real, tile_size, channels, absgrad)
+    b = make_batches(real, tile_size, channels)
+    count = VALUES + channels - COLORS + 2 * absgrad
+    values = wp.constant(count)
+    group_bits = wp.constant(TOGETHER - 1)
+    together_values = wp.constant(TOGETHER * count)
+    stride = wp.constant(tile_size * (tile_size + 1))
+    batch = wp.constant(BATCH)
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+    bits = wp.constant(tile_size * (tile_size // STRIP) - 1)
+    row_bits = wp.constant(tile_size - 1)
+    column_bits = wp.constant(tile_size * STRIP - 1)
+    half = wp.constant(STRIP // 2)
+    abreast = wp.constant(ABREAST)
+    at = b.at
+    at_int = b.at_int
+
+    @wp.func(inline=True)
+    def effect(j: wp.int32, p: wp.int32, g: wp.ref[b.Batch], pixels: wp.ref[r.Pixels]) -> real:
+        """Return the effect d of a Gaussian on a pixel."""
+        product = at(g.color[j]) * at(pixels.g[p])
+        for c in range(1, wp.static(channels)):
+            product = product + at(g.color[c * batch + j]) * at(pixels.g[c * stride + p])
+        if wp.static(deep):
+            return product + at(g.z[j]) * at(pixels.v_z[p]) + at(pixels.v_w[p])
+        return product
+
+    @wp.func(inline=True)
+    def add_channels(w: real, p: wp.int32, lane: wp.int32, pixels: wp.ref[r.Pixels], s: wp.ref[r.Gradient]):
+        """Add a pixel's contribution to the gradient of the channels and of the depth."""
+        for c in range(wp.static(channels)):
+            s.color[c * strip + lane] = at(s.color[c * strip + lane]) + w * at(pixels.g[c * stride + p])
+        if wp.static(deep):
+            s.z[lane] = at(s.z[lane]) + w * at(pixels.v_z[p])
+
+    @wp.func(inline=True)
+    def add_magnitudes(u12: real, u22: real, v_e1: real, v_y: real, lane: wp.int32, s: wp.ref[r.Gradient]):
+        """Add the magnitudes of a pixel's contributions to the gradient of the mean, if they are requested."""
+        if wp.static(absgrad):
+            x = wp.static(channels * STRIP) + lane
+            y = wp.static((channels + 1) * STRIP) + lane
+            s.color[x] = at(s.color[x]) + wp.abs(v_e1)
+            s.color[y] = at(s.color[y]) + wp.abs(u12 * v_e1 + u22 * u22 * v_y)
+
+    @wp.func(inline=True)
+    def walk(
+        j: wp.int32, instance: wp.int32, left: wp.int32, settings: f.Blending, g: wp.ref[b.Batch], rows: wp.ref[b.Rows],
+        pixels: wp.ref[r.Pixels], shades: wp.ref[r.Shades],
+    ):  # fmt: skip
+        """Walk back past a Gaussian: find its weights and the gradients of its falloff, and what lies before it."""
+        u11 = at(g.u11[j])
+        opacity = at(g.opacity[j])
+        e1 = f.abreast()
+        e22 = f.abreast()
+        for part in range(parts):
+            row = at_int(g.begin[part * batch + j])
+            end = at_int(g.end[part * batch + j])
+            at_left = f.apart(u11 * (real(left + part * strip) + real(0.5) - at(g.x[j])))
+            # Falloffs have a loop of their own, several strips at a time, since each is a long chain of dependent operations.
+            k = int(0)
+            while k < end - row:
+                for lane in range(strip):
+                    for n in range(abreast):
+                        e1[n] = at_left + at(rows.e12[(row + k + n) & row_bits]) + at(rows.ramp[lane])
+                        e22[n] = at(rows.e22[(row + k + n) & row_bits])
+                    found = f.falloffs(wp.cw_mul(e1, e1) + e22)
+                    for n in range(abreast):
+                        shades.falloff[(k + n) * strip + lane] = found[n]
+                k += abreast  # the last few may lie beyond the end; their values are not read
+            k = int(0)
+            while row < end:
+                o = (part * side + row) & bits
+                q = k & column_bits
+                row += 1
+                k += strip
+                for lane in range(strip):
+                    p = o * strip + lane
+                    falloff = at(shades.falloff[q + lane])
+                    raw = opacity * falloff
+                    alpha = wp.where(settings.alpha_max < raw, settings.alpha_max, raw)
+                    blended = alpha >= settings.alpha_cut and instance < at_int(pixels.end[p])
+                    alpha = wp.where(blended, alpha, real(0.0))
+                    slope = wp.where(blended and raw <= settings.alpha_max, falloff, real(0.0))
+                    inverse = real(1.0) / (real(1.0) - alpha)
+                    t = at(pixels.t[p])
+                    behind = at(pixels.behind[p])
+                    d = effect(j, p, g, pixels)
+                    before = t * inverse
+                    w = alpha * before
+                    shades.v[p] = (t * d - behind) * inverse * slope
+                    shades.w[p] = w
+                    pixels.t[p] = before
+                    pixels.behind[p] = behind + w * d
+
+    @wp.func(inline=True)
+    def sum_up(
+        j: wp.int32, left: wp.int32, g: wp.ref[b.Batch], rows: wp.ref[b.Rows], pixels: wp.ref[r.Pixels],
+        shades: wp.ref[r.Shades],
+    ) -> r.Gradient:  # fmt: skip
+        """Return the sums over the strips that a Gaussian of the batch reaches."""
+        s = r.Gradient()
+        u11 = at(g.u11[j])
+        u12 = at(g.u12[j])
+        u22 = at(g.u22[j])
+        for part in range(parts):
+            row = at_int(g.begin[part * batch + j])
+            end = at_int(g.end[part * batch + j])
+            dx = real(left + part * strip) + real(0.5) - at(g.x[j])
+            at_left = f.apart(u11 * dx)
+            while row < end:
+                o = (part * side + row) & bits
+                dy = at(rows.dy[row & row_bits])
+                start = at_left + at(rows.e12[row & row_bits])
+                row += 1
+                for lane in range(strip):
+                    p = o * strip + lane
+                    v = at(shades.v[p])
+                    v_e1 = v * (start + at(rows.ramp[lane]))
+                    v_y = v * dy
+                    s.e1[lane] = at(s.e1[lane]) + v_e1
+                    s.y[lane] = at(s.y[lane]) + v_y
+                    s.xx[lane] = at(s.xx[lane]) + v_e1 * (dx + real(lane))
+                    s.xy[lane] = at(s.xy[lane]) + v_e1 * dy
+                    s.yy[lane] = at(s.yy[lane]) + v_y * dy
+                    s.opacity[lane] = at(s.opacity[lane]) + v
+                    add_channels(at(shades.w[p]), p, lane, pixels, s)
+                    add_magnitudes(u12, u22, v_e1, v_y, lane, s)
+        return s
+
+    @wp.func(inline=True)
+    def hold_channels(o: wp.int32, lane: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+        """Keep the sums of the channels at a place in half a strip."""
+        for k in range(wp.static(channels + 2 * absgrad)):
+            held.halves[o + (6 + k) * half] = at(s.color[k * strip + lane]) + at(s.color[k * strip + half + lane])
+
+    @wp.func(inline=True)
+    def hold(j: wp.int32, s: wp.ref[r.Gradient], held: wp.ref[r.Held]):
+        """Keep the sums of a Gaussian until a group is complete; the two halves of a strip are added here."""
+        o = (j & group_bits) * (values * half)
+        for lane in range(half):
+            held.halves[o + lane] = at(s.e1[lane]) + at(s.e1[half + lane])
+            held.halves[o + 1 * half + lane] = at(s.y[lane]) + at(s.y[half + lane])
+            held.halves[o + 2 * half + lane] = at(s.xx[lane]) + at(s.xx[half + lane])
+            held.halves[o + 3 * half + lane] = at(s.xy[lane]) + at(s.xy[half + lane])
+            held.halves[o + 4 * half + lane] = at(s.yy[lane]) + at(s.yy[half + lane])
+            held.halves[o + 5 * half + lane] = at(s.opacity[lane]) + at(s.opacity[half + lane])
+            held.halves[o + (values - 1) * half + lane] = at(s.z[lane]) + at(s.z[half + lane])
+            hold_channels(o + lane, lane, s, held)
+
+    @wp.func(inline=True)
+    def fold(held: wp.ref[r.Held]):
+        """Add up the sums that `hold` keeps of each Gaussian, always in the same order."""
+        for n in range(together_values):
+            o = n * half
+            held.totals[n] = (at(held.halves[o]) + at(held.halves[o + 2])) + (at(held.halves[o + 1]) + at(held.halves[o + 3]))
+
+    @wp.func(inline=True)
+    def store(
+        j: wp.int32, g: wp.ref[b.Batch], held: wp.ref[r.Held], slot: wp.int32, v_slots: wp.array2d(dtype=real)
+    ):  # fmt: skip
+        """Store the gradient of an instance: the sums times factors that they share."""
+        o = (j & group_bits) * values
+        u11 = at(g.u11[j])
+        u22 = at(g.u22[j])
+        opacity = at(g.opacity[j])
+        v_e1 = opacity * at(held.totals[o + 0])
+        v_e2 = opacity * u22 * at(held.totals[o + 1])
+        v_slots[slot, 0] = u11 * v_e1
+        product = u22 * v_e2
+        product = wp.where(real(1.0e30) < product, real(wp.inf), product)  # so that it is rounded, and not fused with the sum
+        v_slots[slot, 1] = at(g.u12[j]) * v_e1 + product
+        v_slots[slot, 2] = -opacity * at(held.totals[o + 2])
+        v_slots[slot, 3] = -opacity * at(held.totals[o + 3])
+        v_slots[slot, 4] = -opacity * u22 * at(held.totals[o + 4])
+        for k in range(5, values):
+            v_slots[slot, k] = at(held.totals[o + k])
+        if wp.static(absgrad):  # behind the depth, which is the last total
+            v_slots[slot, values - 3] = at(held.totals[o + values - 1])
+            v_slots[slot, values - 2] = opacity * wp.abs(u11) * at(held.totals[o + values - 3])
+            v_slots[slot, values - 1] = opacity * at(held.totals[o + values - 2])
+
+    return SimpleNamespace(walk=walk, sum_up=sum_up, hold=hold, fold=fold, store=store)
+
+
+@functools.cache
+def make_backward(real, tile_size: int, channels: int, absgrad: bool = False, deep: bool = True):
+    """Make the kernel.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        tile_size: Side of a tile [px].
+        channels: Number of channels.
+        absgrad: As in `BlendSettings`.
+        deep: False where depth and alpha have no gradient; their data is then not read.
+    """
+    f = make_functions(real)
+    r = make_records(real, tile_size, channels, absgrad)
+    b = make_batches(real, tile_size, channels)
+    load_pixels = make_pixels(real, tile_size, channels, absgrad, deep)
+    m = make_walk(real, tile_size, channels, absgrad, deep)
+    side = wp.constant(tile_size)
+    batch = wp.constant(BATCH)
+    bits = wp.constant(BATCH - 1)
+    together = wp.constant(TOGETHER)
+    # values of a row of gradients that are at most 64 bytes apart
+    apart = wp.constant(max(1, 64 // ((4 if real is wp.float32 else 8) * channels)))
+    touches = wp.constant(-(-(tile_size - 1) // max(1, 64 // ((4 if real is wp.float32 else 8) * channels))) + 1)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=ROLLED)
+    def backward(
+        begin: int, settings: f.Blending, projected: wp.array(dtype=b.record), ranges: wp.array2d(dtype=int),
+        gaussian_ids: wp.array(dtype=int), slots: wp.array(dtype=int), backgrounds: wp.array2d(dtype=real),
+        transmittances: wp.array(dtype=real), weights: wp.array(dtype=real), depth: wp.array(dtype=real),
+        ends: wp.array(dtype=int), v_rgb: wp.array(dtype=real), pitch: int,
+        v_alpha: wp.array(dtype=real), v_depth: wp.array(dtype=real),
+        # outputs, zero on entry
+        v_slots: wp.array2d(dtype=real),
+    ):  # fmt: skip
+        tile = begin + wp.tid()
+        place = f.place_of(tile, side, settings)
+        left = settings.origin_x + place[1]
+        top = settings.origin_y + place[2]
+        pixels = r.Pixels()
+        until = b.strip_ints()
+        gaussians = b.Batch()
+        rows = b.Rows()
+        shades = r.Shades()
+        held = r.Held()
+        first = ranges[tile, 0]
+        # One value of each cache line in a loop of its own, so that many loads are under way at once; this is overwritten.
+        corner = (place[0] * settings.height + place[2]) * settings.width + place[1]
+        across = wp.min(side, settings.width - place[1])
+        for row in range(side):
+            o = corner + wp.min(row, settings.height - place[2] - 1) * settings.width
+            if o < 0:
+                break  # never; but vectorised, these loads would be slow gathers
+            until[row] = ends[o]
+            shades.w[row * (touches + 1) + touches] = transmittances[o]
+            for part in range(touches):
+                shades.w[row * (touches + 1) + part] = v_rgb[(o + wp.min(part * apart, across - 1)) * pitch]
+        last = load_pixels(
+            place, settings, backgrounds, transmittances, weights, depth, ends, v_rgb, pitch, v_alpha, v_depth, pixels, until
+        )
+        while last > first:
+            count = wp.min(batch, last - first)
+            b.load(projected, gaussian_ids, last - 1, count, settings.whole_tiles, gaussians)
+            b.find_rows(left, top, last - 1, count, until, gaussians)
+            j = int(0)
+            while j < count:
+                last -= 1
+                b.find_row_values(j & bits, top, gaussians, rows)
+                m.walk(j & bits, last, left, settings, gaussians, rows, pixels, shades)
+                # Apart from the walk, since both together would need more than 16 registers.
+                sums = m.sum_up(j & bits, left, gaussians, rows, pixels, shades)
+                m.hold(j & bits, sums, held)
+                j += 1
+                if j % together == 0 or j == count:
+                    m.fold(held)
+                    k = (j - 1) // together * together
+                    while k < j:
+                        m.store(k & bits, gaussians, held, slots[last + j - 1 - k], v_slots)
+                        k += 1
+
+    return backward
+
+
+# Blending kernels in plain Warp, one task per tile; used on the CPU, and for float64 on every device.
+#
+# A task cuts the rows of its tile into strips. The innermost loops run over the pixels of one strip without branches
+# and are kept rolled, so that the compiler vectorises them (docs/blend.md, section 5).
+
+FORWARD_BATCH = 64
 """Gaussians that the forward pass processes at a time, strip by strip; a power of 2, since BATCH - 1 masks indices."""
-TOGETHER = 16
-"""Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
+FORWARD_TOGETHER = 16
+"""Gaussians of a batch that are tested together, in a loop that vectorises; divides `FORWARD_BATCH`."""
 
 
 @functools.cache
@@ -32,14 +474,14 @@ def make_forward(real, tile_size: int, channels: int):
     tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
     strip_reals = wp.types.vector(STRIP, real)
     strip_ints = wp.types.vector(STRIP, wp.int32)
-    batch_reals = wp.types.vector(BATCH, real)
-    batch_ints = wp.types.vector(BATCH, wp.int32)
-    batch_strips = wp.types.vector(BATCH * STRIP, real)
+    batch_reals = wp.types.vector(FORWARD_BATCH, real)
+    batch_ints = wp.types.vector(FORWARD_BATCH, wp.int32)
+    batch_strips = wp.types.vector(FORWARD_BATCH * STRIP, real)
     record = wp.types.vector(9 + channels, real)
     # of several channels, one after the other
     tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
     strip_channels = wp.types.vector(2 * channels * STRIP, real)
-    batch_channels = wp.types.vector(channels * BATCH, real)
+    batch_channels = wp.types.vector(channels * FORWARD_BATCH, real)
     place_z = wp.constant(6 + channels)
     tile_stride = wp.constant(tile_size * (tile_size + 1))
     per_pixel = wp.constant(channels)
@@ -49,10 +491,10 @@ def make_forward(real, tile_size: int, channels: int):
     strip = wp.constant(STRIP)
     parts = wp.constant(tile_size // STRIP)
     abreast = wp.constant(ABREAST)
-    batch = wp.constant(BATCH)
-    bits = wp.constant(BATCH - 1)
+    batch = wp.constant(FORWARD_BATCH)
+    bits = wp.constant(FORWARD_BATCH - 1)
     outside = wp.constant(real(-1.0))
-    together = wp.constant(TOGETHER)
+    together = wp.constant(FORWARD_TOGETHER)
     smallest = wp.constant(real(SMALLEST_WEIGHT))
 
     # Loops over channels have a static length and are unrolled, so they are kept apart from loops that must stay rolled.

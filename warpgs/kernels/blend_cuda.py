@@ -12,13 +12,12 @@ import torch
 import warp as wp
 
 from warpgs.constants import SMALLEST_WEIGHT, TILE_SIZE
-from warpgs.kernels.blend_records import COLORS
-from warpgs.kernels.blend_settings import BlendSettings, make_struct
+from warpgs.device import FLOAT, StepSizes
+from warpgs.kernels import launch
+from warpgs.kernels.falloff import COLORS, BlendSettings, make_struct
+from warpgs.kernels.launch import TORCH, Allocator
+from warpgs.kernels.native import source
 from warpgs.kernels.tiles import Tiles, grid
-from warpgs.runtime import interop
-from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.runtime.cuda_source import source
-from warpgs.runtime.step_sizes import FLOAT, StepSizes
 
 CHUNKS = (64, 128, 256)
 """Instances for one warp of the backward pass, multiples of 32. Small images use the first number, to have enough warps. Larger
@@ -217,12 +216,12 @@ def make_backward(
     return SimpleNamespace(backward=backward, gather=gather)
 
 
-def _floats(*tensors: torch.Tensor) -> list[interop.View]:
-    return [interop.flat(t, wp.float32) for t in tensors]
+def _floats(*tensors: torch.Tensor) -> list[launch.View]:
+    return [launch.flat(t, wp.float32) for t in tensors]
 
 
-def _ints(*tensors: torch.Tensor) -> list[interop.View]:
-    return [interop.flat(t, wp.int32) for t in tensors]
+def _ints(*tensors: torch.Tensor) -> list[launch.View]:
+    return [launch.flat(t, wp.int32) for t in tensors]
 
 
 def chunk_of(tiles: int, deterministic: bool) -> int:
@@ -275,15 +274,15 @@ def forward(
     order = allocator.workspace((RANKS, count), torch.int32, device)
     threads = -(-count // ORDER_THREADS) * ORDER_THREADS
     inputs = [*_ints(tiles.ranges), count, *_ints(counts, order)]
-    interop.launch(k.order_tiles, threads, inputs, device, block_dim=ORDER_THREADS)
+    launch.launch(k.order_tiles, threads, inputs, device, block_dim=ORDER_THREADS)
     inputs = [
         settings.struct(tiles.size, wp.float32), chunk, *_floats(projected),
         *_ints(counts, order, tiles.ranges, tiles.gaussian_ids), *_floats(backgrounds),
-        interop.rows(rgb, wp.float32), *_floats(alpha, depth, transmittances, weights), *_ints(ends),
-        interop.view(states, wp.float32),
+        launch.rows(rgb, wp.float32), *_floats(alpha, depth, transmittances, weights), *_ints(ends),
+        launch.view(states, wp.float32),
     ]  # fmt: skip
     per = 2 if tiles.gaussian_ids.shape[0] >= LARGE_GAUSSIAN * tiles.visible else 1
-    interop.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
+    launch.launch(make_forward(tiles.size, save, per, channels), count * pixels // per, inputs, device, block_dim=32 * WARPS)
     return rgb, alpha, depth, transmittances, weights, ends, states
 
 
@@ -324,14 +323,14 @@ def backward(
         v_slots = v_projected.zero_().view(-1, projected.shape[2])
     inputs = [
         settings.struct(tiles.size, wp.float32), count, tiles.ranges.shape[0], *_floats(projected),
-        *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots), interop.view(tiles.total, wp.int64),
+        *_ints(tiles.tile_ids, tiles.ranges, tiles.gaussian_ids, tiles.slots), launch.view(tiles.total, wp.int64),
         *_floats(backgrounds),
-        interop.rows(rgb, wp.float32), *_floats(depth, transmittances, weights), *_ints(ends), interop.view(states, wp.float32),
-        interop.rows(v_rgb, wp.float32), *_floats(v_alpha, v_depth), interop.view(v_slots, wp.float32),
+        launch.rows(rgb, wp.float32), *_floats(depth, transmittances, weights), *_ints(ends), launch.view(states, wp.float32),
+        launch.rows(v_rgb, wp.float32), *_floats(v_alpha, v_depth), launch.view(v_slots, wp.float32),
     ]  # fmt: skip
-    interop.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
-    inputs = [*_floats(projected), *_ints(tiles.starts, tiles.counts), interop.view(v_slots, wp.float32), *_floats(v_projected)]
-    interop.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
+    launch.launch(k.backward, 32 * -(-count // chunk), inputs, device, block_dim=32 * WARPS)
+    inputs = [*_floats(projected), *_ints(tiles.starts, tiles.counts), launch.view(v_slots, wp.float32), *_floats(v_projected)]
+    launch.launch(k.gather, -(-tiles.counts.shape[0] // 256) * 256, inputs, device)
     return v_projected
 
 
@@ -350,7 +349,7 @@ def instance_weights(projected: torch.Tensor, tiles: Tiles, settings: BlendSetti
         *_ints(ends), *_floats(weights),
     ]  # fmt: skip
     pixels = tiles.size * tiles.size
-    interop.launch(
+    launch.launch(
         make_kernels(tiles.size).contributions, tiles.ranges.shape[0] * pixels, inputs, projected.device, block_dim=pixels
     )
     return weights

@@ -1,11 +1,68 @@
-"""Functions that all CPU blending passes share, so that their bits agree: tiles, a Gaussian's pixels and its falloff."""
+"""What the blending kernels share: settings, the falloff of a Gaussian, batches and records."""
 
 import functools
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import warp as wp
 
-from warpgs.kernels.blend_settings import make_struct
+from warpgs.constants import Rule
+from warpgs.kernels.tiles import grid
+
+
+@functools.cache
+def make_struct(real):
+    """Make the struct that all blending kernels of one scalar type take."""
+
+    @wp.struct
+    class Blending:
+        """Settings of a blending pass."""
+
+        origin_x: wp.int32  # left of the window [px]
+        origin_y: wp.int32  # top of the window [px]
+        width: wp.int32  # of the window [px]
+        height: wp.int32  # of the window [px]
+        columns: wp.int32  # tiles in a row of the window
+        tiles: wp.int32  # tiles of the window
+        alpha_cut: real  # smallest alpha that is blended
+        alpha_max: real  # largest alpha
+        stop: real  # transmittance below which a pixel is finished
+        inclusive: wp.int32  # 1 to blend the Gaussian that crosses the stop, 0 to drop it
+        whole_tiles: wp.int32  # 1 where a Gaussian reaches all pixels of its tiles, 0 where its box bounds them
+
+    return Blending
+
+
+@dataclass(frozen=True)
+class BlendSettings:
+    """Window, cut-offs and order of sums."""
+
+    origin: tuple[int, int]
+    """Left and top of the window [px], at the corner of a tile."""
+    width: int
+    """Width of the window [px]."""
+    height: int
+    """Height of the window [px]."""
+    rule: Rule
+    """Cut-offs."""
+    deterministic: bool = True
+    """True to sum gradients in a fixed order on every device."""
+    absgrad: bool = False
+    """True to sum magnitudes of the mean's gradient over pixels, too; the gradient of the box holds these sums."""
+
+    @functools.lru_cache(maxsize=256)  # noqa: B019 - to make it takes 20 us, and steps ask for the same ones again
+    def struct(self, tile_size: int, real):
+        """Return the struct for kernels of one scalar type and tiles of ``tile_size`` px; callers must not change it."""
+        columns, rows = grid(self.width, self.height, tile_size)
+        found = make_struct(real)()
+        found.origin_x, found.origin_y = self.origin
+        found.width, found.height = self.width, self.height
+        found.columns, found.tiles = columns, columns * rows
+        rule = self.rule
+        found.alpha_cut, found.alpha_max, found.stop = rule.alpha_cut, rule.alpha_max, rule.transmittance_stop
+        found.inclusive, found.whole_tiles = int(rule.inclusive_stop), int(rule.square_sigma > 0)
+        return found
+
 
 STRIP = 8
 """Pixels of a row that are processed together. With more, the sums of a strip would not fit the 16 registers of AVX2."""
@@ -106,3 +163,240 @@ def make_functions(real):
         Blending=Blending, place_of=place_of, apart=apart, bounds_of=bounds_of, reaches=reaches,
         falloff=make_falloff(real), falloffs=make_falloffs(real, ABREAST), abreast=wp.types.vector(ABREAST, real),
     )  # fmt: skip
+
+
+BATCH = 64
+"""Gaussians that are copied together, so that many loads overlap."""
+TOGETHER = 16
+"""Gaussians of a batch that are tested together, in a loop that vectorises; divides `BATCH`."""
+
+
+@functools.cache
+def make_batches(real, tile_size: int, channels: int):
+    """Make the record of a batch and its functions, for one scalar type, tile size and number of channels.
+
+    A tile is stored in columns as wide as a strip (`STRIP` pixels), one after the other. The strips of a column that a Gaussian
+    reaches are contiguous, since an ellipse is convex. So only the first of their rows and one past the last are stored.
+    """
+    f = make_functions(real)
+    record = wp.types.vector(9 + channels, real)
+    batch_reals = wp.types.vector(BATCH, real)
+    batch_channels = wp.types.vector(channels * BATCH, real)
+    batch_rows = wp.types.vector((tile_size // STRIP) * BATCH, wp.int32)
+    row_reals = wp.types.vector(tile_size, real)
+    strip_reals = wp.types.vector(STRIP, real)
+    lane_reals = wp.types.vector(TOGETHER, real)
+    strip_ints = wp.types.vector(tile_size * (tile_size // STRIP), wp.int32)
+    batch = wp.constant(BATCH)
+    together = wp.constant(TOGETHER)
+    side = wp.constant(tile_size)
+    strip = wp.constant(STRIP)
+    parts = wp.constant(tile_size // STRIP)
+    bits = wp.constant(BATCH - 1)
+    place_z = wp.constant(6 + channels)
+
+    @wp.struct
+    class Batch:
+        """Values of the Gaussians of a batch."""
+
+        x: batch_reals
+        y: batch_reals
+        u11: batch_reals
+        u12: batch_reals
+        u22: batch_reals
+        opacity: batch_reals
+        color: batch_channels
+        z: batch_reals
+        aside: batch_reals  # see `falloff.make_functions`
+        limit: batch_reals
+        begin: batch_rows  # first row that is reached in each column of strips
+        end: batch_rows  # and one past the last
+
+    @wp.struct
+    class Rows:
+        """Values of a Gaussian on each row of a tile."""
+
+        dy: row_reals  # from the mean [px]
+        e12: row_reals  # u12 dy
+        e22: row_reals  # square of e2
+        ramp: strip_reals  # e1 of the pixels of a strip, less that of the first pixel
+
+    @wp.func(inline=True)
+    def at(entry: wp.ref[real]) -> real:
+        """Return an entry of a vector of a record that is taken by reference; Warp would copy the vector otherwise."""
+        return entry
+
+    @wp.func(inline=True)
+    def at_int(entry: wp.ref[wp.int32]) -> wp.int32:
+        return entry
+
+    @wp.func(inline=True)
+    def load_channels(projected: wp.array(dtype=record), i: wp.int32, j: wp.int32, b: wp.ref[Batch]):
+        """Load the channels of a Gaussian."""
+        for c in range(wp.static(channels)):
+            b.color[c * batch + j] = projected[i][6 + c]
+
+    @wp.func(inline=True)
+    def load(
+        projected: wp.array(dtype=record), gaussian_ids: wp.array(dtype=int), last: wp.int32, count: wp.int32,
+        whole_tiles: wp.int32, b: wp.ref[Batch],
+    ):  # fmt: skip
+        """Load the Gaussians of ``count`` instances, from the last on backwards."""
+        j = int(0)
+        while j < count:  # a loop of its own, so that many loads are under way at once
+            i = gaussian_ids[wp.max(last - j, 0)]
+            if i < 0:
+                break  # never true; a loop that may end early is not vectorised, which here avoids slow gathers
+            b.x[j & bits] = projected[i][0]
+            j += 1
+        j = int(0)
+        while j < count:
+            i = gaussian_ids[wp.max(last - j, 0)]
+            if i < 0:
+                break  # never
+            b.y[j & bits] = projected[i][1]
+            b.u11[j & bits] = projected[i][2]
+            b.u12[j & bits] = projected[i][3]
+            b.u22[j & bits] = projected[i][4]
+            b.opacity[j & bits] = projected[i][5]
+            load_channels(projected, i, j & bits, b)
+            b.z[j & bits] = projected[i][place_z]
+            bounds = f.bounds_of(
+                at(b.x[j & bits]), projected[i][1], projected[i][2], projected[i][4],
+                projected[i][place_z + 1], projected[i][place_z + 2], whole_tiles,
+            )  # fmt: skip
+            b.aside[j & bits] = bounds[0]
+            b.limit[j & bits] = bounds[1]
+            j += 1
+
+    @wp.func(inline=True)
+    def find_rows(
+        left: wp.int32, top: wp.int32, last: wp.int32, count: wp.int32, until: wp.ref[strip_ints],
+        b: wp.ref[Batch],
+    ):  # fmt: skip
+        """Find the rows that the Gaussians reach; an instance skips strips whose ``until`` is not above its number."""
+        e12 = lane_reals()
+        e22 = lane_reals()
+        group = int(0)
+        while group < count:
+            j = group & bits
+            group += together
+            for part in range(parts):
+                for lane in range(together):
+                    b.begin[part * batch + j + lane] = side
+                    b.end[part * batch + j + lane] = 0
+            for row in range(side):
+                y = real(top + row) + real(0.5)
+                for lane in range(together):
+                    dy = y - at(b.y[j + lane])
+                    e2 = at(b.u22[j + lane]) * dy
+                    e12[lane] = f.apart(at(b.u12[j + lane]) * dy)
+                    e22[lane] = f.apart(e2 * e2)
+                for part in range(parts):
+                    x = real(left + part * strip) + real(0.5)
+                    strip_end = at_int(until[part * side + row])
+                    for lane in range(together):
+                        u11 = at(b.u11[j + lane])
+                        start = f.apart(u11 * (x - at(b.x[j + lane]))) + e12[lane]
+                        seen = last - (j + lane) < strip_end
+                        hit = f.reaches(start, u11, e22[lane], at(b.aside[j + lane]), at(b.limit[j + lane])) and seen
+                        o = part * batch + j + lane
+                        b.begin[o] = wp.min(at_int(b.begin[o]), wp.where(hit, row, side))
+                        b.end[o] = wp.max(at_int(b.end[o]), wp.where(hit, row + 1, 0))
+
+    @wp.func(inline=True)
+    def find_row_values(j: wp.int32, top: wp.int32, b: wp.ref[Batch], rows: wp.ref[Rows]):
+        """Compute the values of a Gaussian on all rows."""
+        u11 = at(b.u11[j])
+        u12 = at(b.u12[j])
+        u22 = at(b.u22[j])
+        y = at(b.y[j])
+        for row in range(side):
+            dy = real(top + row) + real(0.5) - y
+            e2 = u22 * dy
+            rows.dy[row] = dy
+            rows.e12[row] = f.apart(u12 * dy)
+            rows.e22[row] = f.apart(e2 * e2)
+        for lane in range(strip):
+            rows.ramp[lane] = f.apart(u11 * real(lane))
+
+    return SimpleNamespace(
+        record=record, Batch=Batch, Rows=Rows, strip_ints=strip_ints, at=at, at_int=at_int, load=load, find_rows=find_rows,
+        find_row_values=find_row_values,
+    )  # fmt: skip
+
+
+COLORS = 3
+"""Number of channels of a projected Gaussian as `project` makes it: a colour."""
+VALUES = 10
+"""Number of gradient values of an instance with a colour: all values of a projected Gaussian but the last two, its box."""
+WIDTHS = (COLORS, 7, 11)
+"""Numbers of channels for which kernels are compiled: with nine other values a projected Gaussian fills whole 16-byte loads."""
+
+
+@functools.cache
+def make_records(real, tile_size: int, channels: int, absgrad: bool):
+    """Make the records for one scalar type, tile size and number of channels.
+
+    A tile is stored in columns as wide as a strip, one after the other; entries of its pixels follow in that order. Vectors
+    are one row longer than the tile: see `blend_cpu.make_forward`. Channels are stored one after the other. In a gradient, the
+    two magnitudes follow the channels if ``absgrad`` is set.
+    """
+    # The compiler puts records 8 bytes before a cache line; with this vector in front, no strip lies in two lines.
+    lead_reals = wp.types.vector(2, real)
+    trail_reals = wp.types.vector(14, real)
+    tile_reals = wp.types.vector(tile_size * (tile_size + 1), real)
+    tile_ints = wp.types.vector(tile_size * (tile_size + 1), wp.int32)
+    column_reals = wp.types.vector((tile_size + ABREAST) * STRIP, real)
+    strip_reals = wp.types.vector(STRIP, real)
+    tile_channels = wp.types.vector(channels * tile_size * (tile_size + 1), real)
+    strip_channels = wp.types.vector((channels + 2 * absgrad) * STRIP, real)
+
+    count = VALUES + channels - COLORS + 2 * absgrad
+    half_reals = wp.types.vector(TOGETHER * count * (STRIP // 2), real)
+    total_reals = wp.types.vector(TOGETHER * count, real)
+
+    @wp.struct
+    class Pixels:
+        """Values of each pixel of a tile."""
+
+        lead: lead_reals
+        t: tile_reals  # transmittance behind the current instance, then before it
+        behind: tile_reals  # sum of w d over what lies behind, background included
+        g: tile_channels  # upstream gradient of the channels
+        v_z: tile_reals
+        v_w: tile_reals
+        end: tile_ints  # one past the last instance that was blended
+        trail: trail_reals
+
+    @wp.struct
+    class Shades:
+        """Gradient and weight of the current instance at each pixel that it reaches."""
+
+        lead: lead_reals
+        falloff: column_reals  # of one column of strips, and of a few rows beyond it
+        v: tile_reals  # gradient of the falloff
+        w: tile_reals  # blending weight
+        trail: trail_reals
+
+    @wp.struct
+    class Gradient:
+        """Sums of one instance's gradient, by place in a strip."""
+
+        e1: strip_reals
+        y: strip_reals
+        xx: strip_reals
+        xy: strip_reals
+        yy: strip_reals
+        opacity: strip_reals
+        color: strip_channels
+        z: strip_reals
+
+    @wp.struct
+    class Held:
+        """Sums of several instances' gradients, one instance after the other."""
+
+        halves: half_reals  # by place in half a strip
+        totals: total_reals
+
+    return SimpleNamespace(Held=Held, Pixels=Pixels, Shades=Shades, Gradient=Gradient)

@@ -7,17 +7,14 @@ import torch
 import warp as wp
 
 from warpgs.constants import Rule
+from warpgs.device import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
 from warpgs.errors import UsageError
-from warpgs.kernels import project_cpu, project_cpu_backward, project_cuda, sh
-from warpgs.kernels.cameras.base import CAMERA_MODELS
-from warpgs.kernels.functions import make_types
+from warpgs.kernels import launch, project_cpu, project_cuda, sh
+from warpgs.kernels.cameras import CAMERA_MODELS
+from warpgs.kernels.ellipse import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors, make_types
+from warpgs.kernels.launch import TORCH, Allocator, first_order, keep, kept
 from warpgs.kernels.native import BLOCK
-from warpgs.kernels.project_inputs import PROJECTED_SIZE, ProjectInputs, ProjectSettings, checked_factors
-from warpgs.kernels.project_lanes import LANES
-from warpgs.runtime import interop
-from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.runtime.derivatives import first_order, keep, kept
-from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, PROJECTION, SAMPLING, Needs, StepSizes
+from warpgs.kernels.project_cpu import LANES
 
 
 def step_bytes(sizes: StepSizes) -> Needs:
@@ -32,12 +29,12 @@ def step_bytes(sizes: StepSizes) -> Needs:
     }  # fmt: skip
 
 
-def _views(inputs: Sequence[torch.Tensor]) -> list[interop.View]:
+def _views(inputs: Sequence[torch.Tensor]) -> list[launch.View]:
     """Return the first eight inputs as the kernels take them."""
-    real = interop.real_of(inputs[0])
+    real = launch.real_of(inputs[0])
     t = make_types(real)
     types = (t.vec3, t.vec4, t.vec3, real, t.vec3, t.mat44, t.mat33, real)
-    return [interop.view(tensor, dtype) for tensor, dtype in zip(inputs, types)]
+    return [launch.view(tensor, dtype) for tensor, dtype in zip(inputs, types)]
 
 
 def _threads_each(tensor: torch.Tensor) -> bool:
@@ -58,21 +55,21 @@ def project_tensors(
     Returns:
         Projected Gaussians, shape [C, N, 12], and the number of tiles that each Gaussian touches, int32, shape [C, N].
     """
-    means, real = inputs.means, interop.real_of(inputs.means)
+    means, real = inputs.means, launch.real_of(inputs.means)
     cameras, count, rule = len(inputs.viewmats), len(means), settings.rule
     projected = allocator.output((cameras, count, PROJECTED_SIZE), means.dtype, means.device)
     tile_counts = allocator.output((cameras, count), torch.int32, means.device)
     arguments = [
-        *_views(inputs), interop.view(inputs.opacity_factors, real), *settings.size, *settings.window,
+        *_views(inputs), launch.view(inputs.opacity_factors, real), *settings.size, *settings.window,
         settings.tile_size, settings.sh_count, rule.near, rule.far, rule.low_pass, rule.alpha_cut, rule.square_sigma,
-        interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
+        launch.rows(projected, real), launch.flat(tile_counts, wp.int32),
     ]  # fmt: skip
     if _threads_each(means):
         kernel, cost = project_cuda.make_forward(real, *settings.variant()), 5
         tasks = -(-cameras * count // BLOCK) * BLOCK
     else:
         kernel, tasks, cost = project_cpu.make_forward(real, *settings.variant()), cameras * -(-count // LANES), 5 * LANES
-    interop.launch(kernel, tasks, arguments, means.device, cost=cost, block_dim=BLOCK)
+    launch.launch(kernel, tasks, arguments, means.device, cost=cost, block_dim=BLOCK)
     return projected, tile_counts
 
 
@@ -120,18 +117,18 @@ def project_gradients(
     Returns:
         Gradients of the seven inputs, in their shapes [...]; None where not wanted.
     """
-    real, device = interop.real_of(projected), projected.device
+    real, device = launch.real_of(projected), projected.device
     t, (width, height), rule = make_types(real), settings.size, settings.rule
     v_projected = torch.zeros_like(projected) if v_projected is None else v_projected.contiguous()
     found = [allocator.output(tensor.shape, tensor.dtype, device) for tensor in inputs[:5]]
     cameras, count = len(inputs[5]), len(inputs[0])
     rows = (cameras, count) if wants_camera else (0, 0)
     v_viewmats, v_Ks = (projected.new_zeros(*rows, n, n) if wants_camera else projected.new_empty(*rows, n, n) for n in (4, 3))
-    outputs = [interop.view(g, dtype) for g, dtype in zip(found, (t.vec3, t.vec4, t.vec3, real, t.vec3))]
+    outputs = [launch.view(g, dtype) for g, dtype in zip(found, (t.vec3, t.vec4, t.vec3, real, t.vec3))]
     arguments = [
         *_views(inputs[:8]), width, height, settings.sh_count, rule.near, rule.low_pass,
-        interop.rows(projected, real), interop.flat(tile_counts, wp.int32),
-        interop.rows(v_projected, real),
+        launch.rows(projected, real), launch.flat(tile_counts, wp.int32),
+        launch.rows(v_projected, real),
     ]  # fmt: skip
     if _threads_each(projected):
         kernel, tasks, cost = project_cuda.make_backward(real, *settings.variant()), -(-count // BLOCK) * BLOCK, 10
@@ -139,10 +136,10 @@ def project_gradients(
             found[4].zero_()
         arguments.append(int(wants_camera))
     else:
-        kernel = project_cpu_backward.make_backward(real, *settings.variant(), wants_camera)
+        kernel = project_cpu.make_backward(real, *settings.variant(), wants_camera)
         tasks, cost = -(-count // LANES), 10 * LANES
-    arguments += [*outputs, interop.view(v_viewmats, t.mat44), interop.view(v_Ks, t.mat33)]
-    interop.launch(kernel, tasks, arguments, device, cost=cost * cameras, block_dim=BLOCK)
+    arguments += [*outputs, launch.view(v_viewmats, t.mat44), launch.view(v_Ks, t.mat33)]
+    launch.launch(kernel, tasks, arguments, device, cost=cost * cameras, block_dim=BLOCK)
     if not wants_camera:
         return [*found, None, None]
     # in float64, so that the float32 result is the same for any number of threads
@@ -228,7 +225,7 @@ def project_inputs(inputs: ProjectInputs, settings: ProjectSettings) -> tuple[to
     """
     model = CAMERA_MODELS.find(settings.camera_model)
     scales, opacities = ("log_scales", "logit_opacities") if settings.parameters == "stored" else ("scales", "opacities")
-    sizes = interop.check(
+    sizes = launch.check(
         means=(inputs.means, "N 3"), quats=(inputs.quats, "N 4"),
         **{scales: (inputs.log_scales, "N 3"), opacities: (inputs.logit_opacities, "N")}, sh=(inputs.sh, "N K 3"),
         viewmats=(inputs.viewmats, "C 4 4"), Ks=(inputs.Ks, "C 3 3"),

@@ -5,11 +5,10 @@ import functools
 import warp as wp
 
 from warpgs.constants import LARGEST_COEFFICIENT
-from warpgs.kernels import project_backward, sh
-from warpgs.kernels.functions import make_projection, make_spans
+from warpgs.kernels import ellipse, sh
+from warpgs.kernels.ellipse import PROJECTED_SIZE, make_projection, make_spans
 from warpgs.kernels.native import make_color
 from warpgs.kernels.native import make_functions as make_native
-from warpgs.kernels.project_inputs import PROJECTED_SIZE
 
 
 @functools.cache
@@ -180,7 +179,7 @@ def make_backward(
     """
     native = real is wp.float32
     m = make_projection(real, camera_model, parameters)
-    f = project_backward.make_functions(real, camera_model, parameters, antialiased, bases)
+    f = ellipse.make_functions(real, camera_model, parameters, antialiased, bases)
     functions = sh.make_functions(real, bases)
     vec3 = m.vec3
     vec4 = m.vec4

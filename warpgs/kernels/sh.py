@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import torch
 import warp as wp
 
-from warpgs.colors import C0
+from warpgs.scene import C0
 
 MAX_DEGREE = 4
 """Highest degree of the basis."""

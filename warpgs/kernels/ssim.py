@@ -1,20 +1,404 @@
-"""Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
-
-For images a and b, the forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three fields.
-Images are flat rows of width * channels.
-"""
+"""The structural similarity of images, and its gradient."""
 
 import functools
+import math
 from types import SimpleNamespace
 
 import torch
 import warp as wp
 
-from warpgs.kernels import ssim_cpu, ssim_cuda
-from warpgs.kernels.ssim_cpu import BLOCK, CHANNELS, LANES, PADDING, RADIUS, make_functions
-from warpgs.runtime import interop
-from warpgs.runtime.derivatives import first_order, keep, kept
-from warpgs.runtime.step_sizes import FLOAT, StepSizes
+from warpgs.device import FLOAT, StepSizes
+from warpgs.kernels import launch
+from warpgs.kernels import launch as interop
+from warpgs.kernels.launch import first_order, keep, kept
+from warpgs.kernels.native import ROLLED, source
+
+RADIUS = 5
+"""Half size of the window [px]."""
+SIGMA = 1.5
+"""Standard deviation of the window [px]."""
+C1 = 0.01**2
+"""(K1 L)^2 of Wang et al. 2004 for a data range L of 1."""
+C2 = 0.03**2
+"""(K2 L)^2 of Wang et al. 2004."""
+
+
+def _window() -> list[float]:
+    """Return the weights of the window along one axis."""
+    weights = [math.exp(-0.5 * (k / SIGMA) ** 2) for k in range(-RADIUS, RADIUS + 1)]
+    return [w / sum(weights) for w in weights]
+
+
+WINDOW = _window()
+"""Weights of the window along one axis; their sum is 1."""
+
+CHANNELS = 3
+"""Channels of a pixel, and so the distance between horizontal neighbours."""
+PADDING = RADIUS * CHANNELS
+"""Number of zeros beside a row of sums, so that a horizontal pass needs no border."""
+LANES = 16
+"""Neighbouring elements that are computed together on a CPU, in a loop that vectorises."""
+BLOCK = 8
+"""Rows that one task computes on a CPU. The sums of a row stay in cache between the vertical and the horizontal pass."""
+
+
+@functools.cache
+def make_functions(real):
+    """Make the functions that the kernels of both kinds of device share, for one scalar type."""
+    vec3 = wp.types.vector(3, real)
+    vec4 = wp.types.vector(4, real)
+    vec5 = wp.types.vector(5, real)
+    w0, w1, w2, w3, w4, w5 = (real(w) for w in WINDOW[RADIUS:])
+    vec6 = wp.types.vector(6, real)
+    channels = wp.constant(CHANNELS)
+
+    @wp.func
+    def tap(k: wp.int32) -> real:
+        """Return the weight at a distance of |k| rows or columns, 0 beyond the window."""
+        w = vec6(w0, w1, w2, w3, w4, w5)
+        return wp.where(wp.abs(k) <= RADIUS, w[wp.min(wp.abs(k), RADIUS)], real(0.0))
+
+    @wp.func
+    def at(first: wp.int32, lane: wp.int32) -> wp.int32:
+        """Return an index that the compiler can see is not negative.
+
+        Warp counts negative ones from the end of the array. Where the compiler cannot exclude negative ones, it loads each lane
+        separately.
+        """
+        return wp.max(first, 0) + lane
+
+    @wp.func
+    def across(m: wp.array(dtype=real), first: wp.int32, lane: wp.int32) -> real:
+        """Return the weighted sum over the columns of the window; ``first`` + ``lane`` is the leftmost column."""
+        o = at(first, lane)
+        s = w5 * (m[o] + m[o + 10 * channels])
+        s += w4 * (m[o + channels] + m[o + 9 * channels])
+        s += w3 * (m[o + 2 * channels] + m[o + 8 * channels])
+        s += w2 * (m[o + 3 * channels] + m[o + 7 * channels])
+        s += w1 * (m[o + 4 * channels] + m[o + 6 * channels])
+        s += w0 * m[o + 5 * channels]
+        return s
+
+    @wp.func
+    def add_pair(s: vec5, w: real, p: real, q: real) -> vec5:
+        """Return the five sums after adding a pixel."""
+        d = p - q
+        u = w * p
+        v = w * q
+        return vec5(s[0] + u, s[1] + v, s[2] + u * p, s[3] + v * q, s[4] + w * d * d)
+
+    @wp.func
+    def score(s0: real, s1: real, s2: real, s3: real, s4: real) -> vec4:
+        """Return the similarity, and its partials by mean, variance and gap, from the five sums."""
+        ma = s0
+        mb = s1
+        # rounding can make these differences slightly negative
+        raw_va = s2 - ma * ma
+        raw_gap = s4 - (ma - mb) * (ma - mb)
+        va = wp.max(raw_va, real(0.0))
+        vb = wp.max(s3 - mb * mb, real(0.0))
+        # variance of a - b: the covariance is (va + vb - gap) / 2, and equal images score 1 whatever is rounded
+        gap = wp.max(raw_gap, real(0.0))
+        square = (ma - mb) * (ma - mb)
+        r1 = real(1.0) / (real(2.0) * ma * mb + real(C1) + square)
+        r2 = real(1.0) / (va + vb + real(C2))
+        luminance = real(1.0) - square * r1
+        structure = real(1.0) - gap * r2
+        v = wp.where(raw_va > real(0.0), luminance * gap * r2 * r2, real(0.0))
+        g = wp.where(raw_gap > real(0.0), -luminance * r2, real(0.0))
+        # the mean also acts through the variance, -ma^2, and the gap, -(ma - mb)^2
+        by_mean = real(2.0) * (structure * (mb - luminance * ma) * r1 - ma * v - (ma - mb) * g)
+        return vec4(luminance * structure, by_mean, v, g)
+
+    return SimpleNamespace(tap=tap, at=at, across=across, add_pair=add_pair, score=score,
+                           vec3=vec3, vec4=vec4, vec5=vec5)  # fmt: skip
+
+
+@functools.cache
+def make_cpu_kernels(real, summed: bool):
+    """Make the kernels for a CPU, of one task per block of rows.
+
+    The sums of a row are in ``scratch``, where each task has a few rows of its own. A row is processed in steps of `LANES`
+    elements; the last step starts early, to end with the row, and elements that it computes again get the same values.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        summed: True for sums over the image instead of a map.
+    """
+    f = make_functions(real)
+    vec11 = wp.types.vector(2 * RADIUS + 1, real)
+    vec11i = wp.types.vector(2 * RADIUS + 1, wp.int32)
+    values = wp.types.vector(LANES, real)
+    kernel = functools.partial(wp.kernel, enable_backward=False, module="unique", module_options=ROLLED)
+
+    @wp.func
+    def starts_of(y: wp.int32, height: wp.int32, image: wp.int32, columns: wp.int32) -> vec11i:
+        """Return the first elements of the rows in the window of row y; rows outside the image are replaced, and weigh 0."""
+        o = vec11i()
+        for k in range(2 * RADIUS + 1):
+            o[k] = (image * height + wp.clamp(y + k - RADIUS, 0, height - 1)) * columns
+        return o
+
+    @wp.func
+    def taps_of(y: wp.int32, height: wp.int32) -> vec11:
+        w = vec11()
+        for k in range(2 * RADIUS + 1):
+            inside = y + k >= RADIUS and y + k < height + RADIUS
+            w[k] = wp.where(inside, f.tap(k - RADIUS), real(0.0))
+        return w
+
+    @wp.func
+    def clear_padding(scratch: wp.array(dtype=real), o: wp.int32, columns: wp.int32):
+        for k in range(PADDING):
+            scratch[o + k] = real(0.0)
+            scratch[o + PADDING + columns + k] = real(0.0)
+
+    # The eleven rows are written out: a loop inside the loop over lanes would keep the latter from vectorising.
+
+    @wp.func
+    def down_pairs(
+        a: wp.array(dtype=real), b: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32
+    ) -> f.vec5:
+        s = f.vec5()
+        s = f.add_pair(s, w[0], a[f.at(o[0] + x, lane)], b[f.at(o[0] + x, lane)])
+        s = f.add_pair(s, w[1], a[f.at(o[1] + x, lane)], b[f.at(o[1] + x, lane)])
+        s = f.add_pair(s, w[2], a[f.at(o[2] + x, lane)], b[f.at(o[2] + x, lane)])
+        s = f.add_pair(s, w[3], a[f.at(o[3] + x, lane)], b[f.at(o[3] + x, lane)])
+        s = f.add_pair(s, w[4], a[f.at(o[4] + x, lane)], b[f.at(o[4] + x, lane)])
+        s = f.add_pair(s, w[5], a[f.at(o[5] + x, lane)], b[f.at(o[5] + x, lane)])
+        s = f.add_pair(s, w[6], a[f.at(o[6] + x, lane)], b[f.at(o[6] + x, lane)])
+        s = f.add_pair(s, w[7], a[f.at(o[7] + x, lane)], b[f.at(o[7] + x, lane)])
+        s = f.add_pair(s, w[8], a[f.at(o[8] + x, lane)], b[f.at(o[8] + x, lane)])
+        s = f.add_pair(s, w[9], a[f.at(o[9] + x, lane)], b[f.at(o[9] + x, lane)])
+        s = f.add_pair(s, w[10], a[f.at(o[10] + x, lane)], b[f.at(o[10] + x, lane)])
+        return s
+
+    @wp.func
+    def down(m: wp.array(dtype=real), o: vec11i, w: vec11, x: wp.int32, lane: wp.int32) -> real:
+        s = w[0] * m[f.at(o[0] + x, lane)]
+        s += w[1] * m[f.at(o[1] + x, lane)]
+        s += w[2] * m[f.at(o[2] + x, lane)]
+        s += w[3] * m[f.at(o[3] + x, lane)]
+        s += w[4] * m[f.at(o[4] + x, lane)]
+        s += w[5] * m[f.at(o[5] + x, lane)]
+        s += w[6] * m[f.at(o[6] + x, lane)]
+        s += w[7] * m[f.at(o[7] + x, lane)]
+        s += w[8] * m[f.at(o[8] + x, lane)]
+        s += w[9] * m[f.at(o[9] + x, lane)]
+        s += w[10] * m[f.at(o[10] + x, lane)]
+        return s
+
+    @kernel
+    def forward(
+        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), height: int, blocks: int, columns: int,
+        scratch: wp.array(dtype=real),
+        # outputs: the similarity, or per task the sums of 1 - similarity and of |a - b|; the partials
+        result: wp.array(dtype=real), by_mean: wp.array(dtype=real), by_variance: wp.array(dtype=real),
+        by_gap: wp.array(dtype=real),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        image = task // blocks
+        top = (task - image * blocks) * BLOCK
+        stride = columns + 2 * PADDING
+        m0 = task * 5 * stride
+        m1 = m0 + stride
+        m2 = m1 + stride
+        m3 = m2 + stride
+        m4 = m3 + stride
+        clear_padding(scratch, m0, columns)
+        clear_padding(scratch, m1, columns)
+        clear_padding(scratch, m2, columns)
+        clear_padding(scratch, m3, columns)
+        clear_padding(scratch, m4, columns)
+        s0 = values()
+        s1 = values()
+        s2 = values()
+        s3 = values()
+        s4 = values()
+        unlike = values()
+        error = values()
+        for y in range(top, wp.min(top + BLOCK, height)):
+            o = starts_of(y, height, image, columns)
+            w = taps_of(y, height)
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                for lane in range(LANES):
+                    s = down_pairs(a, b, o, w, x, lane)
+                    s0[lane] = s[0]
+                    s1[lane] = s[1]
+                    s2[lane] = s[2]
+                    s3[lane] = s[3]
+                    s4[lane] = s[4]
+                for lane in range(LANES):
+                    scratch[f.at(m0 + PADDING + x, lane)] = s0[lane]
+                    scratch[f.at(m1 + PADDING + x, lane)] = s1[lane]
+                    scratch[f.at(m2 + PADDING + x, lane)] = s2[lane]
+                    scratch[f.at(m3 + PADDING + x, lane)] = s3[lane]
+                    scratch[f.at(m4 + PADDING + x, lane)] = s4[lane]
+            row = (image * height + y) * columns
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                fresh = step * LANES - x  # elements before this one were counted in the step before
+                for lane in range(LANES):
+                    t = f.score(
+                        f.across(scratch, m0 + x, lane), f.across(scratch, m1 + x, lane), f.across(scratch, m2 + x, lane),
+                        f.across(scratch, m3 + x, lane), f.across(scratch, m4 + x, lane),
+                    )  # fmt: skip
+                    s0[lane] = t[0]
+                    s1[lane] = t[1]
+                    s2[lane] = t[2]
+                    s3[lane] = t[3]
+                    if wp.static(summed):
+                        unlike[lane] = unlike[lane] + wp.where(lane >= fresh, real(1.0) - t[0], real(0.0))
+                        gap = wp.abs(a[f.at(row + x, lane)] - b[f.at(row + x, lane)])
+                        error[lane] = error[lane] + wp.where(lane >= fresh, gap, real(0.0))
+                for lane in range(LANES):
+                    if not wp.static(summed):
+                        result[f.at(row + x, lane)] = s0[lane]
+                    by_mean[f.at(row + x, lane)] = s1[lane]
+                    by_variance[f.at(row + x, lane)] = s2[lane]
+                    by_gap[f.at(row + x, lane)] = s3[lane]
+        if wp.static(summed):
+            unlike_sum = real(0.0)
+            error_sum = real(0.0)
+            for lane in range(LANES):
+                unlike_sum += unlike[lane]
+                error_sum += error[lane]
+            result[2 * task] = unlike_sum
+            result[2 * task + 1] = error_sum
+
+    @kernel
+    def backward(
+        begin: int, a: wp.array(dtype=real), b: wp.array(dtype=real), by_mean: wp.array(dtype=real),
+        by_variance: wp.array(dtype=real), by_gap: wp.array(dtype=real), v_result: wp.array(dtype=real),
+        height: int, blocks: int, columns: int, scratch: wp.array(dtype=real),
+        # outputs
+        v_a: wp.array(dtype=real),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        image = task // blocks
+        top = (task - image * blocks) * BLOCK
+        stride = columns + 2 * PADDING
+        m0 = task * 3 * stride
+        m1 = m0 + stride
+        m2 = m1 + stride
+        clear_padding(scratch, m0, columns)
+        clear_padding(scratch, m1, columns)
+        clear_padding(scratch, m2, columns)
+        s0 = values()
+        s1 = values()
+        s2 = values()
+        for y in range(top, wp.min(top + BLOCK, height)):
+            o = starts_of(y, height, image, columns)
+            w = taps_of(y, height)
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                for lane in range(LANES):
+                    s0[lane] = down(by_mean, o, w, x, lane)
+                    s1[lane] = down(by_variance, o, w, x, lane)
+                    s2[lane] = down(by_gap, o, w, x, lane)
+                for lane in range(LANES):
+                    scratch[f.at(m0 + PADDING + x, lane)] = s0[lane]
+                    scratch[f.at(m1 + PADDING + x, lane)] = s1[lane]
+                    scratch[f.at(m2 + PADDING + x, lane)] = s2[lane]
+            row = (image * height + y) * columns
+            for step in range((columns + LANES - 1) // LANES):
+                x = wp.min(step * LANES, columns - LANES)
+                for lane in range(LANES):
+                    p = a[f.at(row + x, lane)]
+                    d = p - b[f.at(row + x, lane)]
+                    v = f.across(scratch, m1 + x, lane) * p + f.across(scratch, m2 + x, lane) * d
+                    v = f.across(scratch, m0 + x, lane) + real(2.0) * v
+                    if wp.static(summed):
+                        sign = wp.where(d > real(0.0), v_result[1], wp.where(d < real(0.0), -v_result[1], real(0.0)))
+                        v = sign - v_result[0] * v
+                    s0[lane] = v
+                for lane in range(LANES):
+                    v_a[f.at(row + x, lane)] = s0[lane]
+
+    return SimpleNamespace(forward=forward, backward=backward)
+
+
+SIDE = 16
+"""Side [px] of the square that a thread block works on."""
+THREADS = 256
+"""Threads of a block."""
+
+
+@functools.cache
+def make_cuda_kernels():
+    """Make the forward and backward kernels; their argument ``summed`` is 1 for the two sums of `differences`, 0 for a map."""
+    numbers = {"WINDOW": ", ".join(f"{w!r}f" for w in WINDOW), "C1": f"{C1!r}f", "C2": f"{C2!r}f"}
+
+    @wp.func_native(source("ssim_forward.cu", **numbers))
+    def forward_body(
+        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
+        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
+        by_gap: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    @wp.func_native(source("ssim_backward.cu", **numbers))
+    def backward_body(
+        block: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
+        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
+        height: int, columns: int, summed: int, v_a: wp.array(dtype=float),
+    ): ...  # fmt: skip
+
+    kernel = functools.partial(wp.kernel, enable_backward=False, grid_stride=False, module="warpgs.kernels.ssim_cuda")
+
+    @kernel
+    def forward(
+        begin: int, a: wp.array(dtype=float), b: wp.array(dtype=float), height: int, columns: int, summed: int,
+        # outputs: the similarities, or two sums per block; and the partials by mean, variance and gap
+        result: wp.array(dtype=float), by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float),
+        by_gap: wp.array(dtype=float),
+    ):  # fmt: skip
+        forward_body(wp.tid() // THREADS, a, b, height, columns, summed, result, by_mean, by_variance, by_gap)
+
+    @kernel
+    def backward(
+        begin: int, a: wp.array(dtype=float), b: wp.array(dtype=float), v_result: wp.array(dtype=float),
+        by_mean: wp.array(dtype=float), by_variance: wp.array(dtype=float), by_gap: wp.array(dtype=float),
+        height: int, columns: int, summed: int,
+        # outputs
+        v_a: wp.array(dtype=float),
+    ):  # fmt: skip
+        backward_body(wp.tid() // THREADS, a, b, v_result, by_mean, by_variance, by_gap, height, columns, summed, v_a)
+
+    return SimpleNamespace(forward=forward, backward=backward)
+
+
+def _shape(image: torch.Tensor) -> tuple[int, int, int]:
+    """Return the number of blocks, and height and row length [elements], of images [B, H, W, 3]."""
+    batch, height, width, channels = image.shape
+    return batch * -(-height // SIDE) * -(-width // SIDE), height, width * channels
+
+
+def forward(image: torch.Tensor, target: torch.Tensor, summed: bool) -> tuple[torch.Tensor, ...]:
+    """Return similarities [B, H, W, 3] or, if ``summed``, two sums per block [blocks, 2]; then three partial derivatives."""
+    blocks, height, columns = _shape(image)
+    result = image.new_empty(blocks, 2) if summed else torch.empty_like(image)
+    partials = [torch.empty_like(image) for _ in range(3)]
+    arrays = [launch.view(t.view(-1), wp.float32) for t in (image, target, result, *partials)]
+    inputs = [*arrays[:2], height, columns, int(summed), *arrays[2:]]
+    launch.launch(make_cuda_kernels().forward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    return result, *partials
+
+
+def backward(image: torch.Tensor, target: torch.Tensor, partials, v_result: torch.Tensor, summed: bool) -> torch.Tensor:
+    """Return the gradient of the image from the gradient of the similarities [B, H, W, 3] or of the two sums [2]."""
+    blocks, height, columns = _shape(image)
+    v_image = torch.empty_like(image)
+    arrays = [launch.view(t.view(-1), wp.float32) for t in (image, target, v_result.contiguous(), *partials)]
+    inputs = [*arrays, height, columns, int(summed), launch.view(v_image.view(-1), wp.float32)]
+    launch.launch(make_cuda_kernels().backward, blocks * THREADS, inputs, image.device, block_dim=THREADS)
+    return v_image
+
+
+# Structural similarity with an 11 x 11 Gaussian window (Wang et al. 2004), separable, forward and backward.
+#
+# For images a and b, the forward pass sums a, b, a^2, b^2 and (a - b)^2 over the window; the backward pass sums three
+# fields. Images are flat rows of width * channels.
 
 
 def difference_bytes(sizes: StepSizes) -> int:
@@ -110,7 +494,7 @@ class _Launcher:
         self.blocks = -(-self.height // BLOCK)
         self.tasks = batch * self.blocks
         self.blocked = self.device.type == "cpu"
-        self.kernels = ssim_cpu.make_kernels(self.real, summed) if self.blocked else make_kernels(self.real)
+        self.kernels = make_cpu_kernels(self.real, summed) if self.blocked else make_kernels(self.real)
 
     def flat(self, tensor: torch.Tensor) -> interop.View:
         """Return a tensor as a flat kernel argument."""
@@ -141,7 +525,7 @@ class _Ssim(torch.autograd.Function):
     def forward(ctx, image, target):
         image, target = image.contiguous(), target.contiguous()
         if _native(image):
-            result, *partials = ssim_cuda.forward(image, target, summed=False)
+            result, *partials = forward(image, target, summed=False)
             keep(ctx, image, target, *partials)
             return result
         launcher = _Launcher(image)
@@ -163,7 +547,7 @@ class _Ssim(torch.autograd.Function):
     def backward(ctx, v_result):
         image, target, *partials = kept(ctx)
         if _native(image):
-            return ssim_cuda.backward(image, target, partials, v_result, summed=False), None
+            return backward(image, target, partials, v_result, summed=False), None
         launcher = _Launcher(image)
         v_image, pair = torch.empty_like(image), [launcher.flat(image), launcher.flat(target)]
         if launcher.blocked:
@@ -184,7 +568,7 @@ class _Differences(torch.autograd.Function):
     def forward(ctx, image, target):
         image, target = image.contiguous(), target.contiguous()
         if _native(image):
-            sums, *partials = ssim_cuda.forward(image, target, summed=True)
+            sums, *partials = forward(image, target, summed=True)
             keep(ctx, image, target, *partials)
             return sums.sum(0)
         launcher = _Launcher(image, summed=True)
@@ -200,7 +584,7 @@ class _Differences(torch.autograd.Function):
     def backward(ctx, v_sums):
         image, target, *partials = kept(ctx)
         if _native(image):
-            return ssim_cuda.backward(image, target, partials, v_sums, summed=True), None
+            return backward(image, target, partials, v_sums, summed=True), None
         launcher = _Launcher(image, summed=True)
         v_image = torch.empty_like(image)
         inputs = [launcher.flat(t) for t in (image, target, *partials, v_sums.contiguous())]

@@ -1,30 +1,481 @@
-"""Binning of projected Gaussians into tiles, front to back: depth sort, emission, stable tile sort (docs/tiles.md)."""
+"""Binning: which Gaussians touch which tile, in the order of their depth."""
 
+import functools
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import torch
 import warp as wp
 
 from warpgs.constants import TILE_SIZE, Rule
+from warpgs.device import (
+    BINNING,
+    BLENDING,
+    FLOAT,
+    LOSS,
+    SAMPLING,
+    Needs,
+    StepSizes,
+    available_bytes,
+    format_bytes,
+    installed_bytes,
+)
 from warpgs.errors import ResourceError
-from warpgs.kernels import tiles_emit_cpu
-from warpgs.kernels.project_lanes import LANES
-from warpgs.kernels.tiles_emit import EACH, make_emit, make_find_ranges
-from warpgs.kernels.tiles_order import make_kernels, running_counts, split_sum, sum_bits, sum_entries, sums_fit
-from warpgs.runtime import interop
-from warpgs.runtime.allocator import TORCH, Allocator
-from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.device_memory import available_bytes, installed_bytes
-from warpgs.runtime.sorting import sort_pairs
-from warpgs.runtime.step_sizes import BINNING, BLENDING, FLOAT, LOSS, SAMPLING, Needs, StepSizes
+from warpgs.kernels import launch
+from warpgs.kernels.ellipse import make_spans
+from warpgs.kernels.launch import TORCH, Allocator, sort_pairs
+from warpgs.kernels.native import EXACT
+from warpgs.kernels.native import make_functions as make_native
+from warpgs.kernels.project_cpu import LANES
+
+EACH = 4
+"""Number of items per thread in short kernels on CUDA: with one item, waiting for its load would take longer than the work."""
+
+
+@functools.cache
+def make_find_ranges(slotted: bool, native: bool):
+    """Make the kernel that finds the instances of each tile in the sorted keys; arguments are those of `make_emit`.
+
+    A thread takes `EACH` instances on CUDA (``native``), else one. The instances of a thread lie far apart, so that
+    neighbouring threads read neighbouring instances.
+    """
+    each = wp.constant(EACH if native else 1)
+    ints = wp.types.vector(each, wp.int32)
+    module = f"warpgs.kernels.tiles.ranges.{int(slotted)}.{int(native)}"
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    def find_ranges(
+        begin: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int), count: int,
+        no_tile: int,
+        # outputs; ranges zero on entry
+        ids: wp.array(dtype=int), ranges: wp.array2d(dtype=int),
+    ):  # fmt: skip
+        first = begin + wp.tid()
+        apart = (count + each - 1) // each
+        tile = ints()
+        before = ints()
+        after = ints()
+        owner = ints()
+        # all is loaded before anything is used or stored: the waits overlap
+        for k in range(wp.static(each)):
+            i = wp.min(first + k * apart, count - 1)
+            tile[k] = keys[i]
+            before[k] = keys[wp.max(i - 1, 0)]
+            after[k] = keys[wp.min(i + 1, count - 1)]
+            if wp.static(slotted):
+                owner[k] = slots[i]
+        if wp.static(slotted):
+            for k in range(wp.static(each)):
+                if tile[k] != no_tile:
+                    owner[k] = owners[owner[k]]
+        for k in range(wp.static(each)):
+            i = first + k * apart
+            if i < count:
+                if tile[k] == no_tile:
+                    ids[i] = 0
+                else:
+                    if wp.static(slotted):
+                        ids[i] = owner[k]
+                    if i == 0 or before[k] != tile[k]:
+                        ranges[tile[k], 0] = i
+                    if i == count - 1 or after[k] != tile[k]:
+                        ranges[tile[k], 1] = i + 1
+
+    return find_ranges
+
+
+@functools.cache
+def make_write(slotted: bool):
+    """Make the function that writes an instance; arguments are those of `make_emit`."""
+
+    @wp.func
+    def write(
+        slot: int, key: int, owner: int, keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int)
+    ):
+        keys[slot] = key
+        if wp.static(slotted):
+            slots[slot] = slot
+            owners[slot] = owner
+        else:
+            slots[slot] = owner
+
+    return write
+
+
+@functools.cache
+def make_emit(real, slotted: bool):
+    """Make the kernel for CUDA that writes the instances of each Gaussian, row by row of tiles (for a CPU: `tiles_emit_cpu`).
+
+    A warp shares the rows and then the tiles of its 32 Gaussians evenly among its lanes. Unused slots get the tile number
+    ``no_tile``.
+
+    Args:
+        real: wp.float32 or wp.float64.
+        slotted: True to write the slot and the Gaussian number of each instance; False to write the number in place of the
+            slot.
+    """
+    s = make_spans(real)
+    vec3 = wp.types.vector(3, real)
+    vec2i = s.vec2i
+    lanes = make_native()
+    write = make_write(slotted)
+
+    @wp.func
+    def span_of(
+        projected: wp.array2d(dtype=real), i: int, row: int, alpha_cut: real, square_sigma: real,
+        origin_x: int, width: int, tile_size: int,
+    ) -> vec2i:  # fmt: skip
+        factor = vec3(projected[i, 2], projected[i, 3], projected[i, 4])
+        reach = s.reach_of(projected[i, 5], alpha_cut, square_sigma)
+        return s.tile_columns(
+            projected[i, 0], projected[i, 1], factor, reach, projected[i, 10], projected[i, 11], row, origin_x, width, tile_size
+        )
+
+    module = f"warpgs.kernels.tiles.emit.{real.__name__}.{int(slotted)}"
+
+    # five blocks to a multiprocessor
+    @wp.kernel(enable_backward=False, grid_stride=False, cuda_max_registers=48, module=module)
+    def emit(
+        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
+        origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
+        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
+        # outputs
+        starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
+        overflow: wp.array(dtype=int),
+    ):  # fmt: skip
+        j = begin + wp.tid()
+        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
+        i = int(0)
+        touched = int(0)
+        slot = int(0)
+        end = int(0)
+        if j < count:
+            i = order[j]
+            touched = tile_counts[i]
+            last_slot = ends[j]
+            if last_slot > wp.int64(capacity):  # the lists are cut, and must not be used; see `bin_tiles`
+                overflow[0] = 1
+                touched = int(wp.max(wp.int64(touched) - (last_slot - wp.int64(capacity)), wp.int64(0)))
+                last_slot = wp.int64(capacity)
+                tile_counts[i] = touched
+            end = int(last_slot)
+            slot = end - touched
+            starts[i] = slot
+        rows = vec2i(0, 0)
+        if touched > 0:
+            rows = s.tile_rows(projected[i, 1], projected[i, 11], origin_y, height, tile_size)
+        first_tile = (i // per_camera) * tiles - corner
+        # The warp writes the rows of its 32 Gaussians together: a lane finds the columns of a row, then each a tile.
+        lane = wp.tid() % 32
+        row_end = lanes.running_sum(rows[1] - rows[0])
+        row_begin = row_end - (rows[1] - rows[0])
+        row_count = lanes.broadcast(row_end, 31)
+        batch = int(0)
+        while batch < row_count:
+            owner = lanes.holder(row_end, batch + lane)
+            g = lanes.broadcast(i, owner)
+            row = lanes.broadcast(rows[0], owner) + batch + lane - lanes.broadcast(row_begin, owner)
+            span = vec2i(0, 0)
+            if batch + lane < row_count:
+                span = span_of(projected, g, row, alpha_cut, square_sigma, origin_x, width, tile_size)
+            tile_end = lanes.running_sum(span[1] - span[0])
+            tile_begin = tile_end - (span[1] - span[0])
+            tile_count = lanes.broadcast(tile_end, 31)
+            # a Gaussian's slots go on from where its rows of the last batch ended
+            first = wp.max(row_begin - batch, 0)
+            to_slot = lanes.broadcast(slot, owner) - lanes.broadcast(tile_begin, lanes.broadcast(first, owner))
+            to_key = lanes.broadcast(first_tile, owner) + row * columns + span[0] - tile_begin
+            limit = lanes.broadcast(end, owner)
+            done = int(0)
+            while done < tile_count:
+                at = lanes.holder(tile_end, done + lane)
+                to = done + lane + lanes.broadcast(to_slot, at)
+                key = done + lane + lanes.broadcast(to_key, at)
+                owner_of = lanes.broadcast(g, at)
+                if to < lanes.broadcast(limit, at) and done + lane < tile_count:
+                    write(to, key, owner_of, keys, slots, owners)
+                done += 32
+            written = lanes.broadcast(tile_end, wp.clamp(row_end - batch - 1, 0, 31))
+            written -= lanes.broadcast(tile_begin, wp.min(first, 31))
+            if row_begin < batch + 32 and row_end > batch and rows[1] > rows[0]:
+                slot += written
+            batch += 32
+        # Two compilations of one formula may round differently; then a tile at the margin is counted but not found again.
+        while slot < end:
+            write(slot, no_tile, i, keys, slots, owners)
+            slot += 1
+        if j < count:  # slots of the unused capacity belong to no tile
+            slot = j + int(wp.min(ends[count - 1], wp.int64(capacity)))
+            while slot < capacity:
+                keys[slot] = no_tile
+                slot += count
+
+    return emit
+
+
+# The kernel in plain Warp that writes the (Gaussian, tile) instances on a CPU.
+#
+# As in `project_cpu`, a task processes `LANES` Gaussians; loops that the compiler vectorises find their rows and
+# columns.
+
+
+@functools.cache
+def make_emit_cpu(real, slotted: bool):
+    """Make the kernel; arguments are those of `tiles_emit.make_emit`."""
+    s = make_spans(real, lanes=True)
+    vec3 = wp.types.vector(3, real)
+    lane_reals = wp.types.vector(LANES, real)
+    lane_ints = wp.types.vector(LANES, wp.int32)
+    lanes = wp.constant(LANES)
+    write = make_write(slotted)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
+    def emit(
+        begin: int, projected: wp.array2d(dtype=real), order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        ends: wp.array(dtype=wp.int64), count: int, per_camera: int,
+        origin_x: int, origin_y: int, width: int, height: int, tile_size: int,
+        alpha_cut: real, square_sigma: real, columns: int, tiles: int, no_tile: int, capacity: int,
+        # outputs
+        starts: wp.array(dtype=int), keys: wp.array(dtype=int), slots: wp.array(dtype=int), owners: wp.array(dtype=int),
+        overflow: wp.array(dtype=int),
+    ):  # fmt: skip
+        first = (begin + wp.tid()) * lanes
+        used = wp.min(lanes, count - first)
+        corner = (origin_y // tile_size) * columns + origin_x // tile_size  # rows and columns count from the image's corner
+        owner = lane_ints()
+        first_tile = lane_ints()
+        slot = lane_ints()
+        end = lane_ints()
+        x = lane_reals()
+        y = lane_reals()
+        u11 = lane_reals()
+        u12 = lane_reals()
+        u22 = lane_reals()
+        reach = lane_reals()
+        half_width = lane_reals()
+        half_height = lane_reals()
+        for lane in range(used):
+            i = order[first + lane]
+            touched = tile_counts[i]
+            last = ends[first + lane]
+            if last > wp.int64(capacity):  # the lists are cut, and must not be used; see `bin_tiles`
+                overflow[0] = 1
+                touched = int(wp.max(wp.int64(touched) - (last - wp.int64(capacity)), wp.int64(0)))
+                last = wp.int64(capacity)
+                tile_counts[i] = touched
+            owner[lane] = i
+            first_tile[lane] = (i // per_camera) * tiles - corner
+            end[lane] = int(last)
+            slot[lane] = int(last) - touched
+            starts[i] = int(last) - touched
+            x[lane] = projected[i, 0]
+            y[lane] = projected[i, 1]
+            u11[lane] = projected[i, 2]
+            u12[lane] = projected[i, 3]
+            u22[lane] = projected[i, 4]
+            reach[lane] = projected[i, 5]
+            half_width[lane] = projected[i, 10]
+            half_height[lane] = projected[i, 11]
+        begin_row = lane_ints()
+        end_row = lane_ints()
+        begin_column = lane_ints()
+        end_column = lane_ints()
+        for lane in range(lanes):
+            rows = s.tile_rows(y[lane], half_height[lane], origin_y, height, tile_size)
+            touches = slot[lane] < end[lane]
+            begin_row[lane] = wp.where(touches, rows[0], 0)
+            end_row[lane] = wp.where(touches, rows[1], 0)
+        most = int(0)
+        for lane in range(used):
+            most = wp.max(most, end_row[lane] - begin_row[lane])
+            if slot[lane] < end[lane]:
+                reach[lane] = s.reach_of(reach[lane], alpha_cut, square_sigma)
+        for k in range(most):
+            for lane in range(lanes):
+                row = begin_row[lane] + k
+                span = s.tile_columns(
+                    x[lane], y[lane], vec3(u11[lane], u12[lane], u22[lane]), reach[lane], half_width[lane], half_height[lane],
+                    row, origin_x, width, tile_size,
+                )  # fmt: skip
+                begin_column[lane] = span[0]
+                end_column[lane] = wp.where(row < end_row[lane], span[1], 0)
+            for lane in range(used):
+                to = slot[lane]
+                key = first_tile[lane] + (begin_row[lane] + k) * columns + begin_column[lane]
+                until = wp.min(to + end_column[lane] - begin_column[lane], end[lane])
+                while to < until:
+                    write(to, key, owner[lane], keys, slots, owners)
+                    to += 1
+                    key += 1
+                slot[lane] = to
+        # Two compilations of one formula may round differently; then a tile at the margin is counted but not found again.
+        for lane in range(used):
+            to = slot[lane]
+            while to < end[lane]:
+                write(to, no_tile, owner[lane], keys, slots, owners)
+                to += 1
+
+    return emit
+
+
+def _of_sum(native: bool) -> tuple[int, int]:
+    """Return the number of threads per entry of the running sums, and of items per thread."""
+    return (32, EACH) if native else (1, 1)
+
+
+def sum_entries(count: int, native: bool) -> tuple[int, int]:
+    """Return the number of running sums for ``count`` items, and the number of threads to launch.
+
+    On CUDA, the number of threads is a multiple of 256, the block size.
+    """
+    width, each = _of_sum(native)
+    entries = -(-count // (width * each))
+    return entries, -(-entries * width // 256) * 256 if native else entries
+
+
+@functools.cache
+def make_kernels(real, native: bool):
+    """Make the kernels for one scalar type; ``native`` is True for CUDA, where each warp has one entry of the running sums."""
+    lanes = make_native() if native else None
+    width, each = (wp.constant(n) for n in _of_sum(native))
+    ints, reals = wp.types.vector(each, wp.int32), wp.types.vector(each, real)
+    module = f"warpgs.kernels.tiles.{real.__name__}.{int(native)}"
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    def depth_keys(
+        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int),
+        # outputs
+        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        ids[i] = i
+        if tile_counts[i] > 0:
+            keys[i] = projected[i, 9]
+        else:
+            keys[i] = real(wp.inf)
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    def pack_counts(
+        begin: int, tile_counts: wp.array(dtype=int), bits: int,
+        # outputs
+        packed: wp.array(dtype=wp.int64),
+    ):  # fmt: skip
+        thread = begin + wp.tid()
+        entry = thread // width
+        first = entry * width * each + thread % width
+        last = tile_counts.shape[0] - 1
+        own = wp.int64(0)
+        for k in range(wp.static(each)):
+            i = first + k * width
+            touched = tile_counts[wp.min(i, last)]
+            if i <= last and touched > 0:
+                own += (wp.int64(1) << wp.int64(bits)) + wp.int64(touched)
+        if wp.static(native):
+            own = lanes.whole_sum(own)
+        if thread % width == 0 and first <= last:
+            packed[entry] = own
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    def visible_keys(
+        begin: int, projected: wp.array2d(dtype=real), tile_counts: wp.array(dtype=int), packed: wp.array(dtype=wp.int64),
+        bits: int, limit: int,
+        # outputs
+        keys: wp.array(dtype=real), ids: wp.array(dtype=int),
+    ):  # fmt: skip
+        thread = begin + wp.tid()
+        entry = thread // width
+        first = entry * width * each + thread % width
+        last = tile_counts.shape[0] - 1
+        entries = packed.shape[0]
+        touched = ints()
+        key = reals()
+        for k in range(wp.static(each)):  # all is loaded before anything is used: the waits overlap
+            i = first + k * width
+            touched[k] = wp.where(i <= last, tile_counts[wp.min(i, last)], 0)
+        passed = int(packed[wp.min(entry, entries - 1)] >> wp.int64(bits))  # visible ones up to an item
+        all_visible = int(packed[entries - 1] >> wp.int64(bits))
+        byte = int(0)  # one for each of the thread's items: of a warp at most 32 are visible
+        for k in range(wp.static(each)):
+            key[k] = real(wp.inf)
+            if touched[k] > 0:
+                key[k] = projected[first + k * width, 9]
+                byte += 1 << (8 * k)
+        upto = byte
+        whole = byte
+        if wp.static(native):
+            upto = lanes.running_sum(byte)
+            whole = lanes.broadcast(upto, 31)
+        for k in range(wp.static(each)):
+            passed -= (whole >> (8 * k)) & 255
+        for k in range(wp.static(each)):
+            i = first + k * width
+            here = passed + ((upto >> (8 * k)) & 255)
+            j = here - 1
+            if touched[k] == 0:  # behind all visible ones, within the limit
+                j = all_visible + i - here
+            if i <= last and j < limit:
+                keys[j] = key[k]
+                ids[j] = i
+            passed += (whole >> (8 * k)) & 255
+
+    @wp.kernel(enable_backward=False, grid_stride=False, module=module)
+    def ordered_counts(
+        begin: int, order: wp.array(dtype=int), tile_counts: wp.array(dtype=int),
+        # outputs
+        counts: wp.array(dtype=wp.int64),
+    ):  # fmt: skip
+        j = begin + wp.tid()
+        counts[j] = wp.int64(tile_counts[order[j]])
+
+    return SimpleNamespace(
+        depth_keys=depth_keys, pack_counts=pack_counts, visible_keys=visible_keys, ordered_counts=ordered_counts
+    )  # fmt: skip
+
+
+def running_counts(
+    counts: torch.Tensor, real, allocator: Allocator = TORCH, out: torch.Tensor | None = None
+) -> torch.Tensor:  # fmt: skip
+    """Return running sums, each of which counts both tiles and visible Gaussians in one number, int64, shape [S].
+
+    A visible Gaussian adds its tile count and 2^`sum_bits`. `split_sum` splits the last sum.
+
+    Args:
+        counts: Tiles that each Gaussian touches, int32, shape [C * N], at least one.
+        real: Scalar type of the Gaussians, of Warp.
+        allocator: Provider of the sums' memory, which is workspace.
+        out: Result of an earlier call, shape [S], for reuse of its memory; None for new memory.
+    """
+    device, count, native = counts.device, len(counts), counts.is_cuda
+    sums, threads = sum_entries(count, native)
+    packed = allocator.workspace((sums,), torch.int64, device) if out is None else out
+    kernel = make_kernels(real, native).pack_counts
+    launch.launch(kernel, threads, [launch.view(counts, wp.int32), sum_bits(count), launch.view(packed, wp.int64)], device)
+    return torch.cumsum(packed, 0, out=packed)
+
+
+def sum_bits(count: int) -> int:
+    """Return how many low bits of a running sum count instances; the other bits count up to ``count`` visible Gaussians."""
+    return 63 - count.bit_length()
+
+
+def sums_fit(count: int, tiles: int) -> bool:
+    """Return whether running sums can count the instances of ``count`` Gaussians in all ``tiles`` tiles of an image."""
+    return count * tiles < 2 ** sum_bits(count)
+
+
+def split_sum(total: int, count: int) -> tuple[int, int]:
+    """Split the last of the `running_counts` of ``count`` Gaussians into numbers of visible Gaussians and of instances."""
+    return divmod(total, 2 ** sum_bits(count))
+
 
 LIST_BYTES = 20
 """Bytes of an instance while the lists are made: two sort buffers of (key, slot), and the Gaussian number."""
 BYTES_PER_INSTANCE = LIST_BYTES + 48 + 80
 """Bytes of an instance with its gradient slot and its part of the saved states (blend_cuda.CHUNKS) on CUDA."""
 
-MAX_INSTANCES = interop.MAX_SIZE // 2
+MAX_INSTANCES = launch.MAX_SIZE // 2
 """Largest number of instances: a radix sort needs one array of twice that size."""
 
 
@@ -99,7 +550,7 @@ def grid(width: int, height: int, tile_size: int) -> tuple[int, int]:
 
 def _checked_counts(projected: torch.Tensor, tile_counts: torch.Tensor) -> torch.Tensor:
     """Return the tile counts by flat Gaussian number, int32, shape [C * N]; ValueError where a shape or type is wrong."""
-    sizes = interop.check(projected=(projected, "C N 12"))
+    sizes = launch.check(projected=(projected, "C N 12"))
     if tuple(tile_counts.shape) != (sizes["C"], sizes["N"]) or tile_counts.dtype != torch.int32:
         wanted, found = [sizes["C"], sizes["N"]], list(tile_counts.shape)
         raise ValueError(f"tile_counts must be int32 of shape {wanted}, not {tile_counts.dtype} of shape {found}")
@@ -110,10 +561,10 @@ def _checked_tiles(cameras: int, width: int, height: int, tile_size: int) -> int
     """Return the number of tiles of all images; ResourceError where there are more than kernels can index."""
     columns, rows = grid(width, height, tile_size)
     tiles = cameras * columns * rows
-    if tiles > interop.MAX_SIZE:
+    if tiles > launch.MAX_SIZE:
         raise ResourceError(
             f"{cameras:,} images of {width} x {height} px have {tiles:,} tiles of {tile_size} px, beyond the "
-            f"{interop.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
+            f"{launch.MAX_SIZE:,} that kernels can index; render fewer cameras at once, or a window of each image"
         )
     return tiles
 
@@ -155,9 +606,9 @@ def _depth_order(
     ones come last, and the number of instances is the capacity. ``projected`` is [C * N, 12], ``counts`` [C * N], ``tiles`` the
     number of tiles of an image.
     """
-    device, count, real, native = projected.device, len(counts), interop.real_of(projected), projected.is_cuda
+    device, count, real, native = projected.device, len(counts), launch.real_of(projected), projected.is_cuda
     k = make_kernels(real, native)
-    projected_view, counts_view = interop.view(projected, real), interop.view(counts, wp.int32)
+    projected_view, counts_view = launch.view(projected, real), launch.view(counts, wp.int32)
     packed = None
     if memory.capacity is not None:
         visible, total = count, memory.capacity
@@ -172,13 +623,13 @@ def _depth_order(
         visible, total = split_sum(int(packed[-1]), count)
         _check_total(total, visible, device, tiles, memory.budget)
     depths, order = (memory.allocator.workspace((2 * visible,), t, device) for t in (projected.dtype, torch.int32))
-    depths_view, order_view = interop.view(depths, real), interop.view(order, wp.int32)
+    depths_view, order_view = launch.view(depths, real), launch.view(order, wp.int32)
     if packed is None:
-        interop.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
+        launch.launch(k.depth_keys, count, [projected_view, counts_view, depths_view, order_view], device)
     else:
-        sums_view, bits = interop.view(packed, wp.int64), sum_bits(count)
+        sums_view, bits = launch.view(packed, wp.int64), sum_bits(count)
         inputs = [projected_view, counts_view, sums_view, bits, visible, depths_view, order_view]
-        interop.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
+        launch.launch(k.visible_keys, sum_entries(count, native)[1], inputs, device)
     sort_pairs(depths_view, order_view, visible)
     return order, visible, total
 
@@ -186,8 +637,8 @@ def _depth_order(
 def _slot_ends(order: torch.Tensor, counts: torch.Tensor, visible: int, kernel, allocator: Allocator) -> torch.Tensor:
     """Return the slot after the last slot of each visible Gaussian, front to back, int64, shape [max(visible, 1)]."""
     ends = allocator.saved((max(visible, 1),), torch.int64, counts.device)
-    inputs = [interop.view(order, wp.int32), interop.view(counts, wp.int32), interop.view(ends, wp.int64)]
-    interop.launch(kernel, visible, inputs, counts.device)
+    inputs = [launch.view(order, wp.int32), launch.view(counts, wp.int32), launch.view(ends, wp.int64)]
+    launch.launch(kernel, visible, inputs, counts.device)
     return torch.cumsum(ends, 0, out=ends) if visible > 0 else ends.zero_()
 
 
@@ -199,11 +650,11 @@ def _sort_by_tile(
     ``keys`` and ``slots`` are sort buffers [2 M], ``owners`` [M], or [0] without ``slotted``; ``ranges`` [C * tiles, 2].
     """
     no_tile, ids = len(ranges), slots[total:] if slotted else slots[:total]  # the second half of the buffers is free again
-    keys_view, slots_view, *others = (interop.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
+    keys_view, slots_view, *others = (launch.view(t, wp.int32) for t in (keys, slots, owners, ids, ranges))
     sort_pairs(keys_view, slots_view, total, end_bit=no_tile.bit_length())
     inputs = [keys_view, slots_view, others[0], total, no_tile, *others[1:]]
     native = keys.is_cuda
-    interop.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)
+    launch.launch(make_find_ranges(slotted, native), -(-total // EACH) if native else total, inputs, keys.device)
     return ids
 
 
@@ -235,13 +686,13 @@ def bin_tiles(
     counts, (columns, rows) = _checked_counts(projected, tile_counts), grid(width, height, tile_size)
     cameras, per_camera = tile_counts.shape
     no_tile = _checked_tiles(cameras, width, height, tile_size)
-    device, real, native, allocator = projected.device, interop.real_of(projected), projected.is_cuda, memory.allocator
+    device, real, native, allocator = projected.device, launch.real_of(projected), projected.is_cuda, memory.allocator
     ranges = allocator.saved((no_tile, 2), torch.int32, device).zero_()
     if len(counts) == 0:
         return Tiles(tile_size, ranges, counts, counts, counts, counts, counts, counts.new_zeros(1, dtype=torch.int64))
 
     projected = projected.detach().contiguous().view(len(counts), -1)
-    with interop.stream_of(device):
+    with launch.stream_of(device):
         order, visible, total = _depth_order(projected, counts, columns * rows, memory)
         ends = _slot_ends(order, counts, visible, make_kernels(real, native).ordered_counts, allocator)
         starts, keys, slots = (allocator.saved((n,), torch.int32, device) for n in (len(counts), 2 * total, 2 * total))
@@ -250,15 +701,15 @@ def bin_tiles(
             keys[:total].fill_(no_tile)
         overflow = starts if memory.capacity is None else memory.overflow
         inputs = [
-            interop.view(projected, real), interop.view(order, wp.int32), interop.view(counts, wp.int32),
-            interop.view(ends, wp.int64), visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
+            launch.view(projected, real), launch.view(order, wp.int32), launch.view(counts, wp.int32),
+            launch.view(ends, wp.int64), visible, per_camera, *origin, width, height, tile_size, rule.alpha_cut,
             rule.square_sigma, columns, columns * rows, no_tile, total,
-            *(interop.view(t, wp.int32) for t in (starts, keys, slots, owners, overflow)),
+            *(launch.view(t, wp.int32) for t in (starts, keys, slots, owners, overflow)),
         ]  # fmt: skip
         if native:
-            interop.launch(make_emit(real, slotted), -(-visible // 256) * 256, inputs, device, cost=10)
+            launch.launch(make_emit(real, slotted), -(-visible // 256) * 256, inputs, device, cost=10)
         else:
-            interop.launch(tiles_emit_cpu.make_emit(real, slotted), -(-visible // LANES), inputs, device, cost=10 * LANES)
+            launch.launch(make_emit_cpu(real, slotted), -(-visible // LANES), inputs, device, cost=10 * LANES)
         if listed is not None:
             own, kept = keys[:total], torch.cat([listed, listed.new_zeros(1)])
             own.masked_fill_(~kept[own.long()], no_tile)

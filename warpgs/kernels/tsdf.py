@@ -14,7 +14,7 @@ import warp as wp
 
 from warpgs.constants import NEAR
 from warpgs.geometry import check_pinhole
-from warpgs.runtime import interop
+from warpgs.kernels import launch
 from warpgs.scene import Camera
 
 
@@ -189,10 +189,10 @@ def empty_grid(
     return DistanceGrid(origin, voxel, truncation, like.new_zeros(shape), like.new_zeros(shape))
 
 
-def _pose(camera: Camera, like: torch.Tensor, kernels: SimpleNamespace) -> list[interop.View]:
+def _pose(camera: Camera, like: torch.Tensor, kernels: SimpleNamespace) -> list[launch.View]:
     """Return viewmat and intrinsics of a numpy camera as kernel arguments."""
     views = (camera.viewmat, kernels.mat44), (camera.K, kernels.mat33)
-    return [interop.view(torch.as_tensor(a[None], dtype=like.dtype, device=like.device), kind) for a, kind in views]
+    return [launch.view(torch.as_tensor(a[None], dtype=like.dtype, device=like.device), kind) for a, kind in views]
 
 
 def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
@@ -209,10 +209,10 @@ def face_cosines(depth: torch.Tensor, camera: Camera) -> torch.Tensor:
         UsageError: The camera is not a pinhole.
     """
     check_pinhole(camera)
-    real = interop.real_of(depth)
+    real = launch.real_of(depth)
     kernels, cosines = make_kernels(real), torch.empty_like(depth)
-    inputs = [interop.view(depth, real), _pose(camera, depth, kernels)[1], interop.view(cosines, real)]
-    interop.launch(kernels.face, depth.numel(), inputs, depth.device, cost=5)
+    inputs = [launch.view(depth, real), _pose(camera, depth, kernels)[1], launch.view(cosines, real)]
+    launch.launch(kernels.face, depth.numel(), inputs, depth.device, cost=5)
     return cosines
 
 
@@ -233,18 +233,18 @@ def integrate(grid: DistanceGrid, camera: Camera, depth: torch.Tensor, pixel_wei
         ValueError: A shape or device is wrong.
     """
     check_pinhole(camera)
-    interop.check(
+    launch.check(
         depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), distances=(grid.distances, "X Y Z"),
         weights=(grid.weights, "X Y Z"),
     )  # fmt: skip
-    real = interop.real_of(depth)
+    real = launch.real_of(depth)
     kernels, shape = make_kernels(real), grid.distances.shape
     inputs = [
-        interop.view(depth.new_tensor([grid.origin]), kernels.vec3), grid.voxel, grid.truncation, shape[1], shape[2],
+        launch.view(depth.new_tensor([grid.origin]), kernels.vec3), grid.voxel, grid.truncation, shape[1], shape[2],
         *_pose(camera, depth, kernels),
-        *(interop.view(t, real) for t in (depth, pixel_weights, grid.distances.view(-1), grid.weights.view(-1))),
+        *(launch.view(t, real) for t in (depth, pixel_weights, grid.distances.view(-1), grid.weights.view(-1))),
     ]  # fmt: skip
-    interop.launch(kernels.integrate, grid.distances.numel(), inputs, depth.device, cost=3)
+    launch.launch(kernels.integrate, grid.distances.numel(), inputs, depth.device, cost=3)
 
 
 def gather_colors(
@@ -269,15 +269,15 @@ def gather_colors(
         ValueError: A shape or device is wrong.
     """
     check_pinhole(camera)
-    interop.check(
+    launch.check(
         points=(points, "N 3"), depth=(depth, "H W"), pixel_weights=(pixel_weights, "H W"), image=(image, "H W 3"),
         sums=(sums, "N 3"), weights=(weights, "N"),
     )  # fmt: skip
-    real = interop.real_of(points)
+    real = launch.real_of(points)
     kernels = make_kernels(real)
     inputs = [
-        interop.view(points, kernels.vec3), tolerance, *_pose(camera, points, kernels),
-        interop.view(depth, real), interop.view(pixel_weights, real), interop.view(image, kernels.vec3),
-        interop.view(sums, kernels.vec3), interop.view(weights, real),
+        launch.view(points, kernels.vec3), tolerance, *_pose(camera, points, kernels),
+        launch.view(depth, real), launch.view(pixel_weights, real), launch.view(image, kernels.vec3),
+        launch.view(sums, kernels.vec3), launch.view(weights, real),
     ]  # fmt: skip
-    interop.launch(kernels.gather, len(points), inputs, points.device, cost=5)
+    launch.launch(kernels.gather, len(points), inputs, points.device, cost=5)

@@ -1,4 +1,4 @@
-"""Fusion of the depth of all cameras into a mesh: distances, then triangles, then their colours."""
+"""Fusion of depth into a grid of signed distances, and its zero surface as triangles."""
 
 from __future__ import annotations
 
@@ -9,14 +9,223 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from warpgs.errors import DataError, UsageError
+from warpgs.device import available_bytes, format_bytes
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.kernels.launch import MAX_SIZE
 from warpgs.kernels.tsdf import DistanceGrid, empty_grid, gather_colors, integrate
-from warpgs.mesh.agreement import DepthMap, agreed, depth_map, neighbours
-from warpgs.mesh.grid import MAX_RESOLUTION, MIN_RESOLUTION, GridPlan, check_memory, plan_grid
-from warpgs.mesh.surface_views import DEPTHS, SAMPLES, SurfaceViews, sample_surface
-from warpgs.mesh.triangles import decimate, extract, remove_small_parts
+from warpgs.mesh.views import DEPTHS, SAMPLES, DepthMap, SurfaceViews, agreed, depth_map, neighbours, sample_surface
 from warpgs.render.options import RasterizeOptions
 from warpgs.scene import Camera, Gaussians, Mesh
+
+RESOLUTION = 256
+"""Voxels along the longest side of the box around the surfaces, if neither ``voxel`` nor ``resolution`` is given."""
+MIN_RESOLUTION, MAX_RESOLUTION = 8, 4096
+TRUNCATION = 4.0
+"""Largest distance from a surface that the grid stores, in voxels."""
+FENCE = 3.0
+"""Distance outside the quartiles, in interquartile ranges, beyond which a coordinate is an outlier (Tukey, 1977: Exploratory
+Data Analysis)."""
+QUANTILES = (0.005, 0.995)
+"""Quantiles of the surface points' coordinates; they bound the grid along each axis, unless `FENCE` bounds it more tightly."""
+GRID_BYTES = 8
+"""Bytes of a grid point on the device: distance and weight."""
+HOST_BYTES = 14
+"""Bytes of a grid point in main memory while triangles are made: two copies of the distances, the weights, and two masks."""
+
+
+@dataclass(frozen=True)
+class GridPlan:
+    """A regular grid of points, parallel to the axes of the world."""
+
+    origin: tuple[float, float, float]
+    """Position of the first point [u]."""
+    voxel: float
+    """Distance from one point to the next [u]."""
+    shape: tuple[int, int, int]
+    """Number of points along each axis."""
+    inside: float
+    """Fraction of the surface points inside the grid."""
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return math.prod(self.shape)
+
+    @property
+    def truncation(self) -> float:
+        """Largest distance from a surface that is stored [u]."""
+        return TRUNCATION * self.voxel
+
+
+def find_box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner, shape [3] each, of the box around points, except outliers along each axis.
+
+    Points far behind all others, such as a background at infinity, are cut off.
+
+    Args:
+        points: Positions [u], shape [N, 3].
+    """
+    first, third = np.quantile(points, [0.25, 0.75], axis=0)
+    low, high = np.quantile(points, QUANTILES, axis=0)
+    return np.maximum(low, first - FENCE * (third - first)), np.minimum(high, third + FENCE * (third - first))
+
+
+def plan_grid(
+    points: np.ndarray, footprints: np.ndarray, voxel: float | None = None, resolution: int | None = None
+) -> GridPlan:
+    """Choose the grid that holds the surfaces which cameras see.
+
+    Args:
+        points: Points of the surfaces [u], shape [N, 3].
+        footprints: Width of a pixel at each point [u], shape [N].
+        voxel: Distance between neighbouring grid points [u]; None to derive it from ``resolution``.
+        resolution: Voxels along the longest side; None for `RESOLUTION`, or fewer where a voxel would be smaller than half of
+            the median footprint.
+
+    Raises:
+        DataError: No camera sees a surface.
+        UsageError: ``voxel`` is not positive, or too small for the extent of the points.
+    """
+    if not len(points):
+        raise DataError(
+            "no training view shows a surface: alpha is below 0.5 or depth uncertain everywhere; fit again with more steps"
+        )
+    low, high = find_box(points)
+    longest = float((high - low).max())
+    if voxel is None:
+        voxel = longest / (RESOLUTION if resolution is None else resolution)
+        if resolution is None:
+            voxel = max(voxel, float(np.median(footprints)) / 2)
+    if not (voxel > 0 and longest / voxel <= 2**20):
+        raise UsageError("--voxel must be at least a millionth of the longest side of the scene")
+    margin = 2 * TRUNCATION * voxel
+    shape = tuple(int(n) for n in np.ceil((high - low + 2 * margin) / voxel) + 1)
+    inside = ((points >= low - margin) & (points <= high + margin)).all(1).mean()
+    x, y, z = low - margin
+    return GridPlan((float(x), float(y), float(z)), voxel, (shape[0], shape[1], shape[2]), float(inside))
+
+
+def check_memory(plan: GridPlan, device: torch.device) -> str:
+    """Return how much memory a grid takes, as text, before it is allocated.
+
+    Raises:
+        ResourceError: The grid needs more than 80 % of the free memory, or has more points than kernels can index.
+    """
+    cpu = torch.device("cpu")
+    needs = {device: plan.points * GRID_BYTES}
+    needs[cpu] = needs.get(cpu, 0) + plan.points * HOST_BYTES
+    sizes = " x ".join(map(str, plan.shape))
+    remedy = "give a larger --voxel or a smaller --resolution"
+    if plan.points > MAX_SIZE:
+        raise ResourceError(f"a grid of {sizes} points is beyond the {MAX_SIZE:,} that kernels can index; {remedy}")
+    for where, needed in needs.items():
+        free = available_bytes(where)
+        if needed > 0.8 * free:
+            raise ResourceError(
+                f"a grid of {sizes} points takes {format_bytes(needed)} of memory on {where}, more than 80 % of the free "
+                f"{format_bytes(free)}; {remedy}"
+            )
+    return format_bytes(sum(needs.values()))
+
+
+MAX_JUMP = 1.1
+"""Largest difference, in units of the truncation, of the distances at two neighbouring grid points with a surface between them.
+A smaller limit leaves out surfaces at grazing angles; with a larger one, false triangles extend behind depth edges. The limit
+and the truncation were chosen on a demo scene with another seed than the scene of the results
+(docs/decisions/019-thresholds.md)."""
+NO_SURFACE = (
+    "no surface inside the grid; give a larger --voxel (a smaller one if voxels are as large as the scene), or fit "
+    "with more steps"
+)
+"""Message for a grid without a surface."""
+MIN_PART = 0.002
+"""Smallest fraction of all triangles that a connected part needs to be kept; smaller parts float in front of surfaces."""
+
+
+def _grey(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """Return a mesh of vertices [V, 3] and triangles [F, 3], without colours."""
+    return Mesh(vertices, faces.astype(np.int32), np.full(vertices.shape, 0.5, np.float32))
+
+
+def extract(grid: DistanceGrid) -> Mesh:
+    """Return the surface where distances are 0, without colours.
+
+    The surface is left open where no view looked: a triangle is kept only if both grid points beside each of its vertices were
+    seen. No triangle is made where the distance jumps from in front of one surface to behind another, as at depth edges.
+
+    Args:
+        grid: The grid.
+
+    Raises:
+        DataError: There is no surface inside the grid.
+    """
+    from skimage.measure import marching_cubes
+
+    distances, weights = grid.distances.cpu().numpy(), grid.weights.cpu().numpy()
+    seen = weights > 0
+    values = np.where(seen, distances, np.float32(1))
+    if not (values < 0).any() or min(values.shape) < 2:
+        raise DataError(NO_SURFACE)
+    corners, faces, _, _ = marching_cubes(values, 0.0, gradient_direction="descent", allow_degenerate=False)
+    # A vertex lies on an edge of the grid: between the points below and above.
+    below, above = (tuple(f(corners).astype(np.int64).T) for f in (np.floor, np.ceil))
+    kept = seen[below] & seen[above] & (np.abs(values[below] - values[above]) <= MAX_JUMP)
+    faces = faces[kept[faces].all(1)]
+    if not len(faces):
+        raise DataError(NO_SURFACE)
+    return _compact(_grey(np.array(grid.origin) + grid.voxel * corners.astype(np.float64), faces))
+
+
+def _compact(mesh: Mesh) -> Mesh:
+    """Remove vertices that no triangle uses."""
+    used = np.zeros(len(mesh.vertices), bool)
+    used[mesh.faces] = True
+    numbers = np.cumsum(used) - 1
+    return Mesh(mesh.vertices[used], numbers[mesh.faces].astype(np.int32), mesh.colors[used])
+
+
+def parts(mesh: Mesh) -> tuple[int, np.ndarray]:
+    """Return the number of connected parts, and the part of each triangle, shape [F]."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    ends = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    count = len(mesh.vertices)
+    graph = coo_array((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), (count, count))
+    number, labels = connected_components(graph, directed=False)
+    return number, labels[mesh.faces[:, 0]]
+
+
+def remove_small_parts(mesh: Mesh, fraction: float = MIN_PART) -> tuple[Mesh, int]:
+    """Return a mesh without connected parts of less than ``fraction`` of all triangles, and the number of removed parts."""
+    number, part = parts(mesh)
+    sizes = np.bincount(part, minlength=number)
+    keep = sizes >= max(1.0, fraction * len(mesh.faces))
+    left = Mesh(mesh.vertices, mesh.faces[keep[part]], mesh.colors)
+    return _compact(left), int((~keep).sum())
+
+
+def decimate(mesh: Mesh, max_faces: int) -> Mesh:
+    """Return a mesh of at most about ``max_faces`` triangles, without colours; open edges stay where they are.
+
+    VTK collapses edges in the order of their quadric error (Garland and Heckbert 1997). This part of VTK needs no graphics
+    library.
+
+    Args:
+        mesh: The mesh; it is returned unchanged if it is small enough.
+        max_faces: Number of triangles, at least 4.
+    """
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    import pyvista
+
+    # centred and scaled to size 1, since VTK computes in float32
+    middle = mesh.vertices.mean(0)
+    size = float(np.abs(mesh.vertices - middle).max()) or 1.0
+    data = pyvista.PolyData.from_regular_faces(((mesh.vertices - middle) / size).astype(np.float32), mesh.faces)
+    fewer = data.decimate(1 - max_faces / len(mesh.faces))
+    return _compact(_grey(np.asarray(fewer.points, np.float64) * size + middle, fewer.regular_faces))
+
 
 COLOR_TOLERANCE = 1.0
 """Largest distance between a vertex and the surface of a view that colours it, as a multiple of the grid's truncation."""

@@ -1,34 +1,245 @@
-"""Poses of photographs or of a video: from files without cameras to a scene folder that a fit reads."""
+"""`find_poses`: photographs become a scene folder, with a record of how, and advice where it fails."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from warpgs import schema
 from warpgs.errors import DataError, UsageError
-from warpgs.files import filling, is_empty, make_folder, write_bytes
-from warpgs.input_files import NOT_REGULAR, input_digest, unread_reason
-from warpgs.io.decoding import MAX_PIXELS
-from warpgs.io.readers import all_readers
-from warpgs.io.unread_formats import unread_note
-from warpgs.poses.advice import MIN_KEYPOINTS, partners
-from warpgs.poses.heic import is_heic, to_jpeg
+from warpgs.files import (
+    NOT_REGULAR,
+    filling,
+    input_digest,
+    is_empty,
+    make_folder,
+    unread_reason,
+    write_bytes,
+    write_json,
+    write_text,
+)
+from warpgs.io.folder import all_readers
+from warpgs.io.images import MAX_PIXELS, unread_note
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
-from warpgs.poses.matcher import Matcher, open_matcher, write_matches
+from warpgs.poses.matching import Matcher, open_matcher, write_matches
 from warpgs.poses.photographs import (
     Photograph,
     find_photographs,
     folder_notes,
     image_root,
+    is_heic,
+    is_video,
     photographs_inside,
     prepare,
+    to_jpeg,
     write_copy,
+    write_frames,
 )
-from warpgs.poses.record import record_of, write_record
-from warpgs.poses.video import is_video, write_frames
+
+MIN_KEYPOINTS = 100
+"""Keypoints below which a photograph shows too little to match: a blank wall, darkness, blur."""
+MIN_MATCHES = 15
+"""Number of matches that a pair needs, all in agreement with one motion of the camera."""
+WEAK_MATCHES = 60
+"""Matches below which the link between two photographs is called weak: a few wrong matches bend the poses."""
+WIDE_ANGLE = 30.0
+"""Angle between the optical axes of neighbours [degrees] beyond which SIFT finds few matches."""
+MAX_ADVICE = 8
+"""Number of pieces of advice that are given, the most urgent first."""
+
+
+def partners(found: Mapping, i: int) -> list[tuple[int, int]]:
+    """Return the photographs that photograph ``i`` matches, each with the number of matches, most matches first."""
+    return sorted(found.links.get(i, ()), key=lambda link: (-link[1], link[0]))
+
+
+def reason(found: Mapping, i: int, names: Sequence[str]) -> str:
+    """Return why a photograph has no pose, in words that follow its name."""
+    keypoints = found.keypoints[i]
+    if keypoints < MIN_KEYPOINTS:
+        return f"has {keypoints} keypoints, too few to match: a blank wall, darkness or blur"
+    best = partners(found, i)
+    if not best:
+        return f"has {keypoints:,} keypoints and matches no other photograph"
+    j, n = best[0]
+    matched = f"has {keypoints:,} keypoints and {n} matches with {names[j]}"
+    if j in found.views:
+        return f"{matched}, too few of them at places of known depth"
+    group = next((g for g in found.groups[1:] if i in g), ())
+    together = f", in a separate group of {len(group)}" if group else ""
+    return f"{matched}, which has no pose either{together}"
+
+
+def axis_angle(found: Mapping, i: int, j: int) -> float:
+    """Return the angle between the optical axes of two views [degrees]."""
+    cosine = float((found.views[i].rotation[2] * found.views[j].rotation[2]).sum())
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def neighbours(found: Mapping) -> list[tuple[int, int, float]]:
+    """Return the pairs of views that connect all views by the smallest angles (a minimum spanning tree), with their angles."""
+    last, *left = list(found.views) or [-1]
+    nearest: dict[int, tuple[float, int]] = dict.fromkeys(left, (math.inf, -1))
+    tree = []
+    while nearest:
+        for j, best in nearest.items():
+            nearest[j] = min(best, (axis_angle(found, last, j), last))
+        (angle, i), last = min((best, j) for j, best in nearest.items())
+        del nearest[last]
+        tree.append((min(i, last), max(i, last), angle))
+    return sorted(tree)
+
+
+def advice(found: Mapping, names: Sequence[str]) -> list[str]:
+    """Return what to photograph next, a sentence each, the most urgent first; empty if nothing is missing."""
+    said = []
+    for i in range(len(names)):
+        if i not in found.views:
+            best = partners(found, i)
+            if found.keypoints[i] < MIN_KEYPOINTS:
+                said.append(f"take {names[i]} again: sharp, in good light, with a textured object in view")
+            elif best:
+                said.append(f"take two or three photographs between {names[i]} and {names[best[0][0]]}, in small steps")
+            else:
+                said.append(f"take photographs from {names[i]} to the others, each overlapping the previous one by two thirds")
+    tree = neighbours(found)
+    for i, j, angle in sorted(tree, key=lambda t: -t[2]):
+        if angle > WIDE_ANGLE:
+            said.append(
+                f"take one or two photographs between {names[i]} and {names[j]}, whose axes differ by {angle:.0f} degrees"
+            )
+    for i in found.views:
+        best = [(n, j) for j, n in partners(found, i) if j in found.views]
+        if best and best[0][0] < WEAK_MATCHES:
+            said.append(f"take a photograph between {names[i]} and {names[best[0][1]]}, which share only {best[0][0]} matches")
+    more = len(said) - MAX_ADVICE
+    return said[:MAX_ADVICE] + ([f"and {more} more; begin with those above"] if more > 0 else [])
+
+
+JSON, TEXT = "poses.json", "poses.txt"
+FORMAT = 1
+"""Number of the format of poses.json."""
+SHOWN_PARTNERS = 5
+"""Largest number of matched photographs that the record names for a photograph."""
+FEW = 5
+"""Largest number of photographs for which a focal length without EXIF is called uncertain (decision 017)."""
+_PHOTOGRAPH = schema.fields(
+    {
+        "name": schema.text, "sha256": schema.text, "registered": schema.flag, "keypoints": schema.whole(0),
+        "points": schema.whole(0), "matches": schema.mapping(schema.whole(1)), "reason": schema.or_null(schema.text),
+    },
+)  # fmt: skip
+_RECORD = schema.fields(
+    {
+        "format": schema.one_of(FORMAT), "source_sha256": schema.text, "photographs": schema.items(_PHOTOGRAPH),
+        "notes": schema.items(schema.text), "advice": schema.items(schema.text),
+        "mean_reprojection_error_px": schema.number(0), "points": schema.whole(0),
+        "method": schema.one_of("incremental", "global"), "pairs_tried": schema.whole(0), "pairs_matched": schema.whole(0),
+        "cameras": schema.items(schema.fields({
+            "focal": schema.number(above=0), "distortion": schema.number(), "width": schema.whole(1), "height": schema.whole(1),
+        })), "pycolmap": schema.text,
+    },
+)  # fmt: skip
+
+
+def record_of(found: Mapping, photographs: Sequence[Photograph], digest: str, notes: Sequence[str]) -> dict[str, Any]:
+    """Return the contents of poses.json; ``digest`` is the hash of the source, ``notes`` are choices made for the user."""
+    names = [p.name for p in photographs]
+    rows = []
+    for i, p in enumerate(photographs):
+        registered = i in found.views
+        rows.append({
+            "name": p.name, "sha256": p.digest, "registered": registered, "keypoints": found.keypoints[i],
+            "points": found.views[i].points if registered else 0,
+            "matches": {names[j]: n for j, n in partners(found, i)[:SHOWN_PARTNERS]},
+            "reason": None if registered else reason(found, i, names),
+        })  # fmt: skip
+    remarks = [summary(found, len(names))]
+    if found.kept_focal:
+        remarks.append(f"the focal length is taken from EXIF, because {len(found.views)} photographs cannot improve it")
+    elif found.kept_focal is False:
+        remarks.append(
+            f"the EXIF focal length does not fit the {len(found.views)} photographs, which may be cropped; the focal length "
+            "was estimated instead. Such an estimate is often 5 % off, at worst 20 % or more"
+        )
+    elif len(found.views) <= FEW and any(photographs[i].focal is None for i in found.views):
+        remarks.append(
+            f"EXIF holds no focal length. An estimate from {len(found.views)} photographs is often 5 % off, at worst 20 % or "
+            "more, and so is depth. Add photographs from more directions"
+        )
+    if found.method == "global":
+        remarks.append(
+            "global mapping is used, because it joined more photographs than incremental mapping; results of global mapping "
+            "differ a little from run to run"
+        )
+    return {
+        "format": FORMAT, "source_sha256": digest, "photographs": rows,
+        "notes": [*notes, *remarks],
+        "advice": advice(found, names), "mean_reprojection_error_px": found.error, "points": found.points,
+        "method": found.method, "pairs_tried": found.tried, "pairs_matched": len([n for n in found.matches.values() if n]),
+        "cameras": [dict(vars(c)) for c in found.cameras], "pycolmap": found.version,
+    }  # fmt: skip
+
+
+def summary(found: Mapping, count: int) -> str:
+    """Return a sentence on how many of ``count`` photographs have a pose, and how well they fit."""
+    focal = ", ".join(f"{c.focal:.0f} px of {max(c.width, c.height)}" for c in found.cameras)
+    return (
+        f"poses found for {len(found.views)} of {count} photographs from {found.points:,} points, mean reprojection error "
+        f"{found.error:.2f} px, {found.method} mapping, focal length {focal}"
+    )
+
+
+def report_lines(record: dict[str, Any]) -> list[str]:
+    """Return a record as lines of text: the choices, each photograph, and what to photograph next."""
+    rows = record["photographs"]
+    width = max((len(p["name"]) for p in rows), default=0)
+    lines = [*record["notes"], ""]
+    for p in rows:
+        best = ", ".join(f"{name} ({n})" for name, n in list(p["matches"].items())[:2])
+        if p["registered"]:
+            lines.append(
+                f"{p['name']:<{width}}  pose    {p['keypoints']:>6,} keypoints, {p['points']:>5,} points, matches {best}"
+            )
+        else:
+            lines.append(f"{p['name']:<{width}}  NO POSE: it {p['reason']}")
+    lines += [
+        "",
+        "What to photograph next:" if record["advice"] else "Nothing more is needed: all photographs are well linked.",
+    ]
+    return lines + [f"- {a}" for a in record["advice"]]
+
+
+def write_record(folder: Path, record: dict[str, Any]) -> None:
+    """Write poses.json and poses.txt into a folder.
+
+    Raises:
+        ResourceError: The disk is full.
+    """
+    write_json(folder / JSON, record)
+    write_text(folder / TEXT, "\n".join(report_lines(record)) + "\n")
+
+
+def read_poses_record(folder: Path) -> dict[str, Any]:
+    """Read poses.json of a scene whose poses were found.
+
+    Raises:
+        DataError: The record is missing or incomplete.
+    """
+    path = folder / JSON
+    try:
+        record: dict[str, Any] = schema.read(path, folder)
+        _RECORD(record, "")
+    except (OSError, schema.SchemaError) as e:
+        raise DataError(f"{path}: cannot be read ({e}); find the poses again with `warpgs poses`") from e
+    return record
+
 
 MIN_PHOTOGRAPHS = 3
 """Fewest photographs: with two, nothing checks the focal length and the depths."""

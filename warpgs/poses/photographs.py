@@ -1,24 +1,297 @@
-"""Photographs without cameras: their files, their EXIF values, and copies without personal metadata."""
+"""Photographs and videos that poses are found for: which they are, and their copies as images."""
 
 from __future__ import annotations
 
 import functools
 import hashlib
+import importlib.util
+import itertools
+import json
 import math
+import sys
 from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
-from warpgs.errors import DataError
-from warpgs.files import UNDECODABLE, make_folder, write_bytes
-from warpgs.io.decoding import MAX_PIXELS, decode, read_image_file
-from warpgs.io.exif import read_exif
-from warpgs.io.image_formats.kinds import format_of
-from warpgs.io.images import list_images, turn_upright
-from warpgs.io.inside import inside
-from warpgs.poses.metadata import without_jpeg_metadata, without_png_metadata
+from warpgs.errors import DataError, UsageError, install_extras
+from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
+from warpgs.io.image_formats.avif import BRANDS_END, kind
+from warpgs.io.image_formats.jpeg import EOI, LONE, MARKER, NEXT_MARKER, SOS
+from warpgs.io.image_formats.png import SIGNATURE
+from warpgs.io.images import (
+    EXPOSURE,
+    FOCAL_35MM,
+    MAKE,
+    MAX_PIXELS,
+    MODEL,
+    decode,
+    format_of,
+    list_images,
+    parse_exif,
+    read_exif,
+    read_image_file,
+    read_image_start,
+    turn_upright,
+)
+from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
+
+JFIF, ADOBE, COMMENT = 0xE0, 0xEE, 0xFE
+"""JPEG segments: the first two define the colour coding, and are kept."""
+APPLICATION = range(0xE0, 0xF0)
+"""JPEG segments of applications."""
+KEPT_CHUNKS = (b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"IEND")
+"""Chunks of a PNG file with its pixels; all others are metadata."""
+
+
+def without_jpeg_metadata(data: bytes) -> bytes:
+    """Return a JPEG file that decodes to the same pixels, without comments and application segments (JFIF and Adobe stay).
+
+    Data after the end of the image are removed, too: phones store films and depth maps there.
+
+    Args:
+        data: A file that was decoded without an error.
+    """
+    parts, at = [data[:2]], 2
+    while found := MARKER.match(data, at):
+        marker, begin, at = found[1][0], at, found.end()
+        if marker == EOI:
+            return b"".join([*parts, data[begin:at]])
+        if marker not in LONE:
+            at += int.from_bytes(data[at : at + 2], "big")
+        if marker == SOS:
+            after = NEXT_MARKER.search(data, at)
+            at = len(data) if after is None else after.start()
+        if marker in (JFIF, ADOBE) or not (marker == COMMENT or marker in APPLICATION):
+            parts.append(data[begin:at])
+    return b"".join(parts)
+
+
+def without_png_metadata(data: bytes) -> bytes:
+    """Return a PNG file with only those chunks that hold pixels.
+
+    Args:
+        data: A file that was decoded without an error.
+    """
+    parts, at = [SIGNATURE], len(SIGNATURE)
+    while at + 12 <= len(data):
+        kind, begin = data[at + 4 : at + 8], at
+        at += 12 + int.from_bytes(data[at : at + 4], "big")
+        if kind in KEPT_CHUNKS:
+            parts.append(data[begin:at])
+        if kind == b"IEND":
+            break
+    return b"".join(parts)
+
+
+SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+"""Suffixes of video files."""
+SHARPNESS_SIDE = 640
+"""Longer side at which frames are compared for sharpness [px]: small enough to average out noise and compression artefacts."""
+MAX_FRAMES = 100_000
+"""Longest video that is read [frames]: an hour at 25 a second."""
+MAX_FRAME_PIXELS = 2**26
+"""Largest frame that is read [px]: 8K has half of that."""
+MAX_TOTAL_PIXELS = 2**40
+"""Largest number of pixels of all frames that are read: an hour and a half of 4K at 25 frames a second."""
+START = 12
+"""First bytes of a file, which identify its container."""
+BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
+"""First boxes of MP4 and MOV files (ISO/IEC 14496-12, QuickTime)."""
+
+
+def is_video(path: Path) -> bool:
+    """Return whether a path is a file with the suffix of a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def _frames(path: Path) -> Iterator[np.ndarray]:
+    """Yield the frames of a video, uint8 BGR [H, W, 3], upright."""
+    import cv2
+
+    _check_container(path)
+    with utf8_name(path) as name, hidden_stderr():  # for a broken file, both would print the error, too
+        capture = cv2.VideoCapture(name, cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise DataError(
+                f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames"
+            )
+        size = capture.get(cv2.CAP_PROP_FRAME_WIDTH) * capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        if not 0 < size <= MAX_FRAME_PIXELS:
+            raise DataError(f"{path}: its frames have {size:,.0f} pixels, not 1 to {MAX_FRAME_PIXELS:,}; convert the video")
+        total = 0
+        for _ in range(MAX_FRAMES):
+            there, frame = capture.read()
+            if not there:
+                return
+            total += frame.shape[0] * frame.shape[1]
+            if total > MAX_TOTAL_PIXELS:
+                raise DataError(f"{path}: has more than {MAX_TOTAL_PIXELS:,} pixels in all frames; cut it shorter or shrink it")
+            yield frame
+    finally:
+        capture.release()
+    raise DataError(f"{path}: has more than {MAX_FRAMES:,} frames; cut it shorter")
+
+
+def _check_container(path: Path) -> None:
+    """Raise a DataError if a file is not a video container: FFmpeg would follow a playlist to other files."""
+    try:
+        start = read_start(path, START)
+    except OSError as e:
+        raise DataError(f"{path}: the video cannot be read ({unread_reason(e)}); fix its permissions or copy it again") from e
+    avi, matroska = start[:4] == b"RIFF" and start[8:] == b"AVI ", start[:4] == b"\x1a\x45\xdf\xa3"
+    if not (avi or matroska or start[4:8] in BOXES):
+        raise DataError(f"{path}: OpenCV cannot read it as a video; convert it to an mp4 file with H.264, or give its frames")
+
+
+def sharpness(frame: np.ndarray) -> float:
+    """Return the variance of the Laplacian of a frame, uint8 BGR [H, W, 3], at a size at which noise averages out."""
+    import cv2
+
+    gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    scale = SHARPNESS_SIDE / max(gray.shape)
+    if scale < 1:
+        gray = cv2.resize(gray, (0, 0), fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray.astype(np.float64), cv2.CV_64F).var())
+
+
+def sharpest(values: list[float], count: int) -> list[int]:
+    """Return indices of at most ``count`` frames: the sharpest of each of ``count`` equal parts, the first if several are."""
+    bounds = np.linspace(0, len(values), min(count, len(values)) + 1).round().astype(int)
+    return [a + int(np.argmax(values[a:b])) for a, b in itertools.pairwise(bounds)]
+
+
+def write_frames(path: Path, folder: Path, count: int, progress: Callable[[str], object]) -> int:
+    """Write the sharpest frame of each of ``count`` equal parts of a video as PNG files, named by their number.
+
+    Args:
+        path: The video file.
+        folder: Folder to write into.
+        count: Number of frames to write; all frames if the video has fewer.
+        progress: Called with a line for the user for each frame.
+
+    Returns:
+        The number of frames that the video has.
+
+    Raises:
+        DataError: The video cannot be read, or is too long.
+        ResourceError: The disk is full.
+    """
+    import cv2
+
+    values = []
+    for i, frame in enumerate(_frames(path)):
+        progress(f"looking for sharp frames: {i + 1} read")
+        values.append(sharpness(frame))
+    if not values:
+        raise DataError(f"{path}: holds no frame that OpenCV can read; record it again, or give its frames as images")
+    wanted = set(sharpest(values, count))
+    for i, frame in enumerate(_frames(path)):
+        if i in wanted:
+            progress(f"writing frames: frame {i}")
+            _, png = cv2.imencode(".png", frame, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            write_bytes(folder / f"frame_{i:06d}.png", png.tobytes())
+    return len(values)
+
+
+# HEIC photographs, as phones take them: coded again as JPEG by a separate process.
+#
+# pi-heif (libheif and libde265, LGPL) reads them. A malicious file can crash the process that reads it, so one separate
+# process reads all photographs.
+
+QUALITY = 98
+"""JPEG quality of the copies, without subsampling of colours."""
+
+
+def is_heic(path: Path) -> bool:
+    """Return whether a file begins as a HEIC file does.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    return kind(read_image_start(path, BRANDS_END)) == "HEIC"
+
+
+def to_jpeg(
+    paths: Sequence[Path], root: Path, folder: Path, max_pixels: int, progress: Callable[[str], object] = lambda line: None
+) -> dict[Path, Path]:
+    """Write upright JPEG copies of HEIC files, with only maker, model and focal length as EXIF; return the copy of each.
+
+    Args:
+        paths: HEIC files below ``root``.
+        root: The folder of photographs.
+        folder: Folder of the copies, which have the relative names with .jpg added.
+        max_pixels: Largest number of pixels that a header may announce.
+        progress: Called with lines for the user.
+
+    Raises:
+        DataError: A file cannot be decoded, or has too many pixels.
+        UsageError: pi-heif is not installed.
+    """
+    if not paths:
+        return {}
+    if importlib.util.find_spec("pi_heif") is None:
+        raise UsageError(
+            f"{paths[0]}: is a HEIC photograph, and the package pi-heif is not installed; "
+            f"{install_extras('poses')}, or convert all HEIC files to JPEG"
+        )
+    copies = {p: folder / f"{p.relative_to(root).as_posix()}.jpg" for p in paths}
+    for copy in copies.values():
+        make_folder(copy.parent)
+    job = folder / "heic.json"
+    write_json(job, {"max_pixels": max_pixels, "files": [[str(p.resolve()), str(c)] for p, c in copies.items()]})
+    at, why = 0, "the decoder ended early"
+    try:
+        for line in python_lines("warpgs.poses.photographs", str(job), folder=folder):
+            said = json.loads(line)
+            if "error" in said:
+                why = said["error"]
+                break
+            at = said["file"]
+            progress(f"reading HEIC: photograph {at + 1} of {len(paths)}")
+        else:
+            return copies
+    except ProcessFailed as e:
+        why = f"the decoder ended with code {e.code}"
+    raise DataError(f"{paths[at]}: the image cannot be decoded: {why}. Restore it from its source, or convert it to JPEG")
+
+
+def _coded_again(source: Path, max_pixels: int) -> bytes:
+    """Return the copy of one file."""
+    import io
+
+    import pi_heif
+    from PIL import Image
+
+    with pi_heif.HeifImageFile(io.BytesIO(read_image_file(source, max_pixels))) as image:
+        width, height = image.size
+        if width * height > max_pixels:
+            raise ValueError(f"{width} x {height} px are more than the limit of {max_pixels:,} pixels (--max-pixels)")
+        found, kept = parse_exif(image.info.get("exif") or b""), Image.Exif()
+        kept.update({tag: text for tag, text in ((MAKE, found.maker), (MODEL, found.model)) if text})
+        if found.focal is not None:
+            kept.get_ifd(EXPOSURE)[FOCAL_35MM] = int(found.focal)
+        pixels = io.BytesIO()
+        image.convert("RGB").save(pixels, "JPEG", quality=QUALITY, subsampling=0, exif=kept)
+    return pixels.getvalue()
+
+
+def main(path: str) -> None:
+    """Copy the files of a job; print a line of JSON before each file, and one with the first error."""
+    job: dict[str, Any] = json.loads(Path(path).read_text("utf-8"))
+    for i, (source, target) in enumerate(job["files"]):
+        answer(json.dumps({"file": i}))
+        try:
+            copy = _coded_again(Path(source), job["max_pixels"])
+        except Exception as e:  # decoders raise a dozen types on malformed files; the caller names the file
+            answer(json.dumps({"error": str(e).strip().rstrip(".") or type(e).__name__}))
+            return
+        write_bytes(Path(target), copy)
+
 
 MASK_FOLDERS = ("mask", "masks", "idrmasks")
 """Folders beside or below photographs that hold masks."""
@@ -191,3 +464,8 @@ def write_copy(photograph: Photograph, folder: Path, max_pixels: int = MAX_PIXEL
     suffix, options = (".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]) if kind == "JPEG" else (".png", [])
     _, coded = cv2.imencode(suffix, np.round(255 * pixels).astype(np.uint8), options)
     write_bytes(target, coded.tobytes())
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    main(sys.argv[1])

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from warpgs.priors.matches import Features, agreeing_matches, sift_features
-from warpgs.priors.opencv import single_threaded_opencv, without_ipp
+from warpgs.priors.flow import Features, agreeing_matches, sift_features
+from warpgs.priors.networks import single_threaded_opencv, without_ipp
 from warpgs.scene import View
 
 MIN_SHARPNESS = 0.87

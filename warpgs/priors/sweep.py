@@ -1,26 +1,403 @@
-"""Plane-sweep depth: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
-
-Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996). The method
-is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a parabola between planes.
-Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md compares sweeps with optical flow.
-"""
+"""Depth by plane sweep: which views to compare, which planes, and the depth that fits best."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from warpgs.kernels.plane_depths import check_round_trip
-from warpgs.priors import sweep_cpu, sweep_cuda
-from warpgs.priors.opencv import single_threaded_opencv
-from warpgs.priors.sweep_planes import SweepConfig, plane_inverses
-from warpgs.priors.view_choice import matching_views, shared_sight, spread_views
-from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.device_memory import installed_bytes
-from warpgs.scene import View, ViewDepth
+from warpgs import geometry
+from warpgs.device import format_bytes, installed_bytes
+from warpgs.errors import UsageError
+from warpgs.geometry import check_pinhole, matmul
+from warpgs.kernels.sweep import NEUTRAL, best_inverses, check_round_trip, plane_costs, scanline_costs
+from warpgs.priors.flow import homogeneous
+from warpgs.priors.networks import single_threaded_opencv
+from warpgs.scene import Camera, View, ViewDepth
+
+SMOOTHNESS = (1e2, 1e4, 1e6)
+"""Strengths of the smoother, in order. A stronger smoother reaches farther; each pixel uses the first that reaches it."""
+COLOR_SIGMA = 8.0
+"""Colour difference [1/255] at which the weight between neighbours falls to 1/e."""
+MIN_FRACTION = 1e-3
+"""Smallest fraction of a smoothed value that must come from consistent pixels."""
+
+
+def complete(depth: np.ndarray, valid: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """Fill a depth map by edge-aware averages of inverse depth.
+
+    The result is a ratio: smoothed inverse depths of consistent pixels, divided by the smoothed mask. The smoother is that of
+    Min et al. 2014. Planes stay planes in inverse depth, and far surfaces are not pulled near. Measured in
+    docs/decisions/007-coarse-start.md.
+
+    Args:
+        depth: z-depths [u], float32, shape [H, W].
+        valid: True where the depth is consistent, bool, shape [H, W].
+        image: Colours in [0, 1], shape [H, W, 3].
+
+    Returns:
+        z-depths [u], float32, shape [H, W]: unchanged where valid, the median where no consistent pixel reaches; 0 everywhere
+        if no pixel is valid.
+    """
+    import cv2
+
+    if not valid.any():
+        return np.zeros(depth.shape, np.float32)
+    inverse = np.where(valid, 1 / np.where(valid, depth, 1), 0).astype(np.float32)
+    guide = (image * 255).round().clip(0, 255).astype(np.uint8)
+    filled = np.full(depth.shape, np.median(inverse[valid]))
+    left = np.ones(depth.shape, bool)
+    with single_threaded_opencv():
+        for strength in SMOOTHNESS:
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, strength, COLOR_SIGMA)
+            fraction = smoother.filter(valid.astype(np.float32))
+            filled_now = left & (fraction > MIN_FRACTION)
+            filled[filled_now] = smoother.filter(inverse)[filled_now] / fraction[filled_now]
+            left &= ~filled_now
+    low, high = inverse[valid].min(), inverse[valid].max()
+    return np.where(valid, depth, 1 / filled.clip(low, high)).astype(np.float32)
+
+
+SAMPLES = 4
+"""Number of sampled pixels along each side of an image."""
+DEPTHS = 3
+"""Number of depths at each sampled pixel."""
+LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE = 1.0, 30.0, 60.0
+"""Angles between two rays to a point [deg]. Below the first, depth is uncertain. Above the second, a surface looks different to
+both views. From the third on, the views are assumed to share nothing."""
+
+
+class Sight(NamedTuple):
+    """Shared sight of pairs of V views, as fractions of what the first view of a pair sees."""
+
+    overlap: np.ndarray
+    """Fraction of what the first view sees that the second sees, too, less at larger angles, in [0, 1], shape [V, V]."""
+    matching: np.ndarray
+    """Shared fraction, weighted by how well depth can be found at the angle; 0 for a view and itself, shape [V, V]."""
+
+
+def _sampled(camera: Camera, bounds: tuple[float, float]) -> np.ndarray:
+    """Return points [S, 3] that a camera may see: at a grid of pixels, and depths evenly spaced in their logarithm."""
+    check_pinhole(camera)
+    along = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    x, y = (a.ravel() for a in np.meshgrid(along * camera.width, along * camera.height))
+    near, far = bounds
+    depths = [near * (far / near) ** ((k + 0.5) / DEPTHS) for k in range(DEPTHS)]
+    pixels = np.tile(np.stack([x, y], 1), (DEPTHS, 1))
+    return geometry.back_project(camera, pixels, np.repeat(depths, len(x)))
+
+
+def shared_sight(cameras: Sequence[Camera], bounds: Sequence[tuple[float, float]]) -> Sight:
+    """Return what pairs of views share, by projecting points sampled in each camera's frustum into all others.
+
+    The method follows the view selection of multi-view stereo (Goesele et al. 2007; angles are weighted as by Yao et al. 2018),
+    but samples points instead of using reconstructed ones.
+
+    Args:
+        cameras: Pinhole cameras of V views.
+        bounds: Nearest and farthest depth of each view [u], 0 < near < far.
+    """
+    turns, shifts = np.stack([c.viewmat[:3, :3] for c in cameras]), np.stack([c.viewmat[:3, 3] for c in cameras])
+    K, centers = np.stack([c.K for c in cameras]), np.stack([c.center for c in cameras])
+    sides = np.array([(c.width, c.height) for c in cameras], float)
+    least, most, lost = (1 - np.cos(np.radians(a)) for a in (LEAST_ANGLE, MOST_ANGLE, LOST_ANGLE))
+    overlap, matching = np.zeros((2, len(cameras), len(cameras)))
+    for i, (camera, near_far) in enumerate(zip(cameras, bounds)):
+        points = _sampled(camera, near_far)
+        local = (turns[:, None] * points[None, :, None, :]).sum(3) + shifts[:, None]  # [V, S, 3]
+        ahead = local[..., 2] > 1e-9
+        z = np.where(ahead, local[..., 2], 1)
+        u = (K[:, None, 0] * local).sum(2) / z
+        v = (K[:, None, 1] * local).sum(2) / z
+        seen = ahead & (u >= 0) & (v >= 0) & (u < sides[:, :1]) & (v < sides[:, 1:])
+        rays = points[None] - centers[:, None]
+        rays /= np.maximum(np.sqrt((rays**2).sum(2, keepdims=True)), 1e-12)
+        turned = 1 - (rays * rays[i]).sum(2)  # 1 - cosine grows with the square of a small angle
+        alike = np.clip((lost - turned) / (lost - most), 0, 1)
+        close = np.clip(1 - np.sqrt(np.maximum(turned, 0) / lost), 0, 1)
+        overlap[i] = (seen * close).mean(1)
+        matching[i] = (seen * alike * np.clip(turned / least, 0, 1)).mean(1)
+        matching[i, i] = 0
+    return Sight(np.round(overlap, 9), np.round(matching, 9))  # rounding errors must not decide
+
+
+def matching_views(sight: Sight, cameras: Sequence[Camera], index: int, count: int, among: Sequence[int]) -> list[int]:
+    """Return up to ``count`` views to compare a view with: the nearest cameras (ties by order) that share sight with it.
+
+    Views too near for depth are skipped: their angles reduce `Sight.matching` to less than half of `Sight.overlap`. If no view
+    is left, the sampled points may have missed the overlap, and the nearest cameras are returned. Choosing the views that share
+    most at the best angles gave fewer depths, and mostly lower PSNR (docs/decisions/013-any-capture.md).
+
+    Args:
+        sight: What pairs of views share.
+        cameras: Cameras of all views.
+        index: The view.
+        count: Number of views wanted.
+        among: Views to choose from; the view itself is left out.
+    """
+    rest = [j for j in among if j != index]
+    matching, overlap = sight.matching[index], sight.overlap[index]
+    good = [j for j in rest if matching[j] > 0 and matching[j] >= 0.5 * overlap[j]]
+    away = {j: float(np.linalg.norm(cameras[j].center - cameras[index].center)) for j in rest}
+    return sorted(good or rest, key=away.get)[:count]
+
+
+def spread_views(sight: Sight, most: int) -> list[int]:
+    """Return up to ``most`` views, in ascending order, chosen to cover as much of the area of all views as possible.
+
+    Each step adds the view that most increases the sum, over all views, of the largest overlap with a chosen view. This greedy
+    choice for a submodular sum reaches at least 1 - 1/e of the optimum (Nemhauser et al. 1978).
+    """
+    count = len(sight.overlap)
+    if count <= most:
+        return list(range(count))
+    shared = np.where(np.eye(count, dtype=bool), 1, sight.overlap)
+    covered, taken = np.zeros(count), []
+    while len(taken) < most:
+        gains = np.maximum(shared - covered[:, None], 0).sum(0).round(9)
+        gains[taken] = -1
+        taken.append(int(gains.argmax()))
+        covered = np.maximum(covered, shared[:, taken[-1]])
+    return sorted(taken)
+
+
+NOISE = (2 / 255) ** 2
+"""Variance below which the pattern in a correlation window counts as noise: correlation fades to 0 there."""
+EDGE = 0.06
+"""Colour step between neighbouring pixels at which the penalty for a jump in depth falls to 1/e."""
+UNIT = 4096
+"""Integer that stands for cost 1 in cost volumes of 16 bits. Such volumes need half the memory of float32; the first access
+to memory takes as long as the computation."""
+MAX_LARGE_STEP = 0.99
+"""Largest penalty P2 at which the sum of four path costs, each at most 1 + P2, stays below 2^15 in units of 1 / `UNIT`."""
+PLANES_AT_ONCE = 16
+"""Number of planes per launch on the GPU."""
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """Settings of the planes, of the smoothing of costs and of the consistency check."""
+
+    near_count: int = 4
+    """Number of other views with which each view is compared: the nearest that see the same surfaces."""
+    max_views: int = 30
+    """Largest number of views that are swept: those that together see most of the scene. All others serve only for
+    comparison."""
+    window: int = 7
+    """Side of the square in which pixels are correlated [px]: 3, 5 or 7."""
+    spacing: float = 0.5
+    """Largest step of a match from one plane to the next [px], if `max_planes` allows it."""
+    max_planes: int = 256
+    """Largest number of planes, at least 8; memory is about 5 bytes per pixel and plane."""
+    max_pixels: int = 200_000
+    """Largest number of pixels of an image; larger ones are swept at a reduced size."""
+    small_step: float = 0.03
+    """Penalty for a depth one plane off the neighbouring pixel's (P1); costs are in [0, 1]."""
+    large_step: float = 0.5
+    """Penalty for any other depth (P2) where the image is uniform; less across the image's edges, but at least 1.5 P1."""
+    max_round_trip: float = 0.6
+    """Largest error [px] when a pixel is projected into another view and back by that view's depth."""
+    min_parallax: float = 0.5
+    """Smallest angle between the two rays [deg]; below it depth is noise."""
+
+    def __post_init__(self):
+        if self.window not in (3, 5, 7):  # kernels add up squares in 32 bits
+            raise UsageError(f"sweep window {self.window} must be 3, 5 or 7")
+        if not (self.max_planes >= 8 and self.near_count >= 1 and self.max_pixels >= 1 and self.max_views >= 2):
+            raise UsageError(
+                "sweep max-planes must be at least 8, near-count and max-pixels at least 1, max-views at least 2; found "
+                f"{self.max_planes}, {self.near_count}, {self.max_pixels}, {self.max_views}"
+            )
+        for name in ("spacing", "small_step", "large_step", "max_round_trip", "min_parallax"):
+            if not getattr(self, name) > 0:
+                raise UsageError(f"sweep {name.replace('_', '-')} must be above 0, not {getattr(self, name)}")
+        if not max(self.large_step, 1.5 * self.small_step) <= MAX_LARGE_STEP:
+            raise UsageError(
+                f"sweep large-step and 1.5 times small-step must be at most {MAX_LARGE_STEP}, not {self.large_step} and "
+                f"{1.5 * self.small_step:g}"
+            )
+
+
+def project_inverse(first: Camera, second: Camera, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+    """Project pixels [N, 2] at inverse depths [1/u] [N] into the second image; return positions [px] [N, 2], NaN if behind."""
+    check_pinhole(first)
+    check_pinhole(second)
+    rotation, translation = geometry.relative_pose(first, second)
+    rays = matmul(homogeneous(pixels), geometry.inverse(first.K).T)
+    p = matmul(matmul(rays, rotation.T) + inverse[:, None] * translation, second.K.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(p[:, 2:] > 1e-9, p[:, :2] / p[:, 2:], np.nan)
+
+
+def inside_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return True where pixels [..., 2] [px] are in the image of ``camera``; False for NaN."""
+    return (pixels >= 0).all(-1) & (pixels[..., 0] < camera.width) & (pixels[..., 1] < camera.height)
+
+
+def plane_inverses(
+    first: Camera, others: Sequence[Camera], bounds: tuple[float, float], spacing: float, max_planes: int
+) -> np.ndarray:
+    """Return inverse depths [1/u] of planes, evenly spaced and ascending, from the far to the near bound [u].
+
+    Their number, 8 to ``max_planes``, is the smallest at which no match inside an image moves more than about ``spacing`` px
+    between planes.
+    """
+    near, far = bounds
+    x, y = np.meshgrid(np.linspace(0, first.width, 5), np.linspace(0, first.height, 5))
+    pixels = np.stack([x.ravel(), y.ravel()], 1)
+    ladder = np.linspace(1 / far, 1 / near, 17)
+    longest = 0.0
+    for other in others:
+        found = np.stack([project_inverse(first, other, pixels, np.full(len(pixels), w)) for w in ladder])
+        inside = inside_image(other, found)
+        steps = np.linalg.norm(np.diff(found, axis=0), axis=2)[inside[1:] & inside[:-1]]
+        longest = max(longest, float(steps.max(initial=0)) * (len(ladder) - 1))
+    return np.linspace(1 / far, 1 / near, int(np.clip(np.ceil(longest / spacing) + 1, 8, max_planes)))
+
+
+def plane_homography(first: Camera, second: Camera, inverse: float) -> np.ndarray:
+    """Return H [3, 3] from first to second by the plane z = 1 / inverse, for pixel centres at integers (OpenCV)."""
+    check_pinhole(first)
+    check_pinhole(second)
+    rotation, translation = geometry.relative_pose(first, second)
+    moved = rotation + inverse * np.outer(translation, [0, 0, 1])
+    H = matmul(matmul(second.K, moved), geometry.inverse(first.K))
+    back, shift = (np.array([[1, 0, s], [0, 1, s], [0, 0, 1]]) for s in (-0.5, 0.5))
+    return matmul(matmul(back, H), shift)
+
+
+def plane_homographies(first: Camera, others: Sequence[Camera], inverses: np.ndarray) -> np.ndarray:
+    """Return `plane_homography` of D inverse depths [1/u] and N other cameras, shape [D, N, 3, 3]."""
+    start = np.stack([plane_homography(first, o, 0.0) for o in others])
+    slope = np.stack([plane_homography(first, o, 1.0) for o in others]) - start
+    return start + inverses[:, None, None, None] * slope
+
+
+def gray_of(view: View) -> np.ndarray:
+    """Return the brightness of a view's pixels in [0, 1], float32, shape [H, W], with the weights of ITU-R BT.601."""
+    red, green, blue = (view.image[..., i].astype(float) for i in range(3))
+    return (0.299 * red + 0.587 * green + 0.114 * blue).astype(np.float32)
+
+
+def step_limits(colors: np.ndarray, small_step: float, large_step: float) -> np.ndarray:
+    """Return P2 of the steps along the first axis of an image [L, B, 3], in units of 1 / `UNIT`, int16, shape [L - 1, B]."""
+    jumps = np.abs(np.diff(colors, axis=0)).max(2).astype(float)  # the rounding of float32's exp depends on the processor
+    return np.rint(np.maximum(large_step * np.exp(-jumps / EDGE), 1.5 * small_step) * UNIT).astype(np.int16)
+
+
+def matching_costs_cpu(view: View, others: Sequence[View], inverses: np.ndarray, window: int) -> torch.Tensor:
+    """Return the disagreement of views at D inverse depths [1/u] in units of 1 / `UNIT`, as `plane_costs` does."""
+    homographies = plane_homographies(view.camera, [o.camera for o in others], inverses)
+    return plane_costs(gray_of(view), [gray_of(o) for o in others], homographies, window, NOISE, UNIT)
+
+
+def path_costs(costs: torch.Tensor, image: np.ndarray, small_step: float, large_step: float) -> torch.Tensor:
+    """Return the sum of the semi-global path costs from four sides.
+
+    Args:
+        costs: Matching costs in units of 1 / `UNIT`, int16, shape [H, W, D], on any device.
+        image: Colours in [0, 1] whose edges allow jumps, shape [H, W, 3].
+        small_step: Penalty for a change of one plane.
+        large_step: Penalty for any other change, less across edges of the image (`step_limits`).
+
+    Returns:
+        Sums in units of 1 / `UNIT`, int16, shape [H, W, D].
+    """
+    down, across = (
+        torch.from_numpy(step_limits(colors, small_step, large_step).astype(np.int32)).to(costs.device)
+        for colors in (image, image.swapaxes(0, 1))
+    )
+    return scanline_costs(costs, down, across.T, round(small_step * UNIT))
+
+
+def inverse_depths_cpu(view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig) -> np.ndarray:
+    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view.
+
+    Args:
+        view: The view.
+        others: Views to compare it with.
+        planes: Inverse depths [1/u] of the planes, ascending, shape [D].
+        config: Window, penalties.
+    """
+    costs = matching_costs_cpu(view, others, planes, config.window)
+    return best_inverses(path_costs(costs, view.image, config.small_step, config.large_step), planes)
+
+
+MAPS = 24
+"""Number of float32 maps of a plane that exist while its costs are computed."""
+
+
+def needed_bytes(view: View, planes: int) -> int:
+    """Return the largest device memory [bytes] that `inverse_depths_cuda` takes for a view and ``planes`` planes."""
+    return view.camera.width * view.camera.height * (4 * planes + 4 * MAPS * min(planes, PLANES_AT_ONCE))
+
+
+def matching_costs_cuda(
+    view: View, others: Sequence[View], inverses: np.ndarray, window: int, device: torch.device
+) -> torch.Tensor:
+    """Return the costs of `sweep_cpu.matching_costs`, without its padding planes, int16, shape [H, W, D], on the device."""
+
+    def box(maps: torch.Tensor) -> torch.Tensor:
+        r = window // 2
+        return torch.nn.functional.avg_pool2d(torch.nn.functional.pad(maps, (r, r, r, r), mode="reflect"), window, 1)
+
+    own, *grays = [torch.from_numpy(gray_of(v))[None, None].to(device) for v in (view, *others)]
+    width, height = view.camera.width, view.camera.height
+    x = torch.arange(width, dtype=torch.float32, device=device)
+    y = torch.arange(height, dtype=torch.float32, device=device)[:, None]
+    mean = box(own)
+    variance = (box(own * own) - mean * mean).clamp(min=0) + NOISE
+    costs = torch.empty(height, width, len(inverses), dtype=torch.int16, device=device)
+    for first in range(0, len(inverses), PLANES_AT_ONCE):
+        chosen, least, total = inverses[first : first + PLANES_AT_ONCE], None, 0
+        for other, gray in zip(others, grays):
+            to_other = np.stack([plane_homography(view.camera, other.camera, w) for w in chosen])
+            H = torch.from_numpy(to_other).to(device, torch.float32)[..., None, None]  # [P, 3, 3, 1, 1]
+            p = [H[:, i, 0] * x + H[:, i, 1] * y + H[:, i, 2] for i in range(3)]
+            sides = (other.camera.width, other.camera.height)
+            # with centres as grid_sample has them without align_corners; with it, torch would load cuDNN
+            at = torch.stack([(2 * p[i] / p[2] + 1) / n - 1 for i, n in enumerate(sides)], -1)  # [P, H, W, 2]
+            # outside is -1, which is less than any colour, also where a pixel is partly outside
+            raised = (gray + 1).expand(len(chosen), -1, -1, -1)
+            warped = torch.nn.functional.grid_sample(raised, at, align_corners=False) - 1
+            m = box(warped)
+            v = (box(warped * warped) - m * m).clamp(min=0) + NOISE
+            cost = 0.5 - 0.5 * (box(own * warped) - mean * m) / (variance * v).sqrt()
+            cost = torch.where(warped >= 0, cost, NEUTRAL)
+            total = total + cost
+            least = cost if least is None else torch.minimum(least, cost)
+        found = (0.5 * least + total * (0.5 / len(others))).clamp(0, 1) * UNIT
+        costs[..., first : first + len(chosen)] = found.round()[:, 0].permute(1, 2, 0).to(torch.int16)
+    return costs
+
+
+def best_inverse(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
+    """Return inverse depths [1/u] as `plane_depths.best_inverses` does, float64, shape [H, W], on the host."""
+    k = costs.argmin(2, keepdim=True).clamp(1, len(inverses) - 2)
+    left, middle, right = (costs.gather(2, k + o).double() for o in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    offset = torch.where(bend > 1e-9, 0.5 * (left - right) / bend.clamp(min=1e-9), 0).clamp(-1, 1)
+    return (inverses[0] + (k + offset) * (inverses[1] - inverses[0]))[..., 0].cpu().numpy()
+
+
+@torch.no_grad()
+def inverse_depths_cuda(
+    view: View, others: Sequence[View], planes: np.ndarray, config: SweepConfig, device: torch.device
+) -> np.ndarray:
+    """Return inverse depths [1/u] of a view, float64, shape [H, W], by sweeping planes against at least one other view."""
+    costs = matching_costs_cuda(view, others, planes, config.window, device)
+    return best_inverse(path_costs(costs, view.image, config.small_step, config.large_step), planes)
+
+
+# Plane-sweep depth: agreement with other views at every depth, smoothed along scanlines, then cross-checked.
+#
+# Poses are known, so a match is sought only along the epipolar line, with one plane per inverse depth (Collins 1996).
+# The method is zero-mean normalised correlation over a window, semi-global aggregation (Hirschmüller 2008) and a
+# parabola between planes. Depths are kept where the sweep of another view agrees. docs/decisions/007-coarse-start.md
+# compares sweeps with optical flow.
 
 CPU = torch.device("cpu")
 GPU_FRACTION = 0.25
@@ -75,14 +452,14 @@ def _backend(
     """Return the function that sweeps a view on the device, or on the CPU if the device cannot, and messages on this."""
     notes: list[str] = []
     if device.type == "cuda":
-        needed = max(sweep_cuda.needed_bytes(views[i], len(p)) for i, p in planes.items())
+        needed = max(needed_bytes(views[i], len(p)) for i, p in planes.items())
         smallest = min(min(v.image.shape[:2]) for v in views.values())
         # not by the free memory: a resumed fit must find the same depths again
         if needed > GPU_FRACTION * installed_bytes(device):
             notes.append(f"depth is swept on the CPU, since a GPU needs {format_bytes(needed / GPU_FRACTION)} of memory")
         elif smallest > config.window // 2:  # torch mirrors no border wider than the image
-            return lambda view, others, p: sweep_cuda.inverse_depths(view, others, p, config, device), notes
-    return lambda view, others, p: sweep_cpu.inverse_depths(view, others, p, config), notes
+            return lambda view, others, p: inverse_depths_cuda(view, others, p, config, device), notes
+    return lambda view, others, p: inverse_depths_cpu(view, others, p, config), notes
 
 
 def _at_size(found: ViewDepth, small: View, view: View, notes: Sequence[str]) -> ViewDepth:

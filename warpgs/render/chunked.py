@@ -7,11 +7,19 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from warpgs.kernels.ellipse import ProjectInputs
+from warpgs.kernels.launch import first_order, keep, kept
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.render.compose import Images, bin_and_blend, bin_projected, heaviest_of, median_depth_of, weights_of
-from warpgs.render.settings import RenderSettings, Window
-from warpgs.runtime.derivatives import first_order, keep, kept
+from warpgs.render.compose import (
+    Images,
+    RenderSettings,
+    Window,
+    bin_and_blend,
+    bin_projected,
+    heaviest_of,
+    median_depth_of,
+    weights_of,
+)
 
 
 @dataclass(frozen=True)

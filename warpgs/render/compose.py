@@ -1,8 +1,4 @@
-"""Project, bin, blend: the steps from Gaussians to images.
-
-`rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to allocate
-memory. Only `RenderSettings` holds the camera model, the spherical-harmonics degree, the cut-offs and the window of a render.
-"""
+"""One pass of the rasterizer: projection, binning and blending, with the settings of each."""
 
 from __future__ import annotations
 
@@ -12,17 +8,68 @@ from typing import Any
 
 import torch
 
+from warpgs.constants import Rule
 from warpgs.kernels import blend as blending
-from warpgs.kernels.blend import blend, contributions
-from warpgs.kernels.blend_channels import blend_channels
-from warpgs.kernels.heaviest import heaviest
-from warpgs.kernels.median_depth import median_depth
+from warpgs.kernels import launch, sh
+from warpgs.kernels.blend import blend, blend_channels, contributions
+from warpgs.kernels.ellipse import ProjectInputs, ProjectSettings, checked_factors, nothing, packed_covariances
+from warpgs.kernels.falloff import BlendSettings
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.project_inputs import ProjectInputs, checked_factors, nothing, packed_covariances
 from warpgs.kernels.tiles import AS_NEEDED, InstanceMemory, Tiles, bin_tiles
-from warpgs.render.settings import RenderSettings
-from warpgs.runtime import interop
+from warpgs.kernels.walk import heaviest, median_depth
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, RasterizedGaussians
+
+Window = tuple[int, int, int, int]
+"""Left, top, width and height [px]."""
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Image, window, cut-offs and camera model of a render."""
+
+    width: int
+    """Width of the whole image [px]."""
+    height: int
+    """Height of the whole image [px]."""
+    window: Window
+    """Part of the image to render."""
+    degree: int
+    """Spherical-harmonics degree used."""
+    rule: Rule
+    """Cut-offs."""
+    tile_size: int = 16
+    """Side of a tile [px]."""
+    camera_model: str = "pinhole"
+    """Name of the camera model."""
+    parameters: str = "stored"
+    """Kind of the Gaussians' parameters (`ProjectSettings.parameters`)."""
+    absgrad: bool = False
+    """True to sum magnitudes of the gradients of projected means, too (`BlendSettings.absgrad`)."""
+    antialiased: bool = False
+    """True to reduce the opacity of Gaussians that the pixel filter widens (`ProjectSettings.antialiased`)."""
+
+    def projection(self) -> ProjectSettings:
+        """Return the settings of the projection."""
+        size, count = (self.width, self.height), sh.coefficient_count(self.degree)
+        variant = (self.camera_model, self.parameters, self.antialiased)
+        return ProjectSettings(size, self.window, count, self.rule, self.tile_size, *variant)
+
+    def of_window(self) -> dict[str, Any]:
+        """Return the window's size and position, and the rule, as keyword arguments of binning and blending."""
+        x, y, width, height = self.window
+        return {"width": width, "height": height, "rule": self.rule, "origin": (x, y)}
+
+    def blending(self, deterministic: bool = True) -> BlendSettings:
+        """Return the settings of blending; True for ``deterministic`` sums gradients in a fixed order."""
+        x, y, width, height = self.window
+        return BlendSettings((x, y), width, height, self.rule, deterministic, self.absgrad)
+
+
+# Project, bin, blend: the steps from Gaussians to images.
+#
+# `rasterize`, chunked and graphed rendering and the training step all call these functions, each with its own way to
+# allocate memory. Only `RenderSettings` holds the camera model, the spherical-harmonics degree, the cut-offs and the
+# window of a render.
 
 Images = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 """Colour [C, H, W, 3], or [C, H, W, D] of Gaussians with D channels; alpha and expected depth [C, H, W]."""
@@ -87,7 +134,7 @@ def inputs_of(gaussians: RasterizedGaussians, camera: Camera, opacity_factors: t
         distortion = _for_each("distortion", camera.distortion, viewmats, 1)
     factors = checked_factors(means, opacity_factors)
     if isinstance(gaussians, CovarianceGaussians):
-        interop.check(means=(means, "N 3"), covars=(gaussians.covars, "N 3 3"))
+        launch.check(means=(means, "N 3"), covars=(gaussians.covars, "N 3 3"))
         _, covars, opacities, sh = gaussians.tensors().values()
         return ProjectInputs(means, *packed_covariances(covars), opacities, sh, viewmats, Ks, distortion, factors)
     return ProjectInputs(*gaussians.tensors().values(), viewmats, Ks, distortion, factors)

@@ -20,19 +20,15 @@ from typing import NamedTuple
 import torch
 import warp as wp
 
-from warpgs.kernels import blend, project
-from warpgs.kernels.cameras.base import CAMERA_MODELS
-from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid
-from warpgs.kernels.tiles_order import running_counts, split_sum, sums_fit
+from warpgs.device import available_bytes
+from warpgs.kernels import blend, launch, project
+from warpgs.kernels.cameras import CAMERA_MODELS
+from warpgs.kernels.ellipse import ProjectInputs
+from warpgs.kernels.graphs import MIN_REPLAYS, GraphedFunction, GraphPool
+from warpgs.kernels.launch import Allocator, fetch, first_order, keep, kept
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, InstanceMemory, Tiles, Visible, grid, running_counts, split_sum, sums_fit
 from warpgs.means2d import count_passes
-from warpgs.render.compose import composite_into
-from warpgs.render.settings import RenderSettings
-from warpgs.runtime import interop
-from warpgs.runtime.allocator import Allocator, fetch
-from warpgs.runtime.cuda_graph import MIN_REPLAYS, GraphedFunction, GraphPool
-from warpgs.runtime.derivatives import first_order, keep, kept
-from warpgs.runtime.device_memory import available_bytes
+from warpgs.render.compose import RenderSettings, composite_into
 
 MIN_CALLS = 3
 """Number of calls in a row with equal keys (`call_key`) before kernels are captured. It doubles after a capture that is
@@ -156,8 +152,8 @@ class GraphedRasterizer:
         fetch(self._table.ptr, 16 * self.cameras, 25 * self.cameras, cameras)
         _, counts = project.project_tensors(self._inputs(gaussians, cameras), self._project_settings, allocator)
         self._sums = running_counts(counts.view(-1), wp.float32, out=self._sums)  # no copy: used only within the call
-        with interop.stream_of(self.device):
-            wp.copy(self._host_total, interop.view(self._sums[-1:], wp.int64).array())
+        with launch.stream_of(self.device):
+            wp.copy(self._host_total, launch.view(self._sums[-1:], wp.int64).array())
         return ()
 
     def _bin_and_blend(self, allocator: Allocator, projected, counts, backgrounds) -> tuple[torch.Tensor, ...]:
@@ -377,7 +373,7 @@ _RECORDERS: dict[tuple[torch.device, int, bool], Recorder] = {}
 
 def recorder(device: torch.device, gradients: bool = True) -> Recorder:
     """Return the recorder of torch's current stream on a CUDA device, for calls with or without ``gradients``."""
-    key = (device, interop.warp_stream(device).cuda_stream, gradients)
+    key = (device, launch.warp_stream(device).cuda_stream, gradients)
     found = _RECORDERS.get(key)
     return found or _RECORDERS.setdefault(key, Recorder(GraphPool(device), gradients))
 

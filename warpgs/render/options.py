@@ -8,12 +8,9 @@ from numbers import Real
 import numpy as np
 import torch
 
-from warpgs.constants import Rule
-from warpgs.errors import UsageError
-from warpgs.field_docs import document_fields
-from warpgs.render.compose import settings_of
-from warpgs.render.settings import RenderSettings
-from warpgs.rules import rule_named
+from warpgs.constants import Rule, rule_named
+from warpgs.errors import UsageError, document_fields
+from warpgs.render.compose import RenderSettings, settings_of
 from warpgs.scene import Camera
 
 SWITCHES = ("contributions", "median_depth", "error_bound", "deterministic", "absgrad", "antialiased", "record")

@@ -1,25 +1,32 @@
-"""The rasterizer as one differentiable call: Gaussians and cameras in, images out."""
+"""The rasterizer: `rasterize` checks what it is given, renders it, and `select_rule` measures its rules."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields, replace
+from numbers import Real
 from typing import Any, NamedTuple, overload
 
+import numpy as np
 import torch
 
-from warpgs.constants import FAR, Rule
+from warpgs.constants import FAR, K_TOLERANCE, POSE_TOLERANCE, Rule, rule_named
+from warpgs.device import available_bytes, installed_bytes
 from warpgs.errors import ResourceError, UsageError
-from warpgs.kernels.blend_records import WIDTHS
-from warpgs.kernels.cameras.base import check_camera
+from warpgs.kernels import launch
+from warpgs.kernels.cameras import check_camera
+from warpgs.kernels.ellipse import ProjectInputs
+from warpgs.kernels.falloff import WIDTHS
+from warpgs.kernels.launch import refuse_transforms, without_gradient
 from warpgs.kernels.project import project_inputs
-from warpgs.kernels.project_inputs import ProjectInputs
-from warpgs.kernels.tiles import MAX_INSTANCES, InstanceMemory
+from warpgs.kernels.tiles import MAX_INSTANCES, InstanceMemory, grid
 from warpgs.means2d import count_passes
 from warpgs.render import graphed
-from warpgs.render.camera_checks import check_arrays
 from warpgs.render.chunked import ChunkedFrame, blend_chunked, contributions_chunked, heaviest_chunked, median_depth_chunked
 from warpgs.render.compose import (
+    RenderSettings,
+    Window,
     bin_projected,
     heaviest_of,
     images_of,
@@ -29,16 +36,200 @@ from warpgs.render.compose import (
     parameters_of,
     settings_of,
     weights_of,
-)  # fmt: skip
-from warpgs.render.lists import for_each
+)
 from warpgs.render.options import RasterizeOptions
-from warpgs.render.pixels import at_pixels, checked_pixels, listed_tiles, window_of
-from warpgs.render.settings import RenderSettings, Window
-from warpgs.rules import rule_named
-from warpgs.runtime import interop
-from warpgs.runtime.derivatives import refuse_transforms, without_gradient
-from warpgs.runtime.device_memory import available_bytes, installed_bytes
 from warpgs.scene import ActivatedGaussians, Camera, CovarianceGaussians, Gaussians, RasterizedGaussians, Render
+
+# Checks of the arrays of a camera. Values on a GPU are not checked: reading them would wait for the device.
+
+
+def check_arrays(camera: Camera) -> None:
+    """Check types and shapes of a camera's arrays, the types of width and height, and the values of arrays in main memory.
+
+    Raises:
+        TypeError: An array is neither a numpy array nor a tensor, is sparse, or has values that are not real or have half
+            precision; or width or height is not an integer.
+        ValueError: A shape is wrong; a number is not finite; K has a focal length of 0, a skew or another last row than
+            0, 0, 1; or a viewmat scales or shears, or has another last row than 0, 0, 0, 1.
+    """
+    for name, rows, tolerance, off, check in MATRICES:
+        given: Any = getattr(camera, name)
+        _check_type(name, given)
+        if given.ndim not in (2, 3) or tuple(given.shape[-2:]) != (rows, rows):
+            raise ValueError(f"camera.{name} must have shape [{rows}, {rows}] or [C, {rows}, {rows}], not {list(given.shape)}")
+        if getattr(given, "is_cuda", False):
+            continue
+        listed = given.tolist()  # Python numbers take a third of the time of tensors
+        for i, matrix in enumerate(listed if given.ndim == 3 else (listed,)):
+            if not off(matrix) <= tolerance:  # also where a number is NaN or infinite; few matrices get further
+                check(matrix, f"camera.{name}[{i}]" if given.ndim == 3 else f"camera.{name}")
+    distortion: Any = camera.distortion
+    if distortion is not None:
+        _check_type("distortion", distortion)
+        if distortion.ndim not in (1, 2):
+            raise ValueError(f"camera.distortion must have shape [P] or [C, P], not {list(distortion.shape)}")
+        if not (getattr(distortion, "is_cuda", False) or all(map(math.isfinite, distortion.reshape(-1).tolist()))):
+            raise ValueError(f"camera.distortion has non-finite values: {distortion.tolist()}")
+    for name in ("width", "height"):
+        size = getattr(camera, name)
+        if not isinstance(size, (int, np.integer)):
+            raise TypeError(f"camera.{name} must be a whole number of pixels, not {size!r}")
+
+
+def _check_type(name: str, array: Any) -> None:
+    """Raise TypeError where a value is not a dense array of real numbers, and ValueError for a device without kernels."""
+    if not isinstance(array, (np.ndarray, torch.Tensor)):
+        raise TypeError(
+            f"camera.{name} must be a numpy array or a tensor, not {type(array).__name__}; numpy.array or torch.stack makes one"
+        )
+    if isinstance(array, torch.Tensor):
+        launch.check_device(f"camera.{name}", array)
+        if array.layout != torch.strided:
+            raise TypeError(f"camera.{name} must be dense, not {array.layout}; camera.{name}.to_dense() converts it")
+    if str(array.dtype).removeprefix("torch.") in ("float16", "bfloat16"):
+        raise TypeError(f"camera.{name} must be float32 or float64, not {array.dtype}: its rounding would shift the image")
+    real = not array.is_complex() if isinstance(array, torch.Tensor) else array.dtype.kind in "fiub"
+    if not real:
+        raise TypeError(f"camera.{name} must hold real numbers, not {array.dtype}")
+
+
+def _skew_of(matrix: list[list[float]]) -> float:
+    """Return the sum of the errors of K's constant entries; non-finite if an entry of K is, or if a focal length is 0."""
+    (fx, skew, cx), (below, fy, cy), (left, middle, last) = matrix
+    if not (fx and fy):
+        return math.inf
+    return abs(skew) + abs(below) + abs(left) + abs(middle) + abs(last - 1) + 0 * (fx + cx + fy + cy)
+
+
+def _check_intrinsics(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the intrinsics are non-finite, or have a skew, a focal length of 0, or a wrong last row."""
+    _check_finite(matrix, where)
+    (fx, skew, _), (below, fy, _), (left, middle, last) = matrix
+    if not (fx and fy):
+        raise ValueError(f"{where} must have focal lengths other than 0, not {fx:g} and {fy:g}")
+    if max(map(abs, (left, middle, last - 1))) > K_TOLERANCE:
+        raise ValueError(f"{where} must have the last row 0, 0, 1, not {left:g}, {middle:g}, {last:g}; divide K by K[2, 2]")
+    if max(abs(skew), abs(below)) > K_TOLERANCE:
+        raise ValueError(
+            f"{where} has a skew of {skew or below:g} px, which is not supported: K must be [[fx, 0, cx], [0, fy, cy], "
+            "[0, 0, 1]]; undistort the images"
+        )
+
+
+def _products(matrix: list[list[float]]) -> tuple[float, ...]:
+    """Return the entries of R R^T - 1."""
+    (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = matrix
+    return (
+        a * a + b * b + c * c - 1, d * d + e * e + f * f - 1, g * g + h * h + i * i - 1,
+        a * d + b * e + c * f, a * g + b * h + c * i, d * g + e * h + f * i,
+    )  # fmt: skip
+
+
+def _stretch_of(matrix: list[list[float]]) -> float:
+    """Return the sum of the errors of R R^T and of the last row of a pose; non-finite if an entry of the pose is."""
+    (p, q, r, s), shift = matrix[3], matrix[0][3] + matrix[1][3] + matrix[2][3]
+    return sum(map(abs, _products(matrix))) + abs(p) + abs(q) + abs(r) + abs(s - 1) + 0 * shift
+
+
+def _check_pose(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where the pose is not rigid; a reflection is allowed, since the mirrored image is correct."""
+    _check_finite(matrix, where)
+    p, q, r, s = matrix[3]
+    if max(map(abs, (p, q, r, s - 1))) > POSE_TOLERANCE:
+        raise ValueError(f"{where} must have the last row 0, 0, 0, 1, not {p:g}, {q:g}, {r:g}, {s:g}; is it transposed?")
+    off = max(map(abs, _products(matrix)))
+    if not off <= POSE_TOLERANCE:  # products of huge numbers overflow
+        raise ValueError(
+            f"{where} scales or shears: R R^T is off by {off:.2g} from the identity, where R is the upper left 3 x 3 block. "
+            "Give a rotation. If the pose is scaled, divide its first three rows by the scale; this also divides depths"
+        )
+
+
+def _check_finite(matrix: list[list[float]], where: str) -> None:
+    """Raise ValueError where a number of the matrix is not finite."""
+    if not all(math.isfinite(value) for row in matrix for value in row):
+        raise ValueError(f"{where} has non-finite values: {matrix}")
+
+
+MATRICES = (
+    ("viewmat", 4, POSE_TOLERANCE, _stretch_of, _check_pose), ("K", 3, K_TOLERANCE, _skew_of, _check_intrinsics),
+)  # fmt: skip
+"""Matrices of a camera: name, rows, tolerance, function that computes the error, and check for matrices with a larger error."""
+
+
+def for_each(cameras: Sequence[Camera], *, gaussians: Any, options: Any) -> list[tuple[Any, ...]]:
+    """Return Gaussians, camera and options of each of C cameras; single values are shared by all.
+
+    Raises:
+        ValueError: The length of a list is not C.
+    """
+    columns = []
+    for name, given in (("gaussians", gaussians), ("options", options)):
+        columns.append(given if isinstance(given, (list, tuple)) else [given] * len(cameras))
+        if len(columns[-1]) != len(cameras):
+            raise ValueError(f"{len(columns[-1])} {name} for {len(cameras)} cameras: give one for all, or one for each camera")
+    return list(zip(columns[0], cameras, columns[1], strict=True))
+
+
+INTEGERS = (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+"""Types of pixel coordinates."""
+
+
+def checked_pixels(pixels: torch.Tensor, cameras: int, device: torch.device) -> torch.Tensor:
+    """Return pixels [P, 2] or [C, P, 2] of C cameras as int64 on a device, shape [1, P, 2] or [C, P, 2].
+
+    Raises:
+        TypeError: The pixels are not a dense tensor of integers.
+        ValueError: The shape is wrong.
+    """
+    if not isinstance(pixels, torch.Tensor) or pixels.dtype not in INTEGERS:
+        found = pixels.dtype if isinstance(pixels, torch.Tensor) else type(pixels).__name__
+        raise TypeError(f"pixels must be a tensor of whole numbers, not {found}: columns and rows, from 0 at the upper left")
+    if pixels.layout != torch.strided:
+        raise TypeError(f"pixels must be dense, not {pixels.layout}; pixels.to_dense() converts them")
+    if pixels.ndim not in (2, 3) or pixels.shape[-1] != 2 or (pixels.ndim == 3 and len(pixels) != cameras):
+        raise ValueError(f"pixels must have shape [P, 2] or [{cameras}, P, 2], not {list(pixels.shape)}")
+    found = pixels.to(device, torch.int64)
+    return found if found.ndim == 3 else found[None]
+
+
+def window_of(pixels: torch.Tensor, camera: Camera, tile_size: int) -> Window:
+    """Return the smallest window of whole tiles that holds pixels [..., P, 2]; the pixels are read from the device.
+
+    Raises:
+        ValueError: A pixel is outside the image.
+    """
+    if not pixels.shape[-2]:
+        return 0, 0, min(tile_size, camera.width), min(tile_size, camera.height)
+    flat = pixels.reshape(-1, 2)
+    (left, top), (right, bottom) = torch.stack([flat.amin(0), flat.amax(0)]).tolist()
+    if left < 0 or top < 0 or right >= camera.width or bottom >= camera.height:
+        raise ValueError(
+            f"pixels reach from column {left} to {right} and from row {top} to {bottom}, beyond the image of "
+            f"{camera.width} x {camera.height} px"
+        )
+    x, y = left // tile_size * tile_size, top // tile_size * tile_size
+    width = min((right // tile_size + 1) * tile_size, camera.width) - x
+    height = min((bottom // tile_size + 1) * tile_size, camera.height) - y
+    return x, y, width, height
+
+
+def listed_tiles(pixels: torch.Tensor, settings: RenderSettings, cameras: int) -> torch.Tensor:
+    """Return a mask [T] over the tiles of C cameras, for `bin_tiles`: True where one of ``pixels`` [1 or C, P, 2] is inside."""
+    (x, y, width, height), size = settings.window, settings.tile_size
+    columns, rows = grid(width, height, size)
+    places = (pixels[..., 1] - y) // size * columns + (pixels[..., 0] - x) // size  # windows begin at edges of tiles
+    places = places + columns * rows * torch.arange(cameras, device=pixels.device)[:, None]
+    listed = torch.zeros(cameras * columns * rows, dtype=torch.bool, device=pixels.device)
+    listed[places.reshape(-1)] = True
+    return listed
+
+
+def at_pixels(image: torch.Tensor, pixels: torch.Tensor, window: Window) -> torch.Tensor:
+    """Read a window's images [C, H, W, ...] at pixels [1, P, 2] or [C, P, 2]; return values [C, P, ...]. Differentiable."""
+    cameras = torch.arange(len(image), device=image.device)[:, None]
+    return image[cameras, pixels[..., 1] - window[1], pixels[..., 0] - window[0]]
+
 
 TILE_SIZES = (8, 16)
 """Supported sides of a tile [px]."""
@@ -120,7 +311,7 @@ def _check_tensor(name: str, value: Any) -> None:
     """Raise TypeError where a value is not a tensor, and ValueError for a device without kernels."""
     if not isinstance(value, torch.Tensor):
         raise TypeError(f"{name} must be a tensor, not {type(value).__name__}; torch.as_tensor makes one")
-    interop.check_device(name, value)
+    launch.check_device(name, value)
 
 
 def _checked_window(camera: Camera, options: RasterizeOptions) -> Window:
@@ -151,7 +342,7 @@ def _checked_channels(name: str, values: torch.Tensor | None, inputs: ProjectInp
     if pattern == "C N D" and name == "colors" and len(values) == len(inputs.means) != len(inputs.viewmats):
         found = list(values.shape)
         raise ValueError(f"colors {found} are neither [N, D] nor [C, N, D]: give spherical harmonics as sh of the Gaussians")
-    interop.check(means=(inputs.means, "N 3"), viewmats=(inputs.viewmats, "C 4 4"), **{name: (values, pattern)})
+    launch.check(means=(inputs.means, "N 3"), viewmats=(inputs.viewmats, "C 4 4"), **{name: (values, pattern)})
     if values.shape[-1] == 0:
         raise ValueError(f"{name} must have at least one channel, not shape {list(values.shape)}")
     return values if values.ndim == 3 else values[None]
@@ -376,3 +567,60 @@ def _as_render(camera: Camera, images: tuple[torch.Tensor, ...], *rest: Any, **m
     shaped: dict[str, Any] = {name: own(image) for name, image in maps.items() if image is not None}
     rgb, alpha, depth = map(own, images)
     return Render(rgb, alpha, depth, *rest, **shaped)
+
+
+FASTEST_FIRST = ("fast", "balanced", "exact")
+"""Rules to choose from; each skips all that the next one skips, and more."""
+DEFAULTS = RasterizeOptions()
+"""Default options."""
+MEASURES: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {"mean": torch.mean, "max": torch.amax}
+"""Reductions over the pixels of a view, by name."""
+
+
+@torch.no_grad()
+def select_rule(
+    gaussians: Gaussians, cameras: Iterable[Camera], *, max_error: float, measure: str = "mean",
+    options: RasterizeOptions = DEFAULTS,
+) -> tuple[str, float]:  # fmt: skip
+    """Return the fastest of the rules `fast`, `balanced` and `exact` whose error is at most ``max_error`` in every given view.
+
+    Each view is rendered with `RasterizeOptions.error_bound`, so the limit covers cut-offs and float32, and holds only for
+    these Gaussians, cameras and options. Each view takes up to three renders in float32 and three in float64.
+
+    Args:
+        gaussians: The scene, N Gaussians.
+        cameras: Views to measure.
+        max_error: Largest error against rule `exact`, in units of the colours, usually [0, 1].
+        measure: ``mean`` or ``max`` over the pixels of a view; the error of a pixel is the largest of its channels.
+        options: Options of the renders, such as the background; their rule is not used.
+
+    Returns:
+        The name of the rule, and its largest measured error over the views.
+
+    Raises:
+        UsageError: No rule keeps the limit, ``cameras`` is empty or a single camera, ``max_error`` is not a positive number, or
+            the measure is unknown.
+    """
+    if not (isinstance(max_error, Real) and 0 < max_error < math.inf):
+        raise UsageError(f"max_error must be a positive number, such as 0.002, not {max_error!r}")
+    if measure not in MEASURES:
+        raise UsageError(f"measure {measure!r} is not one of {', '.join(MEASURES)}")
+    if isinstance(cameras, Camera):
+        raise UsageError("select_rule takes a list of cameras, not one: give [camera]")
+    views, error = list(cameras), 0.0
+    if not views:
+        raise UsageError("select_rule measures errors in views: give at least one camera")
+    for rule in FASTEST_FIRST:
+        error, own = 0.0, replace(options, rule=rule, error_bound=True)
+        for camera in views:
+            bound = rasterize(gaussians, camera, own).error_bound
+            assert bound is not None
+            error = max(error, float(MEASURES[measure](bound)))
+            if error > max_error:
+                break
+        else:
+            return rule, error
+    raise UsageError(
+        f"no rule keeps the {measure} error within {max_error:g}: with rule exact, rounding alone gives {error:.1e}; raise "
+        "max_error, or give the Gaussians as float64"
+    )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from warpgs import lenses
+from warpgs import geometry
 from warpgs.constants import FRUSTUM_MARGIN, RULES
 from warpgs.geometry import rotation_matrices
 from warpgs.kernels import sh
@@ -41,9 +41,9 @@ def _project(gaussians: Gaussians, camera: Camera, degree: int, antialiased: boo
     unit = quats / quats.norm(dim=-1, keepdim=True)
     positions = means @ rotation.T + translation
     opacities = torch.sigmoid(logits)
-    depths = lenses.depth_of(camera.model, positions)
+    depths = geometry.depth_of(camera.model, positions)
     lens = None if camera.distortion is None else torch.as_tensor(camera.distortion, dtype=torch.float64, device=means.device)
-    seen = lenses.on_lens(camera.model, lens, positions)
+    seen = geometry.on_lens(camera.model, lens, positions)
     visible = torch.nonzero(seen & (depths >= rule.near) & (opacities >= rule.alpha_cut)).squeeze(1)
     visible = visible[torch.argsort(depths[visible], stable=True)]
     positions, opacities = positions[visible], opacities[visible]
@@ -76,7 +76,7 @@ def _pixels(
     if camera.model == "pinhole":
         pixels = focal * positions[:, :2] / z + center
         return pixels, torch.cat([torch.diag_embed(focal / z), ((center - clamped(pixels)) / z)[..., None]], -1)
-    pixels = focal * lenses.to_plane(camera.model, lens, positions) + center
+    pixels = focal * geometry.to_plane(camera.model, lens, positions) + center
     at = positions
     if camera.model == "opencv":  # the point moves towards the axis by the same factor as the pixel
         scale = (clamped(pixels) - center) / torch.where(pixels == center, 1, pixels - center)
@@ -84,7 +84,7 @@ def _pixels(
         at = torch.cat([positions[:, :2] * scale, z], 1)
     with torch.enable_grad():
         at = at.detach().requires_grad_()
-        found = lenses.to_plane(camera.model, lens, at).sum(0)
+        found = geometry.to_plane(camera.model, lens, at).sum(0)
         rows = [torch.autograd.grad(found[i], at, retain_graph=True)[0] for i in range(2)]
     return pixels, focal[:, None] * torch.stack(rows, 1)
 
@@ -129,7 +129,7 @@ def reference_image(
     Raises:
         UsageError: The camera model is only supported by the kernels.
     """
-    lenses.check_known(camera.model)
+    geometry.check_known(camera.model)
     g, device = _project(gaussians, camera, degree, antialiased), gaussians.means.device
     left, top, width, height = window
     image = torch.empty(height, width, 3, dtype=torch.float64, device=device)

@@ -1,6 +1,10 @@
-"""Images of a report: PNG bytes, colour maps, error and depth maps."""
+"""Images of a report: colour maps, crops, sheets."""
 
 from __future__ import annotations
+
+import io
+import textwrap
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -116,3 +120,276 @@ def frame_sheet(frames: list[np.ndarray], columns: int = 3, gap: int = 4) -> np.
     rows = [side_by_side(frames[i : i + columns], gap) for i in range(0, len(frames), columns)]
     bar = np.ones((gap, rows[0].shape[1], 3), np.float32)
     return np.concatenate([part for row in rows for part in (row, bar)][:-1])
+
+
+def disagreement(images: list[np.ndarray], reference: np.ndarray) -> np.ndarray:
+    """Return the largest minus the smallest value of images [H, W, 3] at each pixel, averaged over channels, shape [H, W].
+
+    For a single image, return its absolute error against ``reference`` [H, W, 3], averaged over channels.
+    """
+    if len(images) == 1:
+        return np.abs(images[0] - reference).mean(-1)
+    stack = np.stack(images)
+    return (stack.max(0) - stack.min(0)).mean(-1)
+
+
+def crops(values: np.ndarray, width: int, height: int, count: int) -> list[tuple[int, int]]:
+    """Return the top left corners (x, y) [px] of ``count`` crops with the largest sums of ``values`` [H, W], largest first.
+
+    Crops do not overlap; fewer are returned if no more fit. If all values are 0, the first crop is in the middle.
+    """
+    H, W = values.shape
+    width, height = min(width, W), min(height, H)
+    total = np.zeros((H + 1, W + 1))
+    total[1:, 1:] = values.astype(np.float64).cumsum(0).cumsum(1)
+    sums = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    found: list[tuple[int, int]] = []
+    if not sums.max() > 1e-9:
+        found.append(((W - width) // 2, (H - height) // 2))
+    ys, xs = np.mgrid[: sums.shape[0], : sums.shape[1]]
+    while len(found) < count:
+        free = np.ones(sums.shape, bool)
+        for x, y in found:
+            free &= (np.abs(xs - x) >= width) | (np.abs(ys - y) >= height)
+        if not free.any():
+            break
+        at = int(np.argmax(np.where(free, sums, -1.0)))
+        found.append((int(xs.flat[at]), int(ys.flat[at])))
+    return found
+
+
+UNSEEN, ONCE = (0.82, 0.0, 0.52), (1.0, 0.69, 0.0)
+"""Magenta and amber: they differ in brightness, too, and for every kind of colour vision."""
+COVERAGE_LEGEND = "striped magenta: seen by no training view; amber: seen by one; unchanged: seen by two or more, or background"
+"""Meaning of the colours."""
+STRIPES = 90
+"""Stripes along the larger side of an image."""
+
+
+def coverage_image(image: np.ndarray, unseen: np.ndarray, once: np.ndarray) -> np.ndarray:
+    """Return a render with magenta stripes where no training view saw the surface, and an amber tint where one did.
+
+    Args:
+        image: Colours in [0, 1], shape [H, W, 3]; values outside are clamped.
+        unseen: True where no training view saw the point, bool, shape [H, W].
+        once: True where one training view saw it, bool, shape [H, W].
+
+    Returns:
+        Colours in [0, 1], float32, shape [H, W, 3].
+    """
+    image = np.clip(image, 0, 1).astype(np.float32)
+    height, width = unseen.shape
+    period = max(4, round(max(height, width) / STRIPES))
+    rows, columns = np.mgrid[:height, :width]
+    stripe = (rows + columns) % period < period / 2
+    shade = np.where(unseen, np.where(stripe, 0.75, 0.3), np.where(once, 0.45, 0)).astype(np.float32)[..., None]
+    tint = np.where(unseen[..., None], np.float32(UNSEEN), np.float32(ONCE))
+    # gray beneath the tint: the colours of the image would change its hue
+    gray = image.mean(-1, keepdims=True)
+    return np.where(shade > 0, (1 - shade) * gray + shade * tint, image)
+
+
+INK, SOFT, PAPER = (27, 29, 33), (102, 108, 118), (255, 255, 255)
+BOXES = ((240, 78, 35), (0, 158, 190), (240, 190, 0))
+"""Colours of the boxes, and of the frames of their crops."""
+MAX_WIDTH = 2600
+"""Largest width of a figure of many columns [px]; exceeded if columns would be narrower than `CELL` allows."""
+CELL = (180, 480)
+"""Smallest and largest width of a column [px]."""
+GAP, MARGIN, HEAD, CAPTION = 8, 20, 38, 32
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One image of a row."""
+
+    image: np.ndarray
+    """Colours in [0, 1], [H, W, 3]; all images of a row have one size."""
+    caption: str
+    """Text below the image."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """One row: the images of a view by every method."""
+
+    title: str
+    """Text above the row."""
+    cells: tuple[Cell, ...]
+    crops: tuple[tuple[int, int, int, int], ...]
+    """Crops to enlarge: x, y, width, height [px]."""
+
+
+def _column(count: int, widest: int) -> int:
+    available = (MAX_WIDTH - 2 * MARGIN + GAP) // count - GAP
+    return max(CELL[0], min(CELL[1], available, max(widest, 320)))
+
+
+def sheet(headings: list[str], strips: list[Strip]) -> bytes:
+    """Return a figure as PNG bytes.
+
+    Args:
+        headings: Headings of the columns, from left to right.
+        strips: Rows; each has a cell per heading.
+
+    Returns:
+        An 8-bit RGB PNG; images are scaled to the width of a column, and the crops below them share this width.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    column = _column(len(headings), max(s.cells[0].image.shape[1] for s in strips))
+    bold, small = (ImageFont.load_default(max(least, column / part)) for least, part in ((17, 22), (14, 30)))
+
+    def fitted(text: str, font, width: int) -> str:
+        while text and font.getlength(text) > width:
+            text = text[:-2].rstrip("…") + "…" if len(text) > 2 else ""
+        return text
+
+    heights = []
+    for s in strips:
+        H, W = s.cells[0].image.shape[:2]
+        zoom = 0
+        if s.crops:
+            inner = (column - GAP * (len(s.crops) - 1)) // len(s.crops)
+            zoom = GAP + max(round(inner * h / w) for _, _, w, h in s.crops)
+        heights.append((round(column * H / W), zoom))
+    width = 2 * MARGIN + len(headings) * (column + GAP) - GAP
+    height = MARGIN + HEAD + sum(HEAD + a + b + CAPTION for a, b in heights) + MARGIN // 2
+    canvas = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(canvas)
+    for i, heading in enumerate(headings):
+        middle = MARGIN + i * (column + GAP) + column / 2
+        draw.text((middle, MARGIN + 18), fitted(heading, bold, column), INK, bold, anchor="ms")
+    y = MARGIN + HEAD
+    for s, (tall, zoom) in zip(strips, heights):
+        draw.line((MARGIN, y, width - MARGIN, y), (217, 220, 225))
+        draw.text((MARGIN, y + 10), s.title, SOFT, small)
+        y += HEAD
+        factor = column / s.cells[0].image.shape[1]
+        for i, cell in enumerate(s.cells):
+            x = MARGIN + i * (column + GAP)
+            canvas.paste(resized(cell.image, column, tall), (x, y))
+            for k, (cx, cy, w, h) in enumerate(s.crops):
+                inner = (column - GAP * (len(s.crops) - 1)) // len(s.crops)
+                color = BOXES[k % len(BOXES)]
+                box = [x + cx * factor, y + cy * factor, x + (cx + w) * factor - 1, y + (cy + h) * factor - 1]
+                draw.rectangle([round(v) for v in box], outline=color, width=3)
+                left, top = x + k * (inner + GAP), y + tall + GAP
+                canvas.paste(resized(cell.image[cy : cy + h, cx : cx + w], inner, round(inner * h / w)), (left, top))
+                draw.rectangle([left, top, left + inner - 1, top + round(inner * h / w) - 1], outline=color, width=3)
+            words = fitted(cell.caption, small, column)
+            draw.text((x + column / 2, y + tall + zoom + 20), words, SOFT, small, anchor="ms")
+        y += tall + zoom + CAPTION
+    out = io.BytesIO()
+    canvas.save(out, "PNG")
+    return out.getvalue()
+
+
+CONTACT_PAPER, CONTACT_INK, CONTACT_SOFT, CONTACT_LINE = (251, 251, 249), (27, 29, 33), (102, 108, 118), (223, 226, 231)
+LABEL_SIZE, TEXT_SIZE, TITLE_SIZE = 15, 13, 22  # [px]
+CONTACT_MARGIN, CONTACT_GAP, CONTACT_HEAD = 28, 18, 30  # [px]; HEAD is the height of a label
+CONTACT_LEGEND = (72, 8)  # width and height of a colour bar [px]
+DOT = (240, 78, 35)
+"""Colour of dots."""
+MAX_DOT_FRACTION = 0.08
+"""Fraction of an image that dots may cover before they shrink, down to a radius of 0.9 px."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One image of a sheet."""
+
+    label: str
+    """Name of the content, in a few words."""
+    values: np.ndarray
+    """Colours [H, W, 3] in [0, 1], or values [H, W]."""
+    colors: str = "INFERNO"
+    """Colour map of values."""
+    largest: float = 1.0
+    """Value of the last colour of the map; the first is 0."""
+    dots: np.ndarray | None = None
+    """Rows and columns of pixels to mark, shape [S, 2]."""
+
+
+def _tile_image(tile: Tile, size: tuple[int, int]):
+    """Return a tile's pixels at a size (width, height) [px], as a Pillow image."""
+    values = tile.values
+    if values.ndim == 2:
+        values = colored(values / tile.largest, tile.colors)
+    image = resized(values, *size)
+    return image if tile.dots is None else _dotted(image, (tile.dots + 0.5) * (size[0] / tile.values.shape[1]))
+
+
+def _dotted(image, centers: np.ndarray):
+    """Return an image with small discs at rows and columns [px], shape [S, 2], anti-aliased by supersampling."""
+    from PIL import Image, ImageDraw
+
+    least, most = 0.9, max(1.4, image.width / 220)
+    radius = min(most, max(least, (MAX_DOT_FRACTION * image.width * image.height / (np.pi * max(1, len(centers)))) ** 0.5))
+    fine = 4
+    cover = Image.new("L", (fine * image.width, fine * image.height))
+    draw = ImageDraw.Draw(cover)
+    for y, x in fine * centers:
+        draw.ellipse((x - fine * radius, y - fine * radius, x + fine * radius, y + fine * radius), 255)
+    image.paste(DOT, mask=cover.reduce(fine))
+    return image
+
+
+def contact_sheet(
+    title: str, lines: list[str], tiles: list[Tile], *, columns: int = 4, tile_width: int = 440, text: float = 1.0
+) -> np.ndarray:
+    """Arrange labelled tiles in rows, with a colour bar at each map and lines of text after the last tile.
+
+    Args:
+        title: Headline.
+        lines: Sentences, wrapped to the width of a tile.
+        tiles: At least one; all of one height and width.
+        columns: Tiles per row.
+        tile_width: Width of a tile [px].
+        text: Factor on the font sizes, for a sheet that is shown at a reduced size.
+
+    Returns:
+        The sheet, colours in [0, 1], float32, shape [rows, columns, 3].
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = tiles[0].values.shape[:2]
+    tile_height = max(1, round(tile_width * height / width))
+    rows = -(-(len(tiles) + 1) // columns)
+    label_size, text_size, title_size, head = (round(text * v) for v in (LABEL_SIZE, TEXT_SIZE, TITLE_SIZE, CONTACT_HEAD))
+    top = CONTACT_MARGIN + title_size + 18
+    size = (
+        2 * CONTACT_MARGIN + columns * tile_width + (columns - 1) * CONTACT_GAP,
+        top + rows * (head + tile_height) + (rows - 1) * CONTACT_GAP + CONTACT_MARGIN,
+    )
+    sheet = Image.new("RGB", size, CONTACT_PAPER)
+    draw = ImageDraw.Draw(sheet)
+    fonts = {s: ImageFont.load_default(s) for s in (label_size, text_size, title_size)}
+    draw.text((CONTACT_MARGIN, CONTACT_MARGIN - 4), title, CONTACT_INK, fonts[title_size])
+    for i in range(len(tiles) + 1):
+        x, y = (
+            CONTACT_MARGIN + (i % columns) * (tile_width + CONTACT_GAP),
+            top + (i // columns) * (head + tile_height + CONTACT_GAP),
+        )
+        if i == len(tiles):
+            draw.line((x, y + head, x + tile_width - 1, y + head), CONTACT_LINE)
+            characters = int(tile_width / (0.5 * text_size))
+            words = "\n\n".join(textwrap.fill(line, characters) for line in lines)
+            draw.multiline_text((x, y + head + 14), words, CONTACT_SOFT, fonts[text_size], spacing=5)
+            break
+        tile = tiles[i]
+        draw.text((x, y + head // 5), tile.label, CONTACT_INK, fonts[label_size])
+        sheet.paste(_tile_image(tile, (tile_width, tile_height)), (x, y + head))
+        if tile.values.ndim == 2:
+            middle, right = y + head // 2, x + tile_width
+            largest = f"{tile.largest:g}"
+            text_width = round(draw.textlength(largest, fonts[text_size]))
+            bar = Tile(
+                "", np.linspace(0, 1, CONTACT_LEGEND[0], dtype=np.float32)[None].repeat(CONTACT_LEGEND[1], 0), tile.colors
+            )
+            draw.text((right, middle), largest, CONTACT_SOFT, fonts[text_size], anchor="rm")
+            sheet.paste(
+                _tile_image(bar, CONTACT_LEGEND), (right - text_width - 6 - CONTACT_LEGEND[0], middle - CONTACT_LEGEND[1] // 2)
+            )
+            draw.text((right - text_width - 12 - CONTACT_LEGEND[0], middle), "0", CONTACT_SOFT, fonts[text_size], anchor="rm")
+    return np.asarray(sheet, np.float32) / 255

@@ -1,15 +1,137 @@
-"""Report page of a fit: one HTML file with everything in it."""
+"""The HTML page of a run, with its curves."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
+import math
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from warpgs.files import write_text
-from warpgs.runtime.terminal import Detail
+from warpgs.process import Detail
+
+MOST_BYTES = 100
+"""Longest name that is kept unchanged, without suffix: any file system allows it."""
+NOT_EVERYWHERE = re.compile(
+    r'^\.|[<>:"\\|?*\x00-\x1f\x7f]|^(con|prn|aux|nul|com\d|lpt\d)(\.|$)|^$|[\ud800-\udfff]', re.IGNORECASE
+)
+"""Names that hide a file, that are not UTF-8, or that Windows does not take."""
+
+
+def image_names(views: Iterable[str]) -> dict[str, str]:
+    """Return the file name, without suffix, of the images of each view of a scene.
+
+    A file has the view's name without suffix, with _ for /, if this name is unique, ignoring capitals. A name that is
+    ambiguous, longer than 100 bytes or not allowed on some system is shortened; digits of a hash of the whole name follow.
+
+    Args:
+        views: Names of all views of the scene, so that a view has one name in every folder.
+    """
+    own = {view: _own_name(view) for view in views}
+    count = Counter(map(_folded, own.values()))
+    kept = {v: n for v, n in own.items() if count[_folded(n)] == 1 and not NOT_EVERYWHERE.search(n) and _size(n) <= MOST_BYTES}
+    taken = set(map(_folded, kept.values()))
+    for view, name in own.items():
+        if view in kept:
+            continue
+        part = re.sub(r"[^\w.-]", "_", name).lstrip(".").encode("utf-8", "replace")[: MOST_BYTES // 2].decode("utf-8", "ignore")
+        digits, length = hashlib.sha256(view.encode("utf-8", "surrogatepass")).hexdigest(), 8
+        while _folded(f"{part}-{digits[:length]}") in taken:
+            length += 1
+        kept[view] = f"{part}-{digits[:length]}"
+        taken.add(_folded(kept[view]))
+    return {view: kept[view] for view in own}
+
+
+def renaming_notes(names: dict[str, str]) -> list[str]:
+    """Return notes on views with other names for their images."""
+    changed = [f"{view} is {name}.png" for view, name in names.items() if name != _own_name(view)]
+    if not changed:
+        return []
+    words = ", ".join(changed[:3]) + (f", and {len(changed) - 3} more" if len(changed) > 3 else "")
+    return [
+        f"images of some views have other names, because view names are alike, long, or not allowed on every system: {words}"
+    ]
+
+
+def _own_name(view: str) -> str:
+    path = PurePosixPath(view)
+    return str(path).removesuffix(path.suffix).replace("/", "_")
+
+
+def _folded(name: str) -> str:
+    """Return a key that is equal for names that a file system may confuse: macOS and Windows ignore capitals."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _size(name: str) -> int:
+    return len(name.encode("utf-8", "surrogatepass"))
+
+
+WIDTH, HEIGHT = 380, 190
+LEFT, RIGHT, TOP, BOTTOM = 52, 12, 26, 26
+MAX_POINTS = 300
+
+
+def ticks(low: float, high: float) -> list[float]:
+    """Return two to five round numbers, evenly spaced, inside a range."""
+    rough = (high - low) / 4
+    power = 10.0 ** math.floor(math.log10(rough))
+    step = next(m * power for m in (1, 2, 2.5, 5, 10) if m * power >= rough)
+    first = math.ceil(low / step - 1e-9)
+    return [i * step for i in range(first, first + 8) if i * step <= high + 1e-9 * step]
+
+
+def tick_label(value: float) -> str:
+    """Return a number as written on axes: 20000 becomes 20k."""
+    if abs(value) >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1e3:g}k" if abs(value) >= 1e4 else f"{value:g}"
+
+
+def curve(title: str, xs: list[float], ys: list[float], unit: str = "") -> str:
+    """Return an SVG chart of ``ys`` over ``xs`` (steps); long series are shown by the means of at most 300 groups.
+
+    Non-finite points are left out; without any finite point the chart says "no data".
+    """
+    points = [(x, y) for x, y in zip(xs, ys) if math.isfinite(x) and math.isfinite(y)]
+    group = max(1, math.ceil(len(points) / MAX_POINTS))
+    chunks = [points[i : i + group] for i in range(0, len(points), group)]
+    points = [(sum(x for x, _ in c) / len(c), sum(y for _, y in c) / len(c)) for c in chunks]
+    head = (
+        f'<svg class="curve" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{title}">'
+        f'<text x="0" y="13" class="title">{title}{f" [{unit}]" if unit else ""}</text>'
+    )
+    if not points:
+        return head + f'<text x="{LEFT}" y="{HEIGHT / 2}">no data</text></svg>'
+    x0, x1 = points[0][0], max(points[-1][0], points[0][0] + 1)
+    y0, y1 = min(y for _, y in points), max(y for _, y in points)
+    pad = 0.05 * (y1 - y0) or max(abs(y1) * 0.05, 1e-6)
+    y0, y1 = y0 - pad, y1 + pad
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        px = LEFT + (x - x0) / (x1 - x0) * (WIDTH - LEFT - RIGHT)
+        return px, TOP + (y1 - y) / (y1 - y0) * (HEIGHT - TOP - BOTTOM)
+
+    parts = [head]
+    for tick in ticks(y0, y1):
+        _, py = place(x0, tick)
+        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{py:.1f}" y2="{py:.1f}"/>')
+        parts.append(f'<text x="{LEFT - 6}" y="{py + 4:.1f}" text-anchor="end">{tick_label(tick)}</text>')
+    for tick in ticks(x0, x1):
+        px, _ = place(tick, y0)
+        parts.append(f'<text x="{px:.1f}" y="{HEIGHT - 8}" text-anchor="middle">{tick_label(tick)}</text>')
+    line = " ".join(f"{px:.1f},{py:.1f}" for px, py in (place(*p) for p in points))
+    parts.append(f'<polyline class="line" points="{line}"/></svg>')
+    return "".join(parts)
+
 
 STYLE = """
 :root{--ink:#1b1d21;--soft:#666c76;--line:#dfe2e7;--paper:#fbfbf9;--card:#fff;--accent:#0b6e6e}

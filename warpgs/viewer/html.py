@@ -1,4 +1,4 @@
-"""A model as one HTML file: viser's own page with the Gaussians in it, which opens from disk without a network."""
+"""A model as one HTML file, in the viewer's conventions."""
 
 from __future__ import annotations
 
@@ -7,27 +7,138 @@ import math
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
-from warpgs.coordinates import convert_camera, convert_gaussians
+from warpgs.device import format_bytes
 from warpgs.errors import DataError
 from warpgs.files import write_text
-from warpgs.pipeline.films.rig import up_of
-from warpgs.pipeline.runs.export_filters import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
-from warpgs.pipeline.runs.folder import open_run
-from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.folder_lock import hold_file
-from warpgs.scene import Camera, Gaussians
-from warpgs.viewer.camera_conventions import camera_before, distance_ahead, fov_y
-from warpgs.viewer.packing import packed
-from warpgs.viewer.page import NO_PARAMETERS, NO_TEXT_AS_CODE
-from warpgs.viewer.server import open_server, require_viser, stop_server
+from warpgs.geometry import convert_camera, convert_gaussians, look_at, matmul, quaternions, rotation_matrices
+from warpgs.locks import hold_file
+from warpgs.pipeline.films.paths import up_of
+from warpgs.pipeline.run.export import NO_FILTERS, Filters, file_gaussians, filtered, rotate_camera
+from warpgs.pipeline.run.folder import open_run
+from warpgs.scene import Camera, Gaussians, base_colors
+from warpgs.viewer.server import NO_PARAMETERS, NO_TEXT_AS_CODE, open_server, require_viser, stop_server
 
 if TYPE_CHECKING:
     import viser
+
+
+FIELD_OF_VIEW = math.radians(50)
+"""Vertical field of view of the camera that is made for a model without cameras [rad]."""
+
+
+def wxyz_of(camera: Camera) -> np.ndarray:
+    """Return the rotation from camera to world axes as a unit quaternion wxyz, float64, shape [4]."""
+    return quaternions(torch.from_numpy(np.asarray(camera.viewmat)[None, :3, :3].transpose(0, 2, 1).copy()))[0].numpy()
+
+
+def fov_y(camera: Camera, aspect: float = math.inf) -> float:
+    """Return the vertical field of view [rad] at which a window shows a camera's whole image, centred.
+
+    Args:
+        camera: The camera.
+        aspect: Width of the window over its height; by default the window is wider than the image.
+    """
+    return 2 * math.atan(max(0.5 * camera.height / float(camera.K[1, 1]), 0.5 * camera.width / float(camera.K[0, 0]) / aspect))
+
+
+def distance_ahead(camera: Camera, gaussians: Gaussians) -> float:
+    """Return the median depth [u] of the means that a camera sees, or 1 if it sees none; the view turns about this depth."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    points = matmul(means, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
+    z = points[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = (np.abs(points[:, i] / z * camera.K[i, i]) / size for i, size in ((0, camera.width), (1, camera.height)))
+    seen = (z > 0) & (x < 0.5) & (y < 0.5)
+    return float(np.median(z[seen])) if seen.any() else 1.0
+
+
+def camera_at(wxyz: Any, position: Any, fov: float, width: int, height: int) -> Camera:
+    """Return the pinhole camera of a camera-to-world rotation, position [u] and vertical field of view [rad]."""
+    rotation = rotation_matrices(np.asarray(wxyz, np.float64)).T
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -matmul(rotation, np.asarray(position, np.float64))
+    focal = 0.5 * height / math.tan(0.5 * fov)
+    return Camera(viewmat, np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]]), width, height)
+
+
+def camera_before(gaussians: Gaussians, width: int = 960, height: int = 720) -> Camera:
+    """Return a camera at -z that sees the box between the 5th and 95th percentiles of the means, for models without cameras."""
+    means = gaussians.means.detach().cpu().double().numpy()
+    low, high = np.percentile(means, [5, 95], axis=0)
+    middle, radius = (low + high) / 2, max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
+    center = middle - np.array([0, 0, radius / math.sin(0.5 * FIELD_OF_VIEW)])
+    focal = 0.5 * height / math.tan(0.5 * FIELD_OF_VIEW)
+    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1.0]])
+    return Camera(look_at(center, middle, np.array([0.0, -1, 0])), K, width, height)
+
+
+def stands_at(camera: Camera, other: Camera, near: float) -> bool:
+    """Return whether two cameras are within ``near`` [u] of each other, and their axes within 1.8 degrees."""
+    turned = float(np.trace(matmul(camera.viewmat[:3, :3], other.viewmat[:3, :3].T)))
+    return bool(np.linalg.norm(camera.center - other.center) <= near) and turned > 3 - 1e-3
+
+
+LARGEST_HALF = 65504.0
+"""Largest finite number in half precision."""
+MEDIAN_AXIS = 1.0
+"""Length of the median Gaussian's longest axis in the units of stored covariances. Squares of axes are exact to 0.05 % if they
+are at least 6.1e-5, the smallest normal number: for axes from 1/128 of the median to 255 times the median."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """N Gaussians of one colour each, in their own units; one such unit is ``scale`` scene units."""
+
+    centers: np.ndarray
+    """Positions in stored units, float32, shape [N, 3]."""
+    covariances: np.ndarray
+    """Covariances in squared stored units, float32 within half precision, shape [N, 3, 3]."""
+    colors: np.ndarray
+    """Colours of degree 0, uint8, shape [N, 3]."""
+    opacities: np.ndarray
+    """Opacities, uint8, shape [N, 1]."""
+    scale: float
+    """Scene units [u] per stored unit."""
+    shortened: int
+    """Number of Gaussians that are too long for half precision, and are shown shorter."""
+
+
+def packed(gaussians: Gaussians) -> Packed:
+    """Return Gaussians for the browser.
+
+    Half precision is too coarse for covariances in scene units: an axis of 0.001 u has the square 1e-6, of which four bits
+    remain; the square of an axis below 0.00017 u becomes 0. In units in which the median of the longest axes is 1, nearly all
+    squares keep eleven bits.
+
+    Args:
+        gaussians: N Gaussians, on any device.
+    """
+    means, quats, log_scales, logits, sh = (t.detach().cpu().double().numpy() for t in gaussians.tensors().values())
+    median = float(np.median(log_scales.max(1))) if len(means) else 0.0
+    scale = math.exp(median) / MEDIAN_AXIS
+    longest = 0.5 * math.log(LARGEST_HALF) - 1e-3  # the diagonal of a rotated covariance is no longer than its longest axis
+    relative = log_scales - math.log(scale)
+    axes = np.exp(np.minimum(relative, longest))
+    rotations = rotation_matrices(quats / np.linalg.norm(quats, axis=1, keepdims=True))
+    covariances = np.einsum("nij,nj,nkj->nik", rotations, axes**2, rotations)
+    colors = np.clip(base_colors(sh), 0, 1)
+    opacities = torch.sigmoid(torch.from_numpy(logits)).numpy()[:, None]
+    return Packed(
+        (means / scale).astype(np.float32), covariances.astype(np.float32), _bytes(colors), _bytes(opacities), scale,
+        int((relative > longest).any(1).sum()),
+    )  # fmt: skip
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.round(255 * values).astype(np.uint8)
+
 
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; style-src 'unsafe-inline'; "

@@ -1,20 +1,396 @@
-"""The viewer's server: viser's server without tunnels, open only to this machine and only at its full address."""
+"""The server of the viewer: one port, a token, and messages of bounded size."""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import dataclasses
+import functools
 import io
+import logging
+import math
+import secrets
 import socket
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from http import HTTPStatus
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-from warpgs.errors import ResourceError
-from warpgs.runtime.listening import HOST, loopback_socket
-from warpgs.suggestion import install_extras
-from warpgs.viewer.connections import Rules, guarded_server
+from warpgs import schema
+from warpgs.errors import DataError, ResourceError, WarpgsError, install_extras
+from warpgs.process import say
+from warpgs.ranks import HOST, Allowance, WebGuard, loopback_socket
+from warpgs.schema import Schema, SchemaError
 
 if TYPE_CHECKING:
     import viser
+
+
+def said(error: BaseException) -> str:
+    """Return an error as one line, shortened; with its type unless it is a `WarpgsError`."""
+    line = (str(error).strip().splitlines() or [""])[0][:200]
+    return line if isinstance(error, WarpgsError) else f"{type(error).__name__}: {line}"
+
+
+def guarded(callback: Callable[..., Any]) -> Callable[..., None]:
+    """Wrap a callback: if it raises an error, print one line on stderr."""
+
+    @functools.wraps(callback)
+    def call(*args: Any) -> None:
+        try:
+            callback(*args)
+        except Exception as e:  # any error of a browser's request; the viewer continues
+            say(f"the viewer could not serve a request of a browser ({said(e)})", error=True)
+
+    return call
+
+
+NO_PARAMETERS = "URLSearchParams=class extends URLSearchParams{constructor(){super()}set(){}};"
+"""JavaScript that runs before viser's own, so that address parameters have no effect and none is added. Some of them, such as
+``websocket`` and ``playbackPath``, name servers and files to load."""
+NO_TEXT_AS_CODE = (
+    "{const made=Function,nothing=()=>{},make=args=>args.length>1?made(...args):nothing;"
+    "eval=nothing;Function=new Proxy(made,{apply:(f,self,args)=>make(args),construct:(f,args)=>make(args)})}"
+)
+"""JavaScript that runs before viser's own, so that JavaScript in messages does nothing. The content policy cannot do this,
+since the code that sorts Gaussians makes functions from text, too; functions with parameters are still allowed."""
+_MARK_LOADED = (
+    "document.createElement=function(name,...rest){"
+    "const made=Document.prototype.createElement.call(this,name,...rest);"
+    "if(name==='script'){made.nonce='NONCE';delete document.createElement}return made};"
+)
+"""JavaScript that gives the nonce to the one script that viser's page unpacks."""
+
+
+def live_page(text: str, nonce: str) -> str:
+    """Return viser's page for a content policy that only runs scripts with a nonce.
+
+    Args:
+        text: The page of viser.
+        nonce: Word of the policy, of letters that are safe in an attribute.
+    """
+    own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}</script>"
+    return text.replace("<head>", f"<head>{own}", 1).replace("<script", f'<script nonce="{nonce}"')
+
+
+MAX_FRAME = 2**16
+"""Largest frame [bytes]; a camera takes 300."""
+MAX_COORDINATE = 1e9
+"""Largest coordinate [u]."""
+MAX_TEXT = 4096
+"""Longest text: names of images are among the values of controls."""
+
+
+def _within(low: float, high: float) -> Schema:
+    """Return the schema of finite numbers from ``low`` to ``high``."""
+
+    def check(value: Any, place: str) -> None:
+        schema.number(low)(value, place)
+        if value > high:
+            raise SchemaError(f"{place} must be at most {high:g}, not {value:g}")
+
+    return check
+
+
+def _short(value: Any, place: str) -> None:
+    schema.text(value, place)
+    if len(value) > MAX_TEXT:
+        raise SchemaError(f"{place} must be at most {MAX_TEXT} letters long")
+
+
+def _rotation(value: Any, place: str) -> None:
+    """Allow unit quaternions."""
+    schema.items(_within(-1.01, 1.01), 4)(value, place)
+    if abs(math.hypot(*value) - 1) > 0.01:
+        raise SchemaError(f"{place} must be a unit quaternion")
+
+
+def _value(value: Any, place: str) -> None:
+    """Allow what a control can hold."""
+    if isinstance(value, list):
+        schema.items(_coordinate, 3)(value, place)
+    elif isinstance(value, str):
+        _short(value, place)
+    elif not isinstance(value, bool):
+        _coordinate(value, place)
+
+
+_coordinate = _within(-MAX_COORDINATE, MAX_COORDINATE)
+_point = schema.items(_coordinate, 3)
+_size = schema.whole(0, 2**15)
+_node = {"name": _short, "owner": _short}
+_only = functools.partial(schema.fields, others=False)
+MESSAGES: Mapping[str, Schema] = {
+    "ViewerCameraMessage": _only(
+        {
+            "wxyz": _rotation, "position": _point, "look_at": _point, "up_direction": _point, "fov": _within(1e-3, 3.1),
+            "near": _within(0, MAX_COORDINATE), "far": _within(0, MAX_COORDINATE), "image_height": _size, "image_width": _size,
+        }
+    ),
+    "GuiUpdateMessage": _only({"uuid": _short, "updates": _only({"value": _value})}),
+    "SceneNodeClickMessage": _only(
+        {
+            **_node, "instance_index": schema.or_null(schema.whole(0)), "ray_origin": _point, "ray_direction": _point,
+            "screen_pos": schema.items(_coordinate, 2), "modifier": schema.or_null(_short),
+        }
+    ),
+    "TransformControlsUpdateMessage": _only({**_node, "wxyz": _rotation, "position": _point}),
+    "TransformControlsDragStartMessage": _only(_node),
+    "TransformControlsDragEndMessage": _only(_node),
+}  # fmt: skip
+"""Messages that the viewer needs, by type, with the schema of the other fields; viser has more, such as uploads and tunnels."""
+
+
+def read_frame(frame: bytes | str) -> dict[str, Any]:
+    """Return the message of a websocket frame, with ``type`` and checked fields.
+
+    Args:
+        frame: MessagePack, as viser's page sends it.
+
+    Raises:
+        DataError: The frame is not a message, not one of `MESSAGES`, or a field has an invalid value.
+    """
+    import msgspec
+
+    if not isinstance(frame, bytes) or len(frame) > MAX_FRAME:
+        raise DataError(f"a message must be binary and at most {MAX_FRAME} bytes long")
+    try:
+        message = msgspec.msgpack.decode(frame)
+    except (ValueError, TypeError, RecursionError) as e:
+        raise DataError(f"a message is not MessagePack: {e}") from e
+    if not isinstance(message, dict) or not isinstance(message.get("type"), str):
+        raise DataError("a message has no type")
+    kind = message["type"]
+    if kind not in MESSAGES:
+        raise DataError(f"a message has the unknown type {kind[:60]!r}")
+    fields = {name: value for name, value in message.items() if name != "type"}
+    if not all(isinstance(name, str) for name in fields):
+        raise DataError(f"{kind}: a field's name is not text")
+    try:
+        MESSAGES[kind](fields, kind)
+    except SchemaError as e:
+        raise DataError(f"a message is malformed: {e}") from e
+    return {"type": kind, **fields}
+
+
+def write_frame(message: Mapping[str, Any]) -> bytes:
+    """Return a message as a frame: viser reads checked messages only."""
+    import msgspec
+
+    return bytes(msgspec.msgpack.encode(message))
+
+
+def control_value(value: Any, control: Any) -> Any:
+    """Return a message's value as a value for a control, clamped to the control's limits.
+
+    Args:
+        value: Value of a message, as `read_frame` returns it.
+        control: A control of viser, with its present ``value`` and perhaps ``options``, ``min`` and ``max``; None for an
+            unknown one, which can only be a button.
+
+    Raises:
+        DataError: The control cannot have the value.
+    """
+    present = True if control is None else control.value
+    options = getattr(control, "options", None)
+    low, high = getattr(control, "min", None), getattr(control, "max", None)
+    if isinstance(present, bool):
+        if isinstance(value, bool):
+            return value
+    elif isinstance(present, str) and options is not None:
+        if value in options:
+            return value
+    elif isinstance(present, (int, float)):
+        if _is_number(value):
+            return type(present)(_limited(value, low, high))
+    elif isinstance(present, tuple) and isinstance(value, list) and len(value) == len(present) and all(map(_is_number, value)):
+        lows, highs = (limits if limits is not None else (None,) * len(present) for limits in (low, high))
+        return [float(_limited(v, a, b)) for v, a, b in zip(value, lows, highs)]
+    raise DataError(f"a control cannot have the value {str(value)[:60]!r}")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= MAX_COORDINATE
+
+
+def _limited(value: float, low: float | None, high: float | None) -> float:
+    value = value if low is None else max(value, low)
+    return value if high is None else min(value, high)
+
+
+MAX_BROWSERS = 16
+"""Largest number of websockets at a time."""
+MAX_CONNECTIONS = 64
+"""Largest number of connections at a time, including connections that have sent no request yet."""
+MESSAGES_PER_SECOND = 200.0
+"""Rate of messages of one browser; moving a camera sends 50 a second."""
+MAX_BURST = 2000.0
+"""Largest number of messages at once: a delayed page sends a burst."""
+REFUSED = "Open the address that the viewer printed.\n"
+_HOOK = threading.Lock()
+
+
+class Rules:
+    """Rules for connections and messages, and the open connections."""
+
+    def __init__(self) -> None:
+        """Begin without controls."""
+        self.guard = WebGuard()
+        self.control_of: Callable[[str], Any] = lambda uuid: None
+        """Function that returns a control by its identifier in messages."""
+        self.connected: set[Any] = set()
+        """Connections of all kinds."""
+        self.browsers: set[Any] = set()
+        """Websockets."""
+
+    def checked(self, frame: bytes | str) -> bytes | None:
+        """Return a frame as viser may read it, or None for a value that its control cannot have.
+
+        Raises:
+            DataError: The frame is malformed.
+        """
+        message = read_frame(frame)
+        if message["type"] == "GuiUpdateMessage":
+            try:
+                value = control_value(message["updates"]["value"], self.control_of(message["uuid"]))
+            except DataError:  # empty for a moment while the user types
+                return None
+            message["updates"] = {"value": value}
+        return write_frame(message)
+
+    def answer(self, inner: Callable[..., Any] | None, protocol: str, connection: Any, request: Any) -> Any:
+        """Return the answer to a request; None if its websocket may be opened.
+
+        Args:
+            inner: viser's own function, which returns files.
+            protocol: Name of the protocol that a websocket must speak.
+            connection: The connection.
+            request: The request, as websockets passes it.
+        """
+        from websockets.datastructures import Headers
+
+        headers = request.headers
+        upgrade = "Upgrade" in headers
+        path = self.guard.admitted_path(request.path, headers.get_all("Host"), headers.get_all("Origin"), upgrade)
+        if path is None or (upgrade and headers.get_all("Sec-WebSocket-Protocol") != [protocol]):
+            return connection.respond(HTTPStatus.FORBIDDEN, REFUSED)
+        if upgrade:
+            if len(self.browsers) >= MAX_BROWSERS:
+                return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "Too many browsers.\n")
+            self.browsers.add(connection)
+            return None
+        if inner is None:
+            return connection.respond(HTTPStatus.NOT_FOUND, REFUSED)
+        response = inner(connection, dataclasses.replace(request, path=path, headers=Headers()))  # no compression
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            response.body = live_page(response.body.decode("utf-8"), connection.nonce).encode()
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
+        return response
+
+    def add_headers(self, connection: Any, request: Any, response: Any) -> None:
+        """Add the headers of every answer."""
+        hosts = request.headers.get_all("Host")
+        for name, value in self.guard.headers(hosts[0] if hosts else "", connection.nonce).items():
+            response.headers[name] = value
+
+
+def connection_class(rules: Rules) -> type:
+    """Return the class of connections that follow rules."""
+    from websockets.asyncio.server import ServerConnection
+
+    class Connection(ServerConnection):
+        """A connection that checks messages before viser reads them."""
+
+        def __init__(self, *args: Any, **named: Any):
+            super().__init__(*args, **named)
+            self.nonce = secrets.token_urlsafe(16)
+            self.refused = False
+            self.allowance = Allowance(MESSAGES_PER_SECOND, MAX_BURST)
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            rules.connected.add(self)
+            if len(rules.connected) > MAX_CONNECTIONS:
+                transport.abort()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            rules.connected.discard(self)
+            rules.browsers.discard(self)
+            super().connection_lost(exc)
+
+        async def recv(self, *args: Any, **named: Any) -> bytes:
+            """Return the next message that viser may read; a malformed one closes the connection."""
+            while True:
+                frame = await super().recv(*args, **named)
+                if self.refused:  # messages from before the connection ended, too
+                    continue
+                try:
+                    if not self.allowance.take():
+                        raise DataError(f"more than {MESSAGES_PER_SECOND:.0f} messages a second")
+                    checked = rules.checked(frame)
+                except DataError as e:
+                    self.refused = True
+                    say(f"the viewer closed the connection of a browser: {e}", error=True)
+                    self.transport.abort()  # a client that sends such a message may ignore a normal close
+                    continue
+                if checked is not None:
+                    return checked
+
+    return Connection
+
+
+def _silent() -> logging.Logger:
+    """Return a logger that writes nothing: websockets would print tracebacks of invalid requests."""
+    logger = logging.Logger("warpgs.viewer", logging.CRITICAL + 1)
+    logger.addHandler(logging.NullHandler())
+    return logger
+
+
+def _failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Print an error of viser's own in one line."""
+    error = context.get("exception")
+    say(f"the viewer ignored a message ({said(error) if error else context.get('message')})", error=True)
+
+
+@contextlib.contextmanager
+def guarded_server(rules: Rules, bound: socket.socket, protocol: str) -> Iterator[None]:
+    """Make the server that viser starts in the block follow rules, and listen at the socket ``bound``.
+
+    viser has no option for such checks, so the function that starts its server is replaced in the block.
+
+    Args:
+        rules: The rules.
+        bound: The socket.
+        protocol: Name of the protocol that a websocket must speak.
+    """
+    import websockets.asyncio.server as module
+
+    with _HOOK:
+        serve = module.serve
+
+        def guarded(handler: Any, *_: Any, process_request: Any = None, **named: Any) -> Any:
+            async def handle(connection: Any) -> None:
+                try:
+                    await handler(connection)
+                except Exception as e:
+                    say(f"the viewer closed the connection of a browser ({said(e)})", error=True)
+
+            asyncio.get_running_loop().set_exception_handler(_failed)
+            limits = {"max_size": MAX_FRAME, "server_header": None, "logger": _silent()}
+            return serve(
+                handle, sock=bound, create_connection=connection_class(rules), process_response=rules.add_headers,
+                process_request=lambda connection, request: rules.answer(process_request, protocol, connection, request),
+                **{**named, **limits},
+            )  # fmt: skip
+
+        module.serve = guarded  # type: ignore[misc, assignment]
+        try:
+            yield
+        finally:
+            module.serve = serve  # type: ignore[misc]
+
 
 PORT = 8080
 """Default port."""

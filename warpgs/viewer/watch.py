@@ -12,18 +12,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warpgs.errors import DataError, WarpgsError
-from warpgs.export.formats import suffixes
-from warpgs.pipeline.model.model_file import FittedModel
-from warpgs.pipeline.runs.folder import CONFIG, read_record
-from warpgs.pipeline.runs.request import choose_device
+from warpgs.errors import DataError, WarpgsError, similar_folder
+from warpgs.export.base import suffixes
+from warpgs.pipeline.model.table import FittedModel
+from warpgs.pipeline.run.folder import CONFIG, read_record
+from warpgs.pipeline.run.request import choose_device
+from warpgs.process import say
 from warpgs.report.progress import waiting
-from warpgs.runtime.terminal import say
 from warpgs.scene import Gaussians
-from warpgs.suggestion import similar_folder
-from warpgs.viewer.content import Content, content_of_file, content_of_run, modified, views_of
 from warpgs.viewer.server import PORT, address, open_server, require_viser, stop_server
-from warpgs.viewer.window import Window
+from warpgs.viewer.window import Content, Window, content_of_file, content_of_run, modified, views_of
 
 if TYPE_CHECKING:
     import viser

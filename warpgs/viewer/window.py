@@ -1,27 +1,460 @@
-"""The window of the viewer: a model in the browser, with its cameras, and the panel beside it."""
+"""The window of the viewer: its content, maps, panel and saved views."""
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 
-from warpgs.geometry import camera_extent
-from warpgs.report.images import resized
-from warpgs.scene import Camera, Gaussians
-from warpgs.viewer.callbacks import guarded, said
-from warpgs.viewer.camera_conventions import camera_at, camera_before, distance_ahead, fov_y, wxyz_of
-from warpgs.viewer.content import Content
-from warpgs.viewer.html import middle_first, place_first_camera, plain_background
-from warpgs.viewer.maps import GAUSSIANS, Maps
-from warpgs.viewer.packing import packed
-from warpgs.viewer.panel import ALL, FINE, Panel
+from warpgs.errors import DataError, WarpgsError
+from warpgs.export.base import read_with_antialiasing
+from warpgs.files import read_file, readable, remove_leftovers, write_json
+from warpgs.geometry import camera_extent, convert_camera, convert_gaussians, matmul, rotation_matrices
+from warpgs.io.images import decode
+from warpgs.pipeline.metrics.coverage import MIN_ALPHA, DepthView, classes_of, coverage_map, depth_views
+from warpgs.pipeline.model.table import FittedModel
+from warpgs.pipeline.run.commands import RULE, scene_of
+from warpgs.pipeline.run.folder import TENSORS, StoredRun, load_checkpoint, open_run
+from warpgs.pipeline.train.strategies.importance_sampling import FINE
+from warpgs.process import say
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.report.images import coverage_image, depth_map, error_map, resized
+from warpgs.scene import Camera, Gaussians, Normalization, View
+from warpgs.viewer.html import (
+    camera_at,
+    camera_before,
+    distance_ahead,
+    fov_y,
+    middle_first,
+    packed,
+    place_first_camera,
+    plain_background,
+    stands_at,
+    wxyz_of,
+)
+from warpgs.viewer.server import guarded, said
 
 if TYPE_CHECKING:
     import viser
+
+
+@dataclass(frozen=True)
+class Content:
+    """A model and its description."""
+
+    title: str
+    """Name to show: the name of the folder or the file."""
+    model: FittedModel
+    """Gaussians, cameras by name, background and rule; without cameras where a file has none."""
+    stem: Path
+    """Beginning of the paths of files that are saved from the viewer: RUN for RUN/crop.json, x for x-crop.json beside x.ply."""
+    fine: torch.Tensor | None = None
+    """True for Gaussians of the fine layer, bool, shape [N]; None without layers."""
+    views: Mapping[str, View] = field(default_factory=dict)
+    """Views by name, with their photographs; empty if the scene cannot be read."""
+    sheet: Path | None = None
+    """PNG that shows where fine Gaussians were placed, or None."""
+
+    def saved(self, name: str) -> Path:
+        """Return the path of a file that is saved from the viewer."""
+        return self.stem / name if self.stem.is_dir() else self.stem.with_name(f"{self.stem.name}-{name}")
+
+
+def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] | None = None) -> Content:
+    """Read a run, finished or still going.
+
+    Args:
+        folder: The run folder.
+        device: auto, cpu or cuda.
+        views: Views that were read before, by name.
+
+    Raises:
+        DataError: The folder is not a run, or it holds no checkpoint yet.
+    """
+    run = open_run(folder, device)
+    level = load_checkpoint(folder)[0].get("columns.level")
+    # a fit that continues may have written another checkpoint in between
+    fine = level == FINE if level is not None and level.shape == (len(run.gaussians()),) else None
+    sheets = sorted((folder / "sampling").glob("*.png"))
+    return Content(
+        folder.resolve().name, run, folder, None if fine is None else fine.to(run.gaussians().means.device), views or {},
+        sheets[-1] if sheets else None,
+    )  # fmt: skip
+
+
+def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, View], list[str]]:
+    """Return the views of a run's scene by name, and notes for the user where they cannot be read."""
+    if not isinstance(content.model, StoredRun):
+        return {}, []
+    try:
+        _, train, test = scene_of(content.model, reader)
+    except WarpgsError as e:
+        return {}, [f"cameras are shown without photographs, since the scene cannot be read: {e}"]
+    return {v.name: v for v in [*train, *test]}, []
+
+
+def content_of_file(path: Path, device: str = "cpu") -> Content:
+    """Read a file of Gaussians of any format; it is centred and scaled for the viewer.
+
+    Raises:
+        DataError: The file holds no Gaussians.
+    """
+    stored, antialiased = read_with_antialiasing(path, None, "file")
+    if not len(stored):
+        raise DataError(f"{path}: contains no Gaussians; export the model again")
+    means = stored.means.double().numpy()
+    low, high = np.percentile(means, [5, 95], axis=0)
+    normalization = Normalization((low + high) / 2, 1 / max(0.5 * float(np.linalg.norm(high - low)), 1e-12))
+    gaussians = convert_gaussians(stored, normalization, "file", "scene")
+    gaussians = dataclasses.replace(gaussians, **{n: t.to(device) for n, t in gaussians.tensors().items()})
+    model = FittedModel(gaussians, normalization, {}, (), (), RULE, (0.0, 0.0, 0.0), 0, antialiased=antialiased)
+    return Content(path.name, model, path.with_suffix(""))
+
+
+def modified(folder: Path) -> float | None:
+    """Return when the last checkpoint of a run was written [s]; None without one."""
+    try:
+        return (folder / TENSORS).stat().st_mtime
+    except OSError:
+        return None
+
+
+CROP, PATH = "crop.json", "path.json"
+"""Names of the files in a run folder."""
+MAX_KEYFRAMES = 1000
+"""Largest number of keyframes of a path: half an hour at the default of 2 s between them."""
+
+
+@dataclass(frozen=True)
+class CropBox:
+    """A box in scene units [u], turned about its centre."""
+
+    center: np.ndarray
+    """Centre [u], shape [3]."""
+    size: np.ndarray
+    """Lengths of the box's sides [u], shape [3]."""
+    rotation: np.ndarray
+    """Rotation from the box's axes to the world's, shape [3, 3]."""
+
+    def contains(self, means: torch.Tensor) -> torch.Tensor:
+        """Return which points [N, 3] are inside, bool, shape [N]."""
+        offsets = means.detach().cpu().double() - torch.from_numpy(self.center)
+        inside = ((offsets[:, :, None] * torch.from_numpy(self.rotation)).sum(1).abs() <= torch.from_numpy(self.size / 2)).all(
+            1
+        )
+        return inside.to(means.device)
+
+    def to_json(self, normalization: Normalization) -> dict[str, Any]:
+        """Return the box in file units: ``center`` [3], ``size`` [3], and ``rotation`` [3, 3] from its axes to the world's."""
+        return {
+            "center": (self.center / normalization.scale + normalization.offset).tolist(),
+            "size": (self.size / normalization.scale).tolist(), "rotation": self.rotation.tolist(),
+        }  # fmt: skip
+
+
+def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
+    """Return a camera of a path as JSON.
+
+    Args:
+        camera: Camera in scene units.
+        seconds: Time at which the path reaches the camera [s].
+        normalization: Similarity from file to scene units.
+
+    Returns:
+        ``c2w``, camera-to-world in OpenCV axes and file units, 4 rows of 4; ``fov_y``, the vertical field of view [rad]; and
+        ``seconds``.
+    """
+    viewmat = convert_camera(camera, normalization, "scene", "file").viewmat
+    c2w = np.eye(4)
+    c2w[:3, :3] = viewmat[:3, :3].T
+    c2w[:3, 3] = -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
+    return {"c2w": c2w.tolist(), "fov_y": fov_y(camera), "seconds": seconds}
+
+
+GAUSSIANS, RENDER, DEPTH, COVERAGE, ERROR = "Gaussians (browser)", "render", "depth", "coverage", "error"
+MAPS = {
+    RENDER: "view-dependent colours, by the rasterizer of the fit",
+    DEPTH: "near: warm colours; far: cold colours; gray: opacity of at most one half",
+    COVERAGE: "striped magenta: seen by no training view; amber: seen by one",
+    ERROR: "difference from the photograph at the camera that you stepped into; 0.3 and more is brightest",
+}
+"""Images by name, with their descriptions."""
+NEAR = 1e-3
+"""Distance from a known camera, as a fraction of the cameras' extent, within which a browser's camera counts as there."""
+
+
+class Maps:
+    """Renders images of one model; depths of its training views are rendered once, when coverage is first requested."""
+
+    def __init__(self, content: Content, extent: float):
+        """Keep the model; ``extent`` is the extent of its cameras [u]."""
+        self.content, self.extent = content, extent
+        self._depths: list[DepthView] | None = None
+
+    def view_at(self, camera: Camera) -> str | None:
+        """Return the name of the model's camera at nearly the pose of ``camera``; None if there is no such camera."""
+        cameras = self.content.model.scene_cameras.items()
+        return next((n for n, c in cameras if stands_at(camera, c, NEAR * self.extent)), None)
+
+    @torch.no_grad()
+    def image(self, kind: str, camera: Camera, gaussians: Gaussians, sh_degree: int) -> tuple[np.ndarray, str]:
+        """Return an image as uint8, shape [H, W, 3], and its description.
+
+        Args:
+            kind: One of `MAPS`.
+            camera: Camera of the browser.
+            gaussians: The Gaussians to show, in scene units: all of the model or some.
+            sh_degree: Degree of the colours.
+        """
+        options = dataclasses.replace(self.content.model.options(), sh_degree=min(sh_degree, gaussians.sh_degree), record=False)
+        drawn: dict[str, Callable[..., tuple[np.ndarray, str]]] = {
+            RENDER: self._render, DEPTH: self._depth, COVERAGE: self._coverage, ERROR: self._error,
+        }  # fmt: skip
+        colors, note = drawn[kind](camera, gaussians, options)
+        return np.round(255 * np.clip(colors, 0, 1)).astype(np.uint8), note
+
+    def _render(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
+        return rasterize(gaussians, camera, options).rgb.cpu().numpy(), MAPS[RENDER]
+
+    def _depth(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
+        r = rasterize(gaussians, camera, options)
+        return depth_map(r.depth.cpu().numpy(), r.alpha.cpu().numpy()), MAPS[DEPTH]
+
+    def _coverage(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
+        model = self.content.model
+        if not model.train:
+            return self._render(camera, gaussians, options)[0], "a file of Gaussians has no training cameras; open its run"
+        if self._depths is None:
+            cameras = model.cameras()
+            masks = [v.mask if (v := self.content.views.get(n)) else None for n in model.train]
+            self._depths = depth_views(model.gaussians(), [cameras[n] for n in model.train], options, masks)
+        r = rasterize(gaussians, camera, options)
+        seen = classes_of(coverage_map(torch.where(r.alpha >= MIN_ALPHA, r.depth, 0), camera, self._depths), model.transparent)
+        return coverage_image(r.rgb.cpu().numpy(), seen["0"], seen["1"]), MAPS[COVERAGE]
+
+    def _error(self, camera: Camera, gaussians: Gaussians, options: RasterizeOptions) -> tuple[np.ndarray, str]:
+        name = self.view_at(camera)
+        view = self.content.views.get(name or "")
+        if view is None:
+            why = "the photographs cannot be read" if name else "step into a camera, by a click or by its name"
+            return self._render(camera, gaussians, options)[0], f"the error map cannot be shown: {why}"
+        render = rasterize(gaussians, view.camera, options).rgb.cpu().numpy()
+        return placed(error_map(render, view.image), view.camera, camera), f"{name}: {MAPS[ERROR]}"
+
+
+def placed(image: np.ndarray, own: Camera, camera: Camera) -> np.ndarray:
+    """Resample an image [H, W, 3] of the camera ``own`` for a camera at the same pose; gray outside the image."""
+    import cv2
+
+    K = matmul(np.asarray(camera.K), np.linalg.inv(own.K))  # pixel centres lie at +0.5 here, and at whole numbers in OpenCV
+    K[:2, 2] += 0.5 * (np.diag(K)[:2] - 1)
+    size = (camera.width, camera.height)
+    placed: np.ndarray = cv2.warpAffine(image, K[:2], size, flags=cv2.INTER_LINEAR, borderValue=(0.25, 0.25, 0.25))
+    return placed
+
+
+ALL_LAYERS, COARSE_LAYER, FINE_LAYER = "all", "coarse", "fine"
+"""Layers to show."""
+NOWHERE = "(choose one)"
+BOX, GIZMO = "/crop/box", "/crop"
+
+
+class Shown(Protocol):
+    """Methods of the window that the panel calls."""
+
+    def redraw(self) -> None:
+        """Send the current image."""
+
+    def step_into(self, name: str, client: Any) -> None:
+        """Move a browser's camera to the model's camera of that name."""
+
+    def reset(self, client: Any) -> None:
+        """Move a browser's camera back to where pages start."""
+
+    def camera_of(self, client: Any, side: int | None = None) -> Camera:
+        """Return a browser's camera."""
+
+
+class Panel:
+    """Controls that all browsers share."""
+
+    def __init__(self, server: viser.ViserServer, content: Content, window: Shown, maps: bool):
+        """Make the controls that are useful for the model."""
+        self.server, self.content, self.window = server, content, window
+        self.keyframes: list[dict[str, Any]] = []
+        self._lock = threading.Lock()
+        gui = server.gui
+        self._status = gui.add_markdown("")
+        self._kind = gui.add_dropdown("show", (GAUSSIANS, *MAPS) if maps else (GAUSSIANS,), initial_value=GAUSSIANS)
+        degree = content.model.gaussians().sh_degree
+        self._degree = gui.add_slider(
+            "SH degree", 0, max(degree, 1), 1, degree, disabled=degree == 0, visible=maps,
+            hint="spherical-harmonics degree of a render; Gaussians that the browser draws have degree 0",
+        )  # fmt: skip
+        self._layer = gui.add_dropdown(
+            "layer", (ALL_LAYERS, COARSE_LAYER, FINE_LAYER), initial_value=ALL_LAYERS, visible=content.fine is not None
+        )
+        self._cameras = gui.add_checkbox("cameras", True, visible=bool(content.model.scene_cameras))
+        self._note = gui.add_markdown("", visible=False)
+        for control in (self._kind, self._degree, self._layer, self._cameras):
+            control.on_update(guarded(lambda _: self.window.redraw()))
+        self._add_stepping()
+        self._add_sampling()
+        self._add_crop()
+        self._add_keyframes()
+        self.tell(content)
+
+    def kind(self) -> str:
+        """Return the choice of image: `GAUSSIANS` or one of `MAPS`."""
+        return str(self._kind.value)
+
+    def sh_degree(self) -> int:
+        """Return the degree of the colours of renders."""
+        return int(self._degree.value)
+
+    def layer(self) -> str:
+        """Return the layer to be shown."""
+        return str(self._layer.value)
+
+    def shows_cameras(self) -> bool:
+        """Return whether cameras are to be shown."""
+        return bool(self._cameras.value)
+
+    def crop_box(self) -> CropBox | None:
+        """Return the box outside of which nothing is to be shown; None for everything."""
+        if not self._crop.value:
+            return None
+        size = np.asarray(self._size.value, np.float64)
+        return CropBox(np.asarray(self._gizmo.position, np.float64), size, rotation_matrices(np.asarray(self._gizmo.wxyz)))
+
+    def tell(self, content: Content) -> None:
+        """Write title, number of Gaussians, step and number of cameras."""
+        self.content = content
+        model = content.model
+        parts = [f"{len(model.gaussians()):,} Gaussians"]
+        parts += [f"step {model.step:,}"] if model.step else []
+        parts += [f"{len(model.train)} training cameras, {len(model.test)} held out"] if model.scene_cameras else []
+        self._status.content = f"**{_plain(content.title)}**\n\n{', '.join(parts)}"
+
+    def explain(self, note: str) -> None:
+        """Show a note about the image; hide an empty one."""
+        self._note.content, self._note.visible = _plain(note), bool(note)
+
+    def _add_stepping(self) -> None:
+        names = {readable(name): name for name in self.content.model.scene_cameras}  # viser takes UTF-8 alone
+        if names:
+            chooser = self.server.gui.add_dropdown("step into", (NOWHERE, *names), initial_value=NOWHERE)
+
+            def step(event: Any) -> None:
+                if chooser.value != NOWHERE:
+                    self.window.step_into(names[chooser.value], event.client)
+
+            chooser.on_update(guarded(step))
+        reset = self.server.gui.add_button("Reset", hint="back to the first camera")
+        reset.on_click(guarded(lambda event: self.window.reset(event.client)))
+
+    def _add_sampling(self) -> None:
+        """Add the fit's image of the places where fine Gaussians were placed."""
+        sheet, run = self.content.sheet, self.content.stem
+        if sheet is None:
+            return
+
+        def show(event: Any) -> None:
+            try:
+                image = np.round(255 * decode(sheet, data=read_file(sheet, run))[0]).astype(np.uint8)
+            except WarpgsError as e:
+                return self.explain(str(e))
+            with event.client.gui.add_modal("Where fine Gaussians were placed") as modal:
+                event.client.gui.add_image(image, format="jpeg")
+                event.client.gui.add_button("close").on_click(lambda _: modal.close())
+
+        self.server.gui.add_button("show sampling", hint="where the fit placed fine Gaussians").on_click(guarded(show))
+
+    def _add_crop(self) -> None:
+        """Add a box that the user moves and rotates by its handles, and saves."""
+        gui, scene, means = self.server.gui, self.server.scene, self.content.model.gaussians().means.cpu().double().numpy()
+        low, high = np.percentile(means, [5, 95], axis=0)
+        with gui.add_folder("Crop box", expand_by_default=False):
+            self._crop = gui.add_checkbox("crop", False)
+            self._size = gui.add_vector3("size [u]", tuple(np.maximum(high - low, 1e-3)), min=(1e-3,) * 3, step=0.01)
+            save = gui.add_button("save crop box")
+        length = 0.3 * float(np.linalg.norm(high - low))
+        self._gizmo = scene.add_transform_controls(GIZMO, scale=length, position=tuple((low + high) / 2), visible=False)
+
+        def draw(_: Any = None) -> None:
+            self._gizmo.visible = bool(self._crop.value)
+            scene.add_box(
+                BOX, dimensions=self._size.value, wireframe=True, color=(240, 200, 60), visible=bool(self._crop.value)
+            )
+            self.window.redraw()
+
+        self._crop.on_update(guarded(draw))
+        self._size.on_update(guarded(draw))
+        self._gizmo.on_update(guarded(lambda event: self.window.redraw() if event.phase == "end" else None))
+
+        def store(_: Any) -> None:
+            box = self.crop_box()
+            if box is None:
+                return self.explain("no crop box yet: tick crop, and move the box")
+            self._save(CROP, box.to_json(self.content.model.normalization))
+
+        save.on_click(guarded(store))
+
+    def _add_keyframes(self) -> None:
+        """Add controls that append the current camera to a path, and save the path."""
+        gui = self.server.gui
+        with gui.add_folder("Keyframes", expand_by_default=False):
+            seconds = gui.add_number("seconds between", 2.0, min=0.1, max=600.0, step=0.1)
+            add, remove, save = (gui.add_button(t) for t in ("add this camera", "remove the last", "save path"))
+            count = gui.add_markdown("no keyframe")
+
+        def changed() -> None:
+            count.content = f"{len(self.keyframes)} keyframes" if self.keyframes else "no keyframe"
+
+        def append(event: Any) -> None:
+            with self._lock:
+                if len(self.keyframes) >= MAX_KEYFRAMES:
+                    return self.explain(f"a path has at most {MAX_KEYFRAMES:,} keyframes")
+                at = self.keyframes[-1]["seconds"] + float(seconds.value) if self.keyframes else 0.0
+                camera = self.window.camera_of(event.client)
+                self.keyframes.append(keyframe(camera, at, self.content.model.normalization))
+                changed()
+
+        def pop(_: Any) -> None:
+            with self._lock:
+                del self.keyframes[-1:]
+                changed()
+
+        add.on_click(guarded(append))
+        remove.on_click(guarded(pop))
+        save.on_click(
+            guarded(lambda _: self._save(PATH, self.keyframes) if self.keyframes else self.explain("add a camera first"))
+        )
+
+    def _save(self, name: str, values: Any) -> None:
+        """Write a file beside the model, and show its path."""
+        path = self.content.saved(name)
+        remove_leftovers(path.parent)
+        try:
+            write_json(path, values)
+        except WarpgsError as e:
+            return self.explain(str(e))
+        say(f"saved {path}")
+        self.explain(f"saved {path}")
+
+
+def _plain(text: str) -> str:
+    """Return text in UTF-8, with the special characters of Markdown escaped."""
+    return "".join(f"\\{c}" if c in "\\`*_{}[]()<>#|!" else c for c in readable(text))
+
 
 PHOTO_SIDE = 256
 """Longer side of the photographs on the cameras [px]."""
@@ -87,8 +520,8 @@ class Window:
         """Return the Gaussians of the layer and the crop box selected in the panel."""
         gaussians, fine = self.content.model.gaussians(), self.content.fine
         keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-        if fine is not None and self.panel.layer() != ALL:
-            keep &= fine if self.panel.layer() == FINE else ~fine
+        if fine is not None and self.panel.layer() != ALL_LAYERS:
+            keep &= fine if self.panel.layer() == FINE_LAYER else ~fine
         box = self.panel.crop_box()
         if box is not None:
             keep &= box.contains(gaussians.means)

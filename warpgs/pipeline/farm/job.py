@@ -1,22 +1,29 @@
-"""A job of a farm: a fit and the folder of its results, and the conversion to text for another process."""
+"""A job of a farm: its description, the list that it comes from, its record, and the interface of an engine."""
 
 from __future__ import annotations
 
 import dataclasses
+import glob
 import hashlib
 import json
-from dataclasses import dataclass
+import os
+import re
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any, Protocol
 
 from warpgs import schema
-from warpgs.errors import UsageError
-from warpgs.io.readers import READERS
-from warpgs.pipeline.runs.request import FitRequest, SceneRequest
-from warpgs.pipeline.train.config import FitConfig
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.files import input_digest, read_input, unread_reason, write_json
+from warpgs.io.folder import READERS, all_readers
+from warpgs.pipeline.run.folder import CONFIG
+from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import STRATEGIES
-from warpgs.pipeline.train.view_modules.base import VIEW_MODULES
+from warpgs.pipeline.train.view_modules import VIEW_MODULES
 from warpgs.plugins import module_of, own_places
+from warpgs.version import __version__
 
 
 @dataclass(frozen=True)
@@ -81,3 +88,279 @@ def job_of(text: str) -> FarmJob:
     )
     results = None if values["results"] is None else Path(values["results"])
     return FarmJob(values["name"], request, Path(values["folder"]), results)
+
+
+@dataclass(frozen=True)
+class Event:
+    """A change of the state of a job."""
+
+    name: str
+    """Name of the job."""
+    state: str
+    """running; or, as the last event of the job: done, failed, held (another process works on it) or crashed (its process
+    ended)."""
+    message: str = ""
+    """Reason of a crash."""
+    step: int = 0
+    """Steps done; 0 if unknown."""
+
+
+class Engine(Protocol):
+    """A place where jobs run."""
+
+    name: str
+    """Name shown to the user."""
+    slots: int
+    """Largest number of jobs that run at a time."""
+
+    def start(self, job: FarmJob) -> None:
+        """Start a job; called while fewer than `slots` jobs run."""
+
+    def wait(self, seconds: float) -> list[Event]:
+        """Return new events, after at most ``seconds`` [s]."""
+
+    def close(self) -> None:
+        """Stop all jobs. A fit saves its state if it can, and the next farm continues it."""
+
+
+NAME = re.compile(r"(?:[^\W_]|[\udc80-\udcff])[^/\\:*?\"<>|\x00-\x1f]{0,99}")
+"""Pattern of a job's name: a valid folder name on any system. Bytes that are not text are allowed, as folders may have them."""
+MOST_BYTES = 200
+"""Longest name of a job [bytes]: file systems allow 255, and longer names such as NAME.old1 must fit, too."""
+OWN_FILES = ("index.html", "results.csv")
+"""Names in a results folder that do not belong to a job."""
+PLUGINS = ("preset", "strategy", "loss-terms", "view-modules", "reader")
+"""Flags that can name code; in a file of jobs they may only name code of warpgs."""
+FARM_FLAGS = (
+    "out", "resume", "view", "view-port", "device", "threads", "time-budget", "allow-outside", "help", "help-all", "h",
+)  # fmt: skip
+"""Flags of `warpgs fit` that a single job may not set."""
+
+
+@dataclass(frozen=True)
+class ListedJob:
+    """A scene to fit, and the job's flags in addition to those of all jobs."""
+
+    name: str
+    """Name, unique in the farm; the folder of its results."""
+    scene: Path
+    """Folder of the scene, or a video."""
+    flags: tuple[str, ...] = ()
+    """Arguments of `warpgs fit`."""
+
+
+def list_jobs(jobs: str) -> list[ListedJob]:
+    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file.
+
+    Raises:
+        DataError: A line of the file is not a job, or a name is not valid for a folder.
+        UsageError: There is nothing to fit, the folder is a single scene, or two jobs have the same name.
+    """
+    path = Path(jobs)
+    if path.is_dir():
+        if any(r.probe(path) is not None for r in all_readers()):
+            raise UsageError(f"{jobs} is a single scene: fit it with `warpgs fit`, or give its parent folder")
+        found = _named(sorted(p for p in path.iterdir() if p.is_dir() and not p.name.startswith(".")))
+    elif path.suffix == ".jsonl":
+        found = _read(path)
+    else:
+        found = _named(sorted(Path(p) for p in glob.glob(jobs)))
+    if not found:
+        raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
+    taken: dict[str, ListedJob] = {}
+    for job in found:
+        if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:
+            raise DataError(
+                f"{jobs}: {job.name[:100]!r} is not a valid name for a job and its folder; give another name in a .jsonl file"
+            )
+        if (size := len(os.fsencode(job.name))) > MOST_BYTES:
+            raise DataError(
+                f"{jobs}: {job.name[:100]!r} has {size} bytes, but a job's name may have at most {MOST_BYTES}; give another "
+                "name in a .jsonl file"
+            )
+        if job.name.casefold() in taken:
+            raise UsageError(f"{jobs}: two jobs have the name {job.name!r}; give each line of a .jsonl file its own name")
+        taken[job.name.casefold()] = job
+    return found
+
+
+def _named(scenes: list[Path]) -> list[ListedJob]:
+    """Name scenes by their folders; if two folders have the same name, by their paths below the common folder."""
+    scenes = [Path(os.path.abspath(s)) for s in scenes]
+    if len({s.name.casefold() for s in scenes}) == len(scenes):
+        return [ListedJob(s.name, s) for s in scenes]
+    above = os.path.commonpath(scenes)
+    return [ListedJob("-".join(s.relative_to(above).parts), s) for s in scenes]
+
+
+def _read(path: Path) -> list[ListedJob]:
+    """Read a file of jobs: ``{"scene": FOLDER}`` per line, optionally with a ``name`` and flags of `warpgs fit`."""
+    try:
+        data = read_input(path, schema.MAX_BYTES)
+    except OSError as e:
+        raise DataError(
+            f"{path}: cannot be read ({unread_reason(e)}); give a file with one line of JSON per job, and split a large one"
+        ) from e
+    found = []
+    for number, line in enumerate(data.splitlines(), 1):
+        if line.strip():
+            try:
+                found.append(_job(schema.parse(line), path.parent))
+            except schema.SchemaError as e:
+                raise DataError(f'{path}, line {number}: {e}; write {{"scene": FOLDER, "steps": 500}}') from e
+    return found
+
+
+_LINE = schema.fields({"scene": schema.text}, {"name": schema.text})
+
+
+def _job(values: Any, folder: Path) -> ListedJob:
+    """Return the job of a line; SchemaError if it is not a job."""
+    _LINE(values, "")
+    scene = Path(os.path.abspath(folder / values["scene"]))
+    flags = [word for key, value in values.items() if key not in ("scene", "name") for word in _flag(key, value)]
+    return ListedJob(values.get("name", scene.name), scene, tuple(flags))
+
+
+def _flag(key: str, value: Any) -> list[str]:
+    """Return a setting of a line as arguments of a command line."""
+    name = key.replace("_", "-")
+    if not re.fullmatch(r"[a-zA-Z][a-zA-Z0-9.-]{0,99}", name) or name in FARM_FLAGS:
+        raise schema.SchemaError(f"{key[:40]!r} cannot be set for a single job")
+    if isinstance(value, bool):
+        group, dot, last = name.rpartition(".")
+        return [f"--{name}" if value else f"--{group}{dot}no-{last}"]
+    if not isinstance(value, (str, int, float)):
+        raise schema.SchemaError(f"{key[:40]} must be text, a number, true or false")
+    schema.text(str(value), key[:40])
+    if name in PLUGINS and ":" in str(value):
+        raise schema.SchemaError(f"{key} names user code; give it as --{name} on the command line of the farm")
+    return [f"--{name}={value}"]
+
+
+RECORD = "job.json"
+LOG = "log.txt"
+"""Name of the file with the output of a job."""
+THUMBNAIL = "thumbnail.jpg"
+PLY = "point_cloud.ply"
+CHECKED = (PLY, "metrics.json", CONFIG)
+"""Files of a run with a checksum in the record."""
+FORMAT = 1
+MOST_FILES = 100_000
+"""Largest number of files and folders of a scene to list. Changes of a larger scene are detected only when a fit reads it."""
+
+_DIGEST = schema.text
+_SCHEMA = schema.fields(
+    {
+        "name": schema.text, "identity": schema.text, "state": schema.one_of("done", "failed"), "how": schema.text,
+        "message": schema.text, "again": schema.flag, "source": schema.text, "seconds": schema.number(0),
+        "psnr": schema.or_null(schema.real), "ssim": schema.or_null(schema.real), "gaussians": schema.whole(0),
+        "steps": schema.whole(0), "ply_bytes": schema.whole(0), "files": schema.mapping(_DIGEST), "version": schema.text,
+        "format": schema.one_of(FORMAT),
+    },
+    others=False,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """Outcome of a job."""
+
+    name: str
+    identity: str
+    """Digest of the job, `FarmJob.identity`."""
+    state: str
+    """done or failed."""
+    how: str = ""
+    """kept, continued, fitted or redone."""
+    message: str = ""
+    """Error of a failed job, or a note on a finished one."""
+    again: bool = False
+    """True if a failed job may succeed when it is repeated."""
+    source: str = ""
+    """SHA-256 of the scene's file names, sizes and times; empty if unknown."""
+    seconds: float = 0.0
+    """Wall time of the job, reading and scores included [s]."""
+    psnr: float | None = None
+    """Mean PSNR over held-out views [dB]; None without held-out views."""
+    ssim: float | None = None
+    """Mean SSIM over held-out views."""
+    gaussians: int = 0
+    steps: int = 0
+    ply_bytes: int = 0
+    """Size of the PLY file."""
+    files: dict[str, str] = field(default_factory=dict)
+    """SHA-256 of files by their names in the run folder."""
+    version: str = __version__
+    """Version of warpgs."""
+    format: int = FORMAT
+
+
+def write_record(folder: Path, record: JobRecord) -> None:
+    """Write the record of a job.
+
+    Raises:
+        ResourceError: The record cannot be written.
+    """
+    write_json(folder / RECORD, asdict(record))
+
+
+def read_job_record(folder: Path) -> JobRecord | None:
+    """Read the record of a job; None if it is missing or incomplete."""
+    try:
+        values = schema.read(folder / RECORD, folder)
+        _SCHEMA(values, "")
+    except (OSError, schema.SchemaError):
+        return None
+    return JobRecord(**values)
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal digits.
+
+    Raises:
+        ResourceError: The file cannot be read.
+    """
+    try:
+        return input_digest(path, path.parent)
+    except OSError as e:
+        raise ResourceError(f"{path}: cannot be read ({unread_reason(e)}); check the disk, and fit the scene again") from e
+
+
+def source_stamp(scene: Path) -> str:
+    """Return the SHA-256 of the names, sizes and times of a scene's files; empty if they cannot be listed or are too many."""
+    rows = []
+    try:
+        if scene.is_file():
+            found = scene.stat()
+            rows.append((scene.name, found.st_size, found.st_mtime_ns))
+        for count, (folder, _, names) in enumerate(os.walk(scene, followlinks=True)):
+            if count > MOST_FILES:  # links may show a folder in many places
+                return ""
+            for name in names:
+                path = Path(folder, name)
+                found = path.stat()
+                rows.append((path.relative_to(scene).as_posix(), found.st_size, found.st_mtime_ns))
+                if len(rows) > MOST_FILES:
+                    return ""
+    except OSError:  # the fit reports the error
+        return ""
+    return hashlib.sha256(json.dumps(sorted(rows)).encode()).hexdigest() if rows else ""
+
+
+def is_whole(folder: Path, record: JobRecord) -> bool:
+    """Return whether the files of a finished run match the checksums of its record."""
+    try:
+        return set(record.files) == set(CHECKED) and all(file_digest(folder / n) == d for n, d in record.files.items())
+    except ResourceError:
+        return False
+
+
+def finished(job: FarmJob) -> JobRecord | None:
+    """Return the record of a job that is finished and valid: same scene, settings and version, and intact files; else None."""
+    record = read_job_record(job.folder)
+    if record is None or record.state != "done" or record.identity != job.identity() or record.version != __version__:
+        return None
+    if not record.source or record.source != source_stamp(Path(job.request.scene.path)):
+        return None
+    return record if is_whole(job.request.out, record) else None

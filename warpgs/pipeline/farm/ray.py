@@ -12,13 +12,11 @@ import secrets
 from collections.abc import Callable
 from typing import Any
 
-from warpgs.errors import ResourceError, UsageError
-from warpgs.pipeline.farm.engine import Event
-from warpgs.pipeline.farm.job import FarmJob, job_text
+from warpgs.errors import ResourceError, UsageError, install_extras
+from warpgs.folders import private_folder
+from warpgs.pipeline.farm.job import Event, FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
-from warpgs.runtime.folders import private_folder
-from warpgs.runtime.listening import listeners, say_what_is_open
-from warpgs.suggestion import install_extras
+from warpgs.ranks import listeners, say_what_is_open
 
 
 class RayEngine:

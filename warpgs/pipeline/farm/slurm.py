@@ -1,8 +1,4 @@
-"""The engine for Slurm clusters: a Slurm job for each scene, by sbatch, squeue and scancel.
-
-A job is sent to its node as JSON, and its state comes back as one word, both in a private folder. All other results are in the
-job's record.
-"""
+"""Farms on Slurm: jobs are submitted as arrays of tasks; each task runs this module."""
 
 from __future__ import annotations
 
@@ -16,13 +12,17 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from warpgs.errors import ResourceError, UsageError
+from warpgs.errors import ResourceError, UsageError, WarpgsError
 from warpgs.files import write_text
-from warpgs.pipeline.farm.engine import Event
-from warpgs.pipeline.farm.job import FarmJob, job_text
-from warpgs.pipeline.farm.private_folder import private_shared_folder
-from warpgs.runtime.subprocesses import ProgramResult, run_program
-from warpgs.runtime.terminal import say
+from warpgs.locks import private_shared_folder
+from warpgs.pipeline.farm.job import Event, FarmJob, job_text
+from warpgs.pipeline.farm.work import run_job
+from warpgs.process import ProgramResult, interrupting_signals, run_program, say
+
+# The engine for Slurm clusters: a Slurm job for each scene, by sbatch, squeue and scancel.
+#
+# A job is sent to its node as JSON, and its state comes back as one word, both in a private folder. All other results
+# are in the job's record.
 
 QUEUED = 100
 """Default number of jobs that Slurm has at a time."""
@@ -108,7 +108,7 @@ class SlurmEngine:
         number = next(self._numbers)
         text, answer, log = (self._folder / f"{number}.{kind}" for kind in ("json", "answer", "log"))
         write_text(text, job_text(job))
-        command = [sys.executable, "-P", "-m", "warpgs.pipeline.farm.batch", str(text), str(answer), str(self._threads)]
+        command = [sys.executable, "-P", "-m", "warpgs.pipeline.farm.slurm", str(text), str(answer), str(self._threads)]
         script = f"#!/bin/sh\nexec {shlex.join(command)}\n"
         done = _call("sbatch", "--parsable", *self._options, f"--output={log}", script=script)
         slurm_id = done.output.strip().partition(";")[0]
@@ -191,3 +191,26 @@ def _call(program: str, *options: str, script: str = "") -> ProgramResult:
 def _last_line(text: str) -> str:
     """Return the last line that is not empty, or an empty text."""
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+
+
+# The process of a Slurm job: runs the job that one file describes, and writes the job's state into another file.
+#
+# ``python -P -m warpgs.pipeline.farm.slurm JOB ANSWER THREADS``
+
+
+def main(job: str, answer: str, threads: str) -> int:
+    """Run a job; return the exit code."""
+    try:
+        with interrupting_signals():
+            state = run_job(Path(job).read_text("utf-8"), int(threads))
+            write_text(Path(answer), state)
+    except KeyboardInterrupt:
+        return 130
+    except WarpgsError as e:
+        say(e, error=True)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

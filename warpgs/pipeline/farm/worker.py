@@ -47,13 +47,13 @@ def _work(values: dict[str, object], answer: Callable[..., None]) -> str:
     if "kernels" in values:
         import torch
 
-        from warpgs.pipeline.runs.precompile import precompile_kernels
+        from warpgs.pipeline.run.precompile import precompile_kernels
 
         for _ in precompile_kernels([torch.device("cpu")] if values["kernels"] == "cpu" else None):
             pass
         return "done"
     from warpgs.pipeline.farm.work import run_job
-    from warpgs.pipeline.train.step_report import StepReport
+    from warpgs.pipeline.train.schedule import StepReport
 
     told = 0.0
 

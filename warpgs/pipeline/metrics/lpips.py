@@ -1,17 +1,255 @@
-"""LPIPS, the distance of two images in the features of a classifier (Zhang et al. 2018), from weights the user names."""
+"""LPIPS, and the weights that it needs."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
+import os
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 
-from warpgs.pipeline.metrics.lpips_weights import Net, read_lpips
+from warpgs import files
+from warpgs.errors import DataError, UsageError
+from warpgs.files import open_input, read_input, remove_leftovers, unread_reason, write_bytes
+
+FORMAT = "warpgs-lpips-1"
+MAX_PICKLE = 2**20
+"""Largest size of a .pth file without its tensors [bytes]; published files have a few KiB. torch copies these bytes twice."""
+
+
+@dataclass(frozen=True)
+class Net:
+    """The convolutional layers of a classifier, with the numbers of torchvision (`features.N`)."""
+
+    name: str
+    """vgg or alex."""
+    title: str
+    """Name as papers write it."""
+    layers: tuple[tuple[Any, ...], ...]
+    """Layers in order: ("conv", number, inputs, outputs, kernel, stride, padding), ("pool", kernel, stride), or ("tap",) after
+    a rectified convolution whose features are compared."""
+    smallest: int
+    """Shortest image side for which the last compared layer has at least a pixel [px]."""
+    published: str
+    """First digits of the SHA-256 of torchvision's file, as in the name of that file."""
+
+    @property
+    def channels(self) -> tuple[int, ...]:
+        """Channels of the five compared layers."""
+        pairs = zip(self.layers, self.layers[1:])
+        return tuple(layer[3] for layer, after in pairs if after == ("tap",))
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the names of all tensors of a converted file with their shapes."""
+        found: dict[str, tuple[int, ...]] = {}
+        for layer in self.layers:
+            if layer[0] == "conv":
+                _, number, inputs, outputs, kernel, _, _ = layer
+                found[f"features.{number}.weight"] = (outputs, inputs, kernel, kernel)
+                found[f"features.{number}.bias"] = (outputs,)
+        return found | {f"lin{i}.model.1.weight": (1, c, 1, 1) for i, c in enumerate(self.channels)}
+
+
+def _conv(number: int, inputs: int, outputs: int, kernel: int = 3, stride: int = 1, padding: int = 1) -> tuple[Any, ...]:
+    return ("conv", number, inputs, outputs, kernel, stride, padding)
+
+
+TAP = ("tap",)
+NETS = {
+    # Simonyan and Zisserman 2015, network D; compared after the last rectification of each block
+    "vgg": Net(
+        "vgg", "VGG16",
+        (
+            _conv(0, 3, 64), _conv(2, 64, 64), TAP, ("pool", 2, 2),
+            _conv(5, 64, 128), _conv(7, 128, 128), TAP, ("pool", 2, 2),
+            _conv(10, 128, 256), _conv(12, 256, 256), _conv(14, 256, 256), TAP, ("pool", 2, 2),
+            _conv(17, 256, 512), _conv(19, 512, 512), _conv(21, 512, 512), TAP, ("pool", 2, 2),
+            _conv(24, 512, 512), _conv(26, 512, 512), _conv(28, 512, 512), TAP,
+        ),
+        16, "397923af",
+    ),
+    # Krizhevsky 2014, one tower; compared after every rectification
+    "alex": Net(
+        "alex", "AlexNet",
+        (
+            _conv(0, 3, 64, 11, 4, 2), TAP, ("pool", 3, 2), _conv(3, 64, 192, 5, 1, 2), TAP, ("pool", 3, 2),
+            _conv(6, 192, 384), TAP, _conv(8, 384, 256), TAP, _conv(10, 256, 256), TAP,
+        ),
+        31, "7be5be79",
+    ),
+}  # fmt: skip
+"""Zhang et al. 2018, section 3; layer numbers of torchvision's vgg16 and alexnet."""
+
+HEADS = {
+    "b9e4236260c3dd988fc79d2a48d645d885afcbb21f9fd595e6744cf7419b582c": "0.0",
+    "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868": "0.1",
+    "18720f55913d0af89042f13faa7e536a6ce1444a0914e6db9461355ece1e8cd5": "0.0",
+    "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0": "0.1",
+}
+"""SHA-256 of the heads vgg.pth and alex.pth that github.com/richzhang/PerceptualSimilarity publishes, and their version."""
+
+
+def _read_state(path: Path) -> tuple[dict[str, torch.Tensor], str]:
+    """Return the tensors of a .pth file by name, and the file's SHA-256."""
+    try:
+        file = open_input(path)
+    except FileNotFoundError as e:
+        raise DataError(f"{path}: no such file; give a .pth file with a state dict") from e
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); give a .pth file with a state dict") from e
+    with file:
+        try:
+            _check_unpacked(file)
+            # weights_only: tensors and plain containers, nothing that could run
+            state = torch.load(_mapped(file), map_location="cpu", weights_only=True, mmap=_mapped(file) is not file)
+        except Exception as e:  # torch, pickle and zipfile raise a dozen types on malformed files
+            reason = str(e).splitlines()[0][:120] if str(e) else ""
+            raise DataError(
+                f"{path}: cannot be read as a torch state dict ({type(e).__name__}: {reason}); download it again"
+            ) from e
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if not isinstance(state, dict):
+        raise DataError(f"{path}: holds a {type(state).__name__}, not a state dict of named tensors; save only the weights")
+    return state, digest
+
+
+def _mapped(file: BinaryIO) -> str | BinaryIO:
+    """Return a path that lets torch map an open archive: then tensors use no memory before they are read.
+
+    Return the file itself if the system has no such paths, or if torch would have to unpickle the tensors.
+    """
+    name = files.DESCRIPTORS / str(file.fileno())
+    named = name.exists() and zipfile.is_zipfile(file)
+    file.seek(0)
+    return str(name) if named else file
+
+
+def _check_unpacked(file: BinaryIO) -> None:
+    """Check that an archive has no large pickle and unpacks to no more than its own size, since torch does not compress.
+
+    Raises:
+        ValueError: The archive unpacks to more, or has a large pickle.
+    """
+    if zipfile.is_zipfile(file):
+        with zipfile.ZipFile(file) as archive:
+            members = archive.infolist()
+        unpacked = sum(member.file_size for member in members)
+        if unpacked > file.seek(0, os.SEEK_END):
+            raise ValueError(f"it unpacks to {unpacked:,} bytes, more than its size")
+        others = sum(member.file_size for member in members if Path(member.filename).parent.name != "data")
+        if others > MAX_PICKLE:
+            raise ValueError(f"it holds {others:,} bytes besides its tensors, more than {MAX_PICKLE:,}")
+        if any(member.compress_type != zipfile.ZIP_STORED for member in members):
+            raise ValueError("its tensors are compressed; torch.save stores them uncompressed")
+    file.seek(0)
+
+
+def _net_of(heads: dict[str, torch.Tensor], path: Path) -> Net:
+    shapes = {k: tuple(v.shape) for k, v in heads.items() if isinstance(v, torch.Tensor)}
+    for net in NETS.values():
+        if shapes == {k: v for k, v in net.shapes().items() if k.startswith("lin")}:
+            return net
+    raise DataError(
+        f"{path}: heads of an unsupported network; warpgs measures LPIPS with VGG16 (vgg.pth) and AlexNet (alex.pth) "
+        "from the folder lpips/weights of PerceptualSimilarity"
+    )
+
+
+def convert_lpips(backbone: Path, heads: Path, out: Path) -> list[str]:
+    """Join a backbone and LPIPS heads, once, into a file without pickles that `--lpips-weights` takes.
+
+    Args:
+        backbone: State dict of torchvision's vgg16 or alexnet, trained on ImageNet.
+        heads: The five linear heads of PerceptualSimilarity for the same network.
+        out: The safetensors file to write; its header names net, version and the SHA-256 of both sources.
+
+    Returns:
+        Lines for the user: the written file, and whether a source differs from the published one.
+
+    Raises:
+        DataError: A source is missing, is not a state dict, belongs to another network, or is not finite.
+        ResourceError: The file cannot be written.
+        UsageError: ``out`` exists.
+    """
+    from safetensors.torch import save
+
+    if os.path.exists(out):
+        raise UsageError(f"{out} exists already; choose another --out")
+    head_state, head_hash = _read_state(heads)
+    net = _net_of(head_state, heads)
+    state, backbone_hash = _read_state(backbone)
+    tensors = {}
+    for name, shape in net.shapes().items():
+        source, path = (head_state, heads) if name.startswith("lin") else (state, backbone)
+        value = source.get(name)
+        if not isinstance(value, torch.Tensor) or tuple(value.shape) != shape:
+            found = f"is {list(value.shape)}" if isinstance(value, torch.Tensor) else "is missing"
+            raise DataError(
+                f"{path}: {name} {found}, expected {list(shape)} of {net.title}; the heads belong to {net.title}, so give "
+                "torchvision's weights of that network"
+            )
+        if not bool(torch.isfinite(value).all()):
+            raise DataError(f"{path}: {name} is not finite; download it again from its source")
+        tensors[name] = value.float().contiguous()
+    version = HEADS.get(head_hash, "unknown")
+    metadata = {
+        "format": FORMAT, "net": net.name, "version": version, "backbone_sha256": backbone_hash, "heads_sha256": head_hash,
+    }  # fmt: skip
+    remove_leftovers(out.parent)
+    write_bytes(out, save(tensors, metadata))
+    notes = [f"{out}: LPIPS with {net.title}, heads of version {version}"]
+    if not backbone_hash.startswith(net.published):
+        notes.append(f"{backbone} is not torchvision's published file (SHA-256 {net.published}...); scores are not comparable")
+    if version == "unknown":
+        notes.append(f"{heads} is neither v0.0 nor v0.1 of the published heads; scores are not comparable")
+    return notes
+
+
+def read_lpips(path: Path) -> tuple[Net, dict[str, torch.Tensor], dict[str, str]]:
+    """Read a converted file.
+
+    Returns:
+        The network, its tensors by name (float32, CPU, shapes [...] as in `Net.shapes`), and the header with the file's own
+        SHA-256 as "sha256".
+
+    Raises:
+        DataError: The file is missing, damaged, or was not written by `convert_lpips`.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    try:
+        data = read_input(path)
+    except FileNotFoundError as e:
+        raise DataError(f"{path}: no such file; `warpgs convert-lpips` makes one from published weights") from e
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); write one with `warpgs convert-lpips`") from e
+    try:
+        tensors = load(data)
+        metadata = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")]).get("__metadata__") or {}
+    except (SafetensorError, ValueError) as e:
+        raise DataError(f"{path}: damaged or not a safetensors file ({e}); write it again with `warpgs convert-lpips`") from e
+    if metadata.get("format") != FORMAT or metadata.get("net") not in NETS:
+        raise DataError(f"{path}: holds no LPIPS weights; `warpgs convert-lpips` writes one from published weights")
+    net = NETS[metadata["net"]]
+    for name, shape in net.shapes().items():
+        if name not in tensors or tuple(tensors[name].shape) != shape:
+            raise DataError(f"{path}: no {name} of shape {list(shape)}; write the file again with `warpgs convert-lpips`")
+        if tensors[name].dtype != torch.float32 or not bool(torch.isfinite(tensors[name]).all()):
+            raise DataError(f"{path}: {name} is not finite float32; write the file again with `warpgs convert-lpips`")
+    return net, tensors, {**metadata, "sha256": hashlib.sha256(data).hexdigest()}
+
+
+# LPIPS, the distance of two images in the features of a classifier (Zhang et al. 2018), from weights the user names.
 
 MODES = ("legacy", "standard")
 """legacy: colours are passed unchanged, in [0, 1], as the evaluation code of Kerbl et al. 2023 and its descendants do;

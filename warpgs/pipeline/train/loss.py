@@ -1,17 +1,21 @@
-"""Loss terms: their inputs in a training step, their declarations, and their lookup by name."""
+"""The loss: the interface of a term, and the built-in terms."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeVar
 
 import torch
 
+from warpgs.device import FLOAT, LOSS, STEP, Needs, StepSizes
 from warpgs.errors import UsageError
+from warpgs.geometry import depth_normals
+from warpgs.kernels.ssim import difference_bytes, differences
 from warpgs.pipeline.train.views import TrainingView
 from warpgs.plugins import Registry
-from warpgs.runtime.step_sizes import FLOAT, LOSS, Needs, StepSizes
 from warpgs.scene import Camera, Gaussians, Prior
 
 OUTPUTS = ("rgb", "alpha", "depth")
@@ -112,7 +116,7 @@ class LossTerm:
         raise TypeError(f"{type(self).__name__} must define __call__(inputs)")
 
 
-LOSS_TERMS = Registry("loss term", LossTerm, "warpgs.pipeline.train.loss_terms")
+LOSS_TERMS = Registry("loss term", LossTerm, "warpgs.pipeline.train.loss")
 """Loss terms by name."""
 register = LOSS_TERMS.register
 
@@ -192,3 +196,338 @@ def collect(terms: Sequence[LossTerm], parts: Callable[[LossTerm], Mapping[str, 
                 )
             found[name], owners[name] = part, term
     return found
+
+
+# The photometric loss: 0.8 L1 + 0.2 (1 - SSIM), as in the paper's preliminaries and Kerbl et al. 2023, eq. 7.
+
+
+@functools.cache
+def _weights(fraction: float, count: int, dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+    """Return the weights [2] of the sums of 1 - SSIM and of absolute differences over ``count`` numbers.
+
+    They stay cached, because CUDA graphs refer to their memory.
+    """
+    with torch.inference_mode(False):  # a first call may come in inference mode, whose tensors cannot be used in training
+        return torch.tensor([fraction / count, (1 - fraction) / count], dtype=dtype, device=device)
+
+
+def photometric_loss(
+    rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None, ssim_weight: float = 0.2
+) -> torch.Tensor:
+    """Return the loss of a rendered image: (1 - lambda) L1 + lambda (1 - SSIM).
+
+    Args:
+        rgb: Rendered colours, shape [H, W, 3].
+        target: Photographed colours in [0, 1], shape [H, W, 3].
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask. Masked pixels are black in the
+            windows of SSIM around unmasked pixels.
+        ssim_weight: lambda, in [0, 1].
+
+    Returns:
+        The loss, shape []; 0 if all pixels are masked.
+    """
+    pixels = target.shape[0] * target.shape[1]
+    if mask is not None:
+        kept = mask[..., None] > 0
+        rgb, target = torch.where(kept, rgb, 0), torch.where(kept, target, 0)
+    if ssim_weight > 0:
+        sums = differences(rgb, target)
+        # one product and one sum, where terms one by one would be a dozen kernels on a GPU
+        loss = (sums * _weights(ssim_weight, target.numel(), sums.dtype, sums.device)).sum()
+    else:
+        loss = total((rgb - target).abs()) / (3 * pixels)
+    return loss if mask is None else loss * (pixels / mask.sum().clamp_min(1))
+
+
+@register("photometric")
+@dataclass(frozen=True)
+class Photometric(LossTerm):
+    """The photometric loss; every fit has it."""
+
+    ssim_weight: float = 0.2
+    """Fraction lambda of the SSIM term, in [0, 1]."""
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the differences and, with a mask, of both masked images."""
+        masked = 7 * FLOAT * sizes.pixels if sizes.masked else 0  # two images, and the mask's own
+        return {LOSS: difference_bytes(sizes) + masked}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute `photometric_loss` of the render and the view's image, shape []."""
+        return photometric_loss(inputs.outputs["rgb"], inputs.target.image, inputs.target.mask, self.ssim_weight)
+
+
+@register("alpha")
+@dataclass(frozen=True)
+class AlphaDifference(LossTerm):
+    """The weighted mean absolute difference of rendered and true opacity, 0 in views without an alpha channel."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha",)
+    weight: float = 0.1
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"alpha: `weight` must be between 0 and 1000, not {self.weight}")
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the difference, its magnitude and its gradient."""
+        return {LOSS: 3 * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times the mean absolute difference of opacities over the unmasked pixels, shape []."""
+        alpha, target = inputs.outputs["alpha"], inputs.target
+        if target.alpha is None:
+            return alpha.new_zeros(())
+        difference = (alpha - target.alpha).abs()
+        if target.mask is None:
+            return total(difference) * (self.weight / target.alpha.numel())
+        return total(difference * target.mask) / target.mask.sum().clamp_min(1) * self.weight
+
+
+# Loss terms for given depth and normals, for views that have them.
+#
+# The depth term is the mean of |q / z - q / d|, with rendered depth z, given depth d, and the view's median given depth
+# q. This difference of inverse depths has no unit. A far surface has less weight than a near one, and an outlier has no
+# larger gradient than other pixels. The normal term is the mean of 1 - cos of the angle between given normals and
+# normals of rendered depth.
+
+GIVEN_MIN_ALPHA = 0.5
+"""Opacity above which a pixel shows a surface, so that its depth is compared."""
+DEPTH_MAPS = 8
+"""Number of maps with one float per pixel that the depth term and its gradient hold at the loss."""
+NORMAL_MAPS = 26
+"""Number of maps with one float per pixel for the normal term; points, differences and normals count as three each."""
+
+
+def inverse_depth_difference(
+    depth: torch.Tensor, alpha: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
+) -> torch.Tensor:
+    """Compute the weighted mean absolute difference of relative inverse depths, shape []; 0 if no pixel is compared.
+
+    Args:
+        depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
+        alpha: Rendered opacity, shape [H, W].
+        target: Weight times q / d, weight, and weight times q [u], for given depth d and its median q, shape [H, W, 3].
+            Averages of pixels keep the weighted means.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    """
+    shown = ~(alpha <= GIVEN_MIN_ALPHA)  # True for a NaN, so that it reaches the loss
+    shown = shown if mask is None else shown & (mask > 0)
+    weight = torch.where(shown, target[..., 1], 0)
+    inverse = target[..., 2] / torch.where(shown & (target[..., 1] > 0), depth, 1)
+    off = torch.where(weight > 0, (inverse - target[..., 0]).abs(), 0)
+    return total(off) / total(weight).clamp_min(1e-6)
+
+
+@register("given_depth")
+@dataclass(frozen=True)
+class GivenDepthDifference(LossTerm):
+    """The weighted difference of rendered and given inverse depth, 0 in views without given depth."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
+    weight: float = 0.3
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"given-depth: `weight` must be between 0 and 1000, not {self.weight}")
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return weight times q / d, weight, and weight times q, [H, W, 3], for depth d with median q; 0 without depth."""
+        given = view.depth
+        if given is None:
+            return {"given_depth": view.image.new_zeros(*view.image.shape[:2], 3)}
+        known = given > 0
+        q = given[known].median() if bool(known.any()) else given.new_ones(())
+        weight = known.to(given.dtype) if view.depth_weight is None else view.depth_weight * known
+        return {"given_depth": torch.stack([weight * q / torch.where(known, given, 1), weight, weight * q], -1)}
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the term's maps, and of the copy of its target on CUDA."""
+        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + DEPTH_MAPS * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times `inverse_depth_difference`, shape []."""
+        depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
+        return self.weight * inverse_depth_difference(depth, alpha, target.maps["given_depth"], target.mask)
+
+
+def normal_difference(normals: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Compute the weighted mean of 1 - cos of the angle between normals, shape [], in [0, 2]; 0 if no pixel has both.
+
+    Args:
+        normals: Unit normals, 0 for missing values, shape [H, W, 3].
+        target: Given normals, 0 for missing values, shape [H, W, 3]; the weight is their length, which is below 1 for averages
+            over pixels.
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    """
+    shown = ~(normals.detach().square().sum(-1) <= 0.5)  # of a NaN too
+    shown = shown if mask is None else shown & (mask > 0)
+    # the root in float64, since the rounding of float32's depends on the processor (MKL)
+    length = target.square().sum(-1).double().sqrt().to(target.dtype)
+    weight = torch.where(shown, length, 0)
+    off = torch.where(weight > 0, length - (normals * target).sum(-1), 0)
+    return total(off) / total(weight).clamp_min(1e-6)
+
+
+@register("given_normals")
+@dataclass(frozen=True)
+class GivenNormalsDifference(LossTerm):
+    """The weighted 1 - cos of the angle between given and rendered normals, for pinholes; 0 in views without given normals."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
+    weight: float = 0.03
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"given-normals: `weight` must be between 0 and 1000, not {self.weight}")
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the view's normals in its camera's axes [H, W, 3]; 0 where none are given."""
+        return {"given_normals": torch.zeros_like(view.image) if view.normals is None else view.normals}
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of points, differences and normals, and of the copy of the target on CUDA."""
+        copy = 3 * FLOAT * sizes.pixels * sizes.cuda
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + NORMAL_MAPS * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times `normal_difference` of the rendered depth's normals, shape []."""
+        depth = torch.where(inputs.outputs["alpha"] <= GIVEN_MIN_ALPHA, 0, inputs.outputs["depth"])
+        # in the axes of the camera, like the given normals: a refined pose gets no gradient
+        camera = dataclasses.replace(inputs.camera, viewmat=torch.eye(4, dtype=depth.dtype, device=depth.device))
+        target = inputs.target
+        return self.weight * normal_difference(depth_normals(camera, depth), target.maps["given_normals"], target.mask)
+
+
+# Smoothness of rendered depth, for few views: ambiguous depth becomes planar instead of fog.
+#
+# On a plane, inverse depth is a linear function of the pixel. So the term sums |z/z' + z/z'' - 2| over the pixels, with
+# the depths z' and z'' of a pixel's two neighbours in its row, adds the same for its column, and divides by the number
+# of pixels. The term has no unit. Weights are lower at edges of colour and at pixels with consistent depth. A bound
+# allows depth to jump where colour does not (docs/decisions/024-smooth-depth.md).
+
+SMOOTH_MIN_ALPHA = 0.3
+"""Opacity above which the depth of a pixel is used."""
+EDGE = 0.1
+"""Difference of colour between the two neighbours, as mean over the channels, at which the weight falls to 1/e."""
+BOUND = 0.1
+"""Largest value of the term at a pixel; above it the gradient is 0."""
+CONFIRMED = 0.2
+"""Weight of pixels with consistent depth."""
+MAPS = 12
+"""Number of maps with one float per pixel that the term and its gradient hold at the loss."""
+
+
+def depth_roughness(
+    depth: torch.Tensor, alpha: torch.Tensor, image: torch.Tensor, weight: torch.Tensor, mask: torch.Tensor | None
+) -> torch.Tensor:
+    """Compute the roughness of depth: the weighted sum of min(|z/z' + z/z'' - 2|, `BOUND`) divided by pixel count, shape [].
+
+    z' and z'' are the depths of the two neighbours of a pixel of depth z, in its row and again in its column. The sum is over
+    pixels that, like both neighbours, are unmasked and more opaque than `SMOOTH_MIN_ALPHA`.
+
+    Args:
+        depth: Rendered z-depth [u], positive where alpha is, shape [H, W].
+        alpha: Rendered opacity, shape [H, W].
+        image: Photographed colours in [0, 1], whose edges weaken the term, shape [H, W, 3].
+        weight: Weights of the pixels, shape [H, W].
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    """
+    shown = ~(alpha <= SMOOTH_MIN_ALPHA)  # True for a NaN, so that it reaches the loss
+    shown = shown if mask is None else shown & (mask > 0)
+    z = torch.where(shown, depth, 1)
+    value = z.new_zeros(())
+    for axis in (0, 1):
+        count = depth.shape[axis] - 2
+        if count < 1:
+            continue
+        (a, b, c), (one, two, three) = ([t.narrow(axis, i, count) for i in range(3)] for t in (z, shown))
+        step = (image.narrow(axis, 0, count) - image.narrow(axis, 2, count)).abs().mean(-1)
+        rough = torch.where(one & two & three, (b / a + b / c - 2).abs(), 0)
+        value = value + total(rough.clamp_max(BOUND) * torch.exp(-step / EDGE) * weight.narrow(axis, 1, count))
+    return value / depth.numel()
+
+
+@register("smooth_depth")
+@dataclass(frozen=True)
+class SmoothDepth(LossTerm):
+    """The weighted roughness of rendered depth."""
+
+    needs_outputs: ClassVar[tuple[str, ...]] = ("alpha", "depth")
+    weight: float = 1.0
+    """Weight of the term, in [0, 1000]."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.weight <= 1000:
+            raise UsageError(f"smooth-depth: `weight` must be between 0 and 1000, not {self.weight}")
+
+    def needs(self, view: TrainingView, prior: Prior | None) -> dict[str, torch.Tensor]:
+        """Return the weights of the view's pixels, shape [H, W]: `CONFIRMED` where depth is consistent, else 1."""
+        ones = torch.ones_like(view.image[..., 0])
+        return {"smooth_depth": ones if view.consistent is None else torch.where(view.consistent > 0, CONFIRMED, ones)}
+
+    def bytes(self, sizes: StepSizes) -> Needs:
+        """Return the bytes of the term's maps, and of the copy of its weights on CUDA."""
+        copy = FLOAT * sizes.pixels * sizes.cuda
+        return {**dict.fromkeys(STEP, copy), LOSS: copy + MAPS * FLOAT * sizes.pixels}
+
+    def __call__(self, inputs: LossInputs) -> torch.Tensor:
+        """Compute ``weight`` times `depth_roughness`, shape []."""
+        depth, alpha, target = inputs.outputs["depth"], inputs.outputs["alpha"], inputs.target
+        return self.weight * depth_roughness(depth, alpha, target.image, target.maps["smooth_depth"], target.mask)
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the loss."""
+
+    ssim_weight: float = 0.2
+    """Fraction lambda of the SSIM term, in [0, 1]."""
+    random_background: bool = True
+    """Put views with an alpha channel, and their renders, on a random background at each step. Without this, Gaussians of the
+    background colour could cover empty areas. No effect on opaque views."""
+    alpha_weight: float = 1.0
+    """Weight of the mean absolute difference of rendered and given opacity, for views with an alpha channel, in [0, 1000]; 0 to
+    disable."""
+    smooth_weight: float | None = 0.0
+    """Weight of the roughness of rendered depth (docs/decisions/024-smooth-depth.md), in [0, 1000]; 0 to disable. None: chosen
+    by the number of views."""
+    depth_weight: float = 0.3
+    """Weight of the difference of rendered and given inverse depth, for views with given depth, in [0, 1000]; 0 to disable."""
+    normal_weight: float = 0.03
+    """Weight of 1 - cos of the angle between given normals and normals of rendered depth, for views with given normals, in [0,
+    1000]; 0 to disable."""
+
+    def __post_init__(self) -> None:
+        for name in ("alpha_weight", "smooth_weight", "depth_weight", "normal_weight"):
+            if getattr(self, name) is not None and not 0 <= getattr(self, name) <= 1000:
+                raise UsageError(f"loss: `{name.replace('_', '-')}` must be between 0 and 1000, not {getattr(self, name)}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise UsageError(f"loss: `ssim-weight` must be between 0 and 1, not {self.ssim_weight}")
+
+
+def built_in_terms(
+    config: LossConfig, cutout: bool = False, depth: bool = False, normals: bool = False
+) -> tuple[LossTerm, ...]:
+    """Return the built-in terms of a fit, by its settings and its views.
+
+    Args:
+        config: Weights.
+        cutout: True if a view has an alpha channel.
+        depth: True if a view has given depth.
+        normals: True if a view has given normals.
+    """
+    terms: list[LossTerm] = [Photometric(config.ssim_weight)]
+    if cutout and config.alpha_weight > 0:
+        terms.append(AlphaDifference(config.alpha_weight))
+    if config.smooth_weight:
+        terms.append(SmoothDepth(config.smooth_weight))
+    if depth and config.depth_weight > 0:
+        terms.append(GivenDepthDifference(config.depth_weight))
+    if normals and config.normal_weight > 0:
+        terms.append(GivenNormalsDifference(config.normal_weight))
+    return tuple(terms)

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warpgs.errors import DataError, UsageError
-from warpgs.input_files import read_input, unread_reason
+from warpgs.files import read_input, unread_reason
 from warpgs.plugins import load_object, module_digest, module_of
-from warpgs.runtime.terminal import Detail
+from warpgs.process import Detail
 from warpgs.schema import SchemaError, check_depth
 
 if TYPE_CHECKING:
-    from warpgs.pipeline.train.config import FitConfig
+    from warpgs.pipeline.train.settings import FitConfig
 
 FOLDER = Path(__file__).parent / "preset_files"
 """Folder of the presets of warpgs."""
@@ -83,7 +83,7 @@ class Presets(Mapping[str, "FitConfig"]):
         return iter([*self._files, *(n for n in self._made if n not in self._files)])
 
     def __len__(self) -> int:
-        return len([*self])
+        return sum(1 for _ in self)  # a list would ask for its length first
 
     def __contains__(self, name: object) -> bool:
         return name in self._files or name in self._made
@@ -105,7 +105,7 @@ def preset_settings(preset: FitConfig | Mapping[str, Any] | str | Path | None) -
         DataError: The file cannot be read or is not TOML.
         UsageError: The preset is unknown, or one of its settings is unknown, has the wrong type or is out of range.
     """
-    from warpgs.pipeline.train.config import FitConfig
+    from warpgs.pipeline.train.settings import FitConfig
 
     if isinstance(preset, FitConfig):
         return preset, f"a FitConfig of preset {preset.preset}"
@@ -135,8 +135,7 @@ def chosen_settings(
         DataError: The file of a preset cannot be read or is not TOML.
         UsageError: The preset is unknown, or a setting is unknown, has the wrong type or is out of range.
     """
-    from warpgs.pipeline.train.config import FitConfig
-    from warpgs.pipeline.train.overrides import with_settings
+    from warpgs.pipeline.train.settings import FitConfig, with_settings
 
     start, origin = preset_settings(preset)
     config = with_settings(start, overrides, "warpgs.fit", keywords=True)
@@ -145,7 +144,7 @@ def chosen_settings(
 
 def origin_note(origin: str, start: FitConfig, config: FitConfig) -> str:
     """Return a note on the source of the settings: ``origin``, and the changes to it."""
-    from warpgs.pipeline.train.overrides import changed_settings
+    from warpgs.pipeline.train.settings import changed_settings
 
     changed = changed_settings(start, config)
     return Detail(f"settings: {origin}" + (f"; then given: {', '.join(changed)}" if changed else ""))
@@ -198,8 +197,7 @@ def _config_of_file(path: Path, name: str, above: int = 0) -> tuple[FitConfig, s
 
 def _config_of(values: Mapping[str, Any], place: str, above: int, folder: Path | None = None) -> tuple[FitConfig, str]:
     """Return the settings of a mapping, and a note on their source; a base that is a file lies below ``folder``."""
-    from warpgs.pipeline.train.config import FitConfig
-    from warpgs.pipeline.train.overrides import changed_settings, with_settings
+    from warpgs.pipeline.train.settings import FitConfig, changed_settings, with_settings
 
     for key in OWN_KEYS:
         if not isinstance(values.get(key, ""), str):

@@ -11,21 +11,19 @@ import numpy as np
 import torch
 
 from warpgs.errors import UsageError
-from warpgs.kernels.cameras.base import check_camera
-from warpgs.lenses import CENTRAL
-from warpgs.pipeline.metrics.region import fitted_region
-from warpgs.pipeline.model.init import Start, check_points, initial_points, seen_points, subsample
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.loss import LossTerm, collect
-from warpgs.pipeline.train.loss_terms.built_in import built_in_terms
+from warpgs.geometry import CENTRAL
+from warpgs.kernels.cameras import check_camera
+from warpgs.pipeline.metrics.scores import fitted_region
+from warpgs.pipeline.model.start import Start, check_points, initial_points, seen_points, subsample
+from warpgs.pipeline.train.loss import LossTerm, built_in_terms, collect
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.strategies.sampling_event import scored
+from warpgs.pipeline.train.strategies.importance_sampling import scored
 from warpgs.pipeline.train.views import TrainingView, with_alpha
-from warpgs.priors.cache import cache_folder
-from warpgs.priors.given_depth import any_given, check_given, with_given_depth
-from warpgs.priors.pinhole_views import lens_depth, pinhole_view
-from warpgs.priors.view_prior import view_priors
-from warpgs.runtime.terminal import Detail
+from warpgs.priors.given_depth import any_given, check_given, lens_depth, pinhole_view, with_given_depth
+from warpgs.priors.networks import cache_folder
+from warpgs.priors.views import view_priors
+from warpgs.process import Detail
 from warpgs.scene import GivenDepth, PointCloud, Prior, View, ViewDepth
 
 

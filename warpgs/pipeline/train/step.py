@@ -1,33 +1,63 @@
-"""One training step, called eagerly on a CPU and captured as a CUDA graph on a GPU.
-
-With few views and small images, a GPU needs less time for a step than Python needs to launch it. So on a GPU the whole step is
-captured, from the choice of the view to the changes after Adam, and replayed. Learning rates and views of several steps are
-uploaded at once; losses are read at the end of these steps. On a CPU the same function is called for each step.
-"""
+"""One step: render, loss, gradients, update; eager, or captured as a CUDA graph."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
-from warpgs.kernels.dropout import opacity_dropout
-from warpgs.kernels.step_buffers import SHIFT, Setting, begin_step, end_step
-from warpgs.kernels.tiles import InstanceMemory
-from warpgs.pipeline.metrics.psnr import masked_mse
-from warpgs.pipeline.model.scale_limits import NO_LIMITS, Limits, TrainingCameras
+from warpgs.device import available_bytes
+from warpgs.errors import ResourceError
+from warpgs.kernels.graphs import CapturedGraph, GraphMemory
+from warpgs.kernels.tiles import BYTES_PER_INSTANCE, MAX_INSTANCES, InstanceMemory
+from warpgs.kernels.update import NOT_FINITE, SHIFT, Setting, begin_step, end_step, opacity_decay, opacity_dropout
+from warpgs.pipeline.metrics.scores import masked_mse
+from warpgs.pipeline.model.limits import NO_LIMITS, Limits, TrainingCameras
 from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.background import over
-from warpgs.pipeline.train.learned_views import LearnedViews, seen
 from warpgs.pipeline.train.loss import LossInputs, LossTerm, Target, outputs_of, term_values
-from warpgs.pipeline.train.opacity_decay import decay_opacities
+from warpgs.pipeline.train.schedule import over
 from warpgs.pipeline.train.strategies.base import Strategy
-from warpgs.pipeline.train.views import Rows, ViewStack
-from warpgs.render.compose import compose, inputs_of
+from warpgs.pipeline.train.views import Kind, LearnedViews, Rows, ViewStack, current, seen
+from warpgs.render.compose import compose, count_instances, inputs_of
 from warpgs.render.options import RasterizeOptions, image_settings
 from warpgs.render.rasterize import rasterize
 from warpgs.scene import Camera, Gaussians, Render
+
+# Decay of opacities: each step lowers every opacity by a fraction, so that Gaussians without support in the photographs
+# fade.
+#
+# The idea comes from Binocular3DGS (Han et al. 2024, arXiv 2410.18822); docs/decisions/023-opacity-decay.md has
+# measurements.
+
+LEAST_LOGIT = -15.0
+"""Logit below which no opacity decays further, far below the pruning threshold."""
+
+
+@torch.no_grad()
+def decay_opacities(logits: torch.Tensor, fraction: float, going: torch.Tensor, used: torch.Tensor | None = None) -> None:
+    """Lower every opacity by a fraction, in place; the call may be part of a captured step.
+
+    Args:
+        logits: Logits of opacities, float32, shape [N].
+        fraction: Fraction by which an opacity is lowered, in [0, 1); 0 changes nothing.
+        going: Whether the step is taken, bool, shape [1]; if False, nothing changes.
+        used: Gaussians whose opacities change, bool, shape [N]; None for all.
+    """
+    kept = 1 - fraction
+    if kept == 1:  # also a fraction below the rounding of float64
+        return
+    new = torch.where(logits > LEAST_LOGIT, opacity_decay(logits, kept), logits)
+    logits.copy_(torch.where(going if used is None else going & used, new, logits))
+
+
+# One training step, called eagerly on a CPU and captured as a CUDA graph on a GPU.
+#
+# With few views and small images, a GPU needs less time for a step than Python needs to launch it. So on a GPU the
+# whole step is captured, from the choice of the view to the changes after Adam, and replayed. Learning rates and views
+# of several steps are uploaded at once; losses are read at the end of these steps. On a CPU the same function is called
+# for each step.
 
 MAX_STEPS = 100
 """Largest number of steps between two reads of results from the device."""
@@ -330,3 +360,152 @@ def settle(learned: Learned, plan: StepPlan, found: ViewGradients) -> None:
     plan.limits.hold(table.params, learned.cameras, found.going)
     for name, value in found.statistics.items():
         table.columns[name] += value
+
+
+CAPACITY_FACTOR = 1.3
+"""Capacity of a captured step for instances, as a multiple of the largest number of any view at the time of capture."""
+DEAD_BYTES = 2**30
+"""Largest memory of unused graphs that is kept [bytes]. Freeing it takes milliseconds, in which the device waits."""
+
+
+class OverLimitError(ResourceError):
+    """A captured step would exceed the memory limit of the fit."""
+
+
+class Capacities:
+    """Capacities of captured steps for instances, by kind of view and plan."""
+
+    def __init__(self, learned: Learned, options: RasterizeOptions):
+        """Compute nothing yet.
+
+        Args:
+            learned: Tables that steps change.
+            options: Rule, background [3] and antialiasing of the fit.
+        """
+        self.learned, self.options = learned, options
+        self._known: dict[tuple[Hashable, StepPlan], int] = {}
+
+    def clear(self) -> None:
+        """Drop all capacities, because the Gaussians have changed."""
+        self._known.clear()
+
+    def of(
+        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
+    ) -> dict[Kind, int]:
+        """Return the capacity for each kind, computed at its first use.
+
+        Args:
+            kinds: Kinds of views.
+            stacks: Views by kind.
+            plan: Fixed choices of the steps.
+            max_instances: Largest capacity; None for no limit.
+
+        Raises:
+            OverLimitError: A capacity would be above ``max_instances``.
+            ResourceError: The instances would not fit into memory.
+        """
+        self._known = {k: c for k, c in self._known.items() if k[1] == plan}
+        found = {}
+        for kind in dict.fromkeys(kinds):
+            if (kind, plan) not in self._known:
+                now = current(stacks[kind], self.learned.views)
+                self._known[kind, plan] = instance_capacity(self.learned.table.gaussians, now, plan.degree, self.options)
+            found[kind] = self._known[kind, plan]
+            if max_instances is not None and found[kind] > max_instances:
+                raise OverLimitError(
+                    f"a captured step would need capacity for {found[kind]:,} instances, but the limit allows {max_instances:,}"
+                )
+        return found
+
+
+class StepGraphs:
+    """Captured steps, one for each plan and kind of view, captured at first use."""
+
+    def __init__(
+        self, learned: Learned, buffers: StepBuffers, options: RasterizeOptions,
+        work: Callable[[Learned, ViewStack, StepBuffers, StepPlan, Renderer], object] = step,
+    ):  # fmt: skip
+        """Begin without captured steps.
+
+        Args:
+            learned: Tables and strategy that steps change.
+            buffers: Settings and results of steps.
+            options: Rule, background [3] and antialiasing of the fit.
+            work: Function that is captured.
+        """
+        self.work = work
+        self.learned, self.buffers, self.options = learned, buffers, options
+        device = buffers.device
+        self.stream = torch.cuda.Stream(device)
+        """Stream of captures, always the same one, since torch reuses freed memory only on the stream that used it before."""
+        self.memory = GraphMemory(device)
+        """Account of the memory that torch keeps for deleted graphs."""
+        self.capacities = Capacities(learned, options)
+        """Capacities of the graphs."""
+        self._graphs: dict[tuple[Hashable, StepPlan], CapturedGraph] = {}
+
+    def clear(self) -> None:
+        """Drop all graphs, because the tensors that they refer to have changed."""
+        self._graphs.clear()
+        self.capacities.clear()
+
+    def capture_all(
+        self, kinds: Sequence[Kind], stacks: Mapping[Kind, ViewStack], plan: StepPlan, max_instances: int | None
+    ) -> list[CapturedGraph]:
+        """Return a graph for each of several steps with the same plan; missing graphs are captured first.
+
+        Args:
+            kinds: Kind of each step's view.
+            stacks: Views by kind.
+            plan: Fixed choices of the steps.
+            max_instances: Largest capacity for instances; None for no limit.
+
+        Raises:
+            OverLimitError: The capacity of a graph would be above ``max_instances``.
+            ResourceError: The instances would not fit into memory.
+        """
+        self._graphs = {k: g for k, g in self._graphs.items() if k[1] == plan}
+        for kind in dict.fromkeys(kinds):
+            if (kind, plan) in self._graphs:
+                continue
+            capacity = self.capacities.of([kind], stacks, plan, max_instances)[kind]
+            self.memory.give_back(0 if max_instances is not None else DEAD_BYTES)
+            render = captured_renderer(self.options, capacity, self.buffers.stop)
+            work = functools.partial(self.work, self.learned, stacks[kind], self.buffers, plan, render)
+            self._graphs[kind, plan] = self.capture(work)
+        return [self._graphs[kind, plan] for kind in kinds]
+
+    def capture(self, work: Callable[[], object]) -> CapturedGraph:
+        """Return the graph of a function that changes nothing if the stop flag is set."""
+        buffers = self.buffers
+        here, loaded = torch.cuda.current_stream(buffers.device), buffers.view_rows.clone()
+        self.stream.wait_stream(here)
+        with torch.cuda.stream(self.stream):
+            # a first run loads kernels and fills caches, which is not allowed during a capture; it changes no parameter
+            buffers.stop.fill_(NOT_FINITE)
+            buffers.view_rows.zero_()
+            work()
+            buffers.stop.zero_()
+            buffers.view_rows.copy_(loaded)
+            self.stream.synchronize()
+            captured = CapturedGraph(work, self.stream)
+        here.wait_stream(self.stream)
+        return captured
+
+
+@torch.no_grad()
+def instance_capacity(gaussians: Gaussians, views: ViewStack, degree: int, options: RasterizeOptions) -> int:
+    """Return the capacity of a captured step for (Gaussian, tile) instances, over all views of a stack.
+
+    Raises:
+        ResourceError: The instances would not fit into memory.
+    """
+    counts = [count_instances(inputs_of(gaussians, c), image_settings(c, degree, options)) for c in views.cameras()]
+    wanted = int(CAPACITY_FACTOR * int(torch.stack(counts).max())) + 1024
+    budget = available_bytes(gaussians.means.device) * 4 // 5
+    if wanted > MAX_INSTANCES or wanted * BYTES_PER_INSTANCE > budget:
+        raise ResourceError(
+            f"a step needs {wanted * BYTES_PER_INSTANCE / 2**30:.2f} GiB for {wanted:,} (Gaussian, tile) instances, but "
+            f"{budget / 2**30:.2f} GiB may be used; fit smaller images with --downscale, or lower --max-gaussians"
+        )
+    return wanted

@@ -1,43 +1,173 @@
-"""The training loop: from views and points to Gaussians, with one or several views per step."""
+"""The trainer: its loop, its stored state, and what runs before and after it."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 
+from warpgs.device import available_bytes, format_bytes, is_out_of_memory, no_memory_message
 from warpgs.errors import DataError, NotFiniteError, OutOfMemoryError, ResourceError, UsageError
-from warpgs.kernels.step_buffers import NOT_FINITE, Setting
-from warpgs.pipeline.metrics.psnr import psnr_of
-from warpgs.pipeline.model.init import Start, initial_gaussians, scene_extent
-from warpgs.pipeline.model.scale_limits import TrainingCameras, scene_radius
-from warpgs.pipeline.model.table import Table
-from warpgs.pipeline.train.background import random_shift
-from warpgs.pipeline.train.config import FitConfig
-from warpgs.pipeline.train.context import StrategyContext
-from warpgs.pipeline.train.learned_views import LearnedViews
-from warpgs.pipeline.train.memory_plan import Layout, layout_of, most_instances, plan
-from warpgs.pipeline.train.parameter_mean import ParameterMean
-from warpgs.pipeline.train.schedule import Phases, plan_phases, sh_degree
+from warpgs.kernels.update import NOT_FINITE, Setting
+from warpgs.pipeline.metrics.scores import psnr_of, render_view, score
+from warpgs.pipeline.model.edit import stored_degrees
+from warpgs.pipeline.model.limits import TrainingCameras, scene_radius
+from warpgs.pipeline.model.start import Start, initial_gaussians, scene_extent, sweeps
+from warpgs.pipeline.model.table import Table, model_bytes
+from warpgs.pipeline.train.batch import StepTaker
+from warpgs.pipeline.train.memory import Layout, layout_of, most_instances, plan
+from warpgs.pipeline.train.schedule import Phases, StepReport, plan_phases, random_shift, sh_degree
+from warpgs.pipeline.train.settings import FitConfig
 from warpgs.pipeline.train.setup import prepare, prepared_views, terms_of
-from warpgs.pipeline.train.step import Learned, StepBuffers, StepPlan, steps_at_once
-from warpgs.pipeline.train.step_graphs import CAPACITY_FACTOR, OverLimitError
-from warpgs.pipeline.train.step_report import StepReport
+from warpgs.pipeline.train.step import CAPACITY_FACTOR, Learned, OverLimitError, StepBuffers, StepPlan, steps_at_once
 from warpgs.pipeline.train.stopping import STATE, Stopping
-from warpgs.pipeline.train.stored_state import check_state
-from warpgs.pipeline.train.strategies.base import find_strategy
-from warpgs.pipeline.train.take_steps import StepTaker
-from warpgs.pipeline.train.views import Kind, TrainingView, half_size, show_learned, stack_views, with_learned
-from warpgs.runtime.byte_units import format_bytes
-from warpgs.runtime.device_memory import available_bytes, is_out_of_memory, no_memory_message
-from warpgs.runtime.ranks import ALONE, Ranks
-from warpgs.runtime.terminal import Detail
-from warpgs.scene import Gaussians, PointCloud, Prior, View
+from warpgs.pipeline.train.strategies.base import StrategyContext, find_strategy
+from warpgs.pipeline.train.views import Kind, LearnedViews, TrainingView, half_size, show_learned, stack_views, with_learned
+from warpgs.priors.sweep import SweepConfig, sweep_depths
+from warpgs.process import Detail
+from warpgs.ranks import ALONE, Ranks
+from warpgs.scene import Camera, Gaussians, PointCloud, Prior, Scene, View
+from warpgs.schema import Schema, SchemaError, anything, fields, items, mapping, number, text, whole
+
+# Mean of the parameters over the last steps of a fit; after the last step it replaces the parameters.
+#
+# A step of one view moves the parameters towards that view, so the parameters of the last step favour the last views.
+# The mean over many steps does not (Polyak and Juditsky 1992; Izmailov et al. 2018, arXiv 1803.05407).
+# docs/decisions/029-mean-of-the-last-steps.md has measurements.
+
+SAMPLES = 32
+"""Least number of samples of a mean; a shorter mean takes every step."""
+PREFIX = "mean."
+"""Beginning of the names of stored tensors."""
+
+
+class ParameterMean:
+    """Sum of the parameters after evenly spaced steps near the end of a fit.
+
+    Sums are in float32. With n samples, fewer than 2 `SAMPLES`, a mean has a rounding error of at most n 2^-24 of the largest
+    sample: 4e-6 at most, and about 1e-7 in practice, which is as much as the rounding of the parameters themselves.
+    """
+
+    def __init__(self, fraction: float):
+        """Begin without a sample; ``fraction`` of the steps, the last ones, are averaged, in [0, 1]; 0 for no mean."""
+        self.fraction, self.count = fraction, 0
+        self.sums: dict[str, torch.Tensor] = {}
+
+    def samples(self, steps: int) -> range:
+        """Return the steps after which a fit of ``steps`` steps takes a sample: the last one, and evenly spaced ones before."""
+        length = int(self.fraction * steps)
+        return range(steps, steps - length, -max(1, length // SAMPLES))
+
+    def wait(self, step: int, steps: int) -> int:
+        """Return the number of steps from ``step`` to the next sample; without one, to the end of the fit."""
+        return min((s - step for s in self.samples(steps) if s > step), default=steps - step)
+
+    @torch.no_grad()
+    def update(self, step: int, steps: int, params: Mapping[str, torch.Tensor]) -> bool:
+        """Take a sample if it is due; after the last step, replace the parameters by the mean.
+
+        Args:
+            step: Steps taken.
+            steps: Steps of the fit.
+            params: Parameters by name, of any shape [...]; replaced in place.
+
+        Returns:
+            Whether the parameters were replaced.
+        """
+        if step not in self.samples(steps):
+            return False
+        for name, value in params.items():
+            if self.count:
+                self.sums[name] += value
+            else:
+                self.sums[name] = value.detach().clone()
+        self.count += 1
+        if step < steps:
+            return False
+        for name, value in params.items():
+            value.detach().copy_(self.sums[name].div_(self.count))
+        self.restart()
+        return True
+
+    def restart(self) -> None:
+        """Forget all samples: the set of Gaussians changed, and rows are no longer the same Gaussians."""
+        self.sums, self.count = {}, 0
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return tensors by name, of any shape [...], from which the mean continues; empty without samples."""
+        if not self.count:
+            return {}
+        count = torch.tensor([self.count], dtype=torch.int64, device="cpu")
+        return {f"{PREFIX}{n}": t for n, t in self.sums.items()} | {f"{PREFIX}count": count}
+
+    def load(self, tensors: Mapping[str, torch.Tensor], params: Mapping[str, torch.Tensor]) -> None:
+        """Load what `state` returned.
+
+        Args:
+            tensors: Tensors by name, of any shape [...]; other names are ignored.
+            params: Current parameters by name, of the shapes [...] of the sums.
+
+        Raises:
+            DataError: A sum is missing, unknown, or of another shape or type than its parameter, or the count is invalid.
+        """
+        self.restart()
+        stored = {n.removeprefix(PREFIX): t for n, t in tensors.items() if n.startswith(PREFIX)}
+        if not stored:
+            return
+        count = stored.pop("count", None)
+        kinds = {n: (t.shape, t.dtype) for n, t in stored.items()}
+        whole = count is not None and count.shape == (1,) and count.dtype == torch.int64 and int(count) > 0
+        if not whole or kinds != {n: (t.shape, t.dtype) for n, t in params.items()}:
+            raise DataError(
+                "the stored mean of the parameters is damaged, or does not belong to these parameters; restore the file, or "
+                "fit the scene again"
+            )
+        assert count is not None
+        self.count = int(count)
+        self.sums = {n: t.to(params[n].device).clone() for n, t in stored.items()}
+
+
+def check_state(
+    tensors: Mapping[str, torch.Tensor], plain: dict[str, Any], *, views: int, steps: int, strategy: Schema, stopping: Schema
+) -> None:
+    """Check the parts of a stored state that are not rows of a table; `Table.load` checks the rows.
+
+    Args:
+        tensors: Tensors by name, of any shape [...].
+        plain: Plain values.
+        views: Number of training views.
+        steps: Number of steps of the fit.
+        strategy: Schema of the strategy's own values.
+        stopping: Schema of the values of early stopping.
+
+    Raises:
+        DataError: A value is missing or invalid.
+    """
+    state = fields({
+        "step": whole(0, steps), "order": items(whole(0, views - 1)), "extent": number(above=0), "notes": items(text),
+        "strategy": mapping(anything), "stopping": stopping, "stable_start": whole(0, steps), "steps": whole(1, steps),
+    })  # fmt: skip
+    try:
+        state(plain, "")
+        strategy(plain["strategy"], "strategy")
+    except SchemaError as e:
+        raise DataError(f"the stored state is incomplete or damaged: {e}; restore the file, or fit the scene again") from e
+    try:
+        torch.Generator().set_state(tensors["generator"])
+    except (KeyError, TypeError, RuntimeError) as e:
+        raise DataError(
+            "the stored state is incomplete: generator (the state of the random numbers) is missing or damaged; restore the "
+            "file, or fit the scene again"
+        ) from e
 
 
 class Trainer:
@@ -57,7 +187,7 @@ class Trainer:
         Args:
             train: The views to fit, at least one.
             points: The reconstruction's points, or None.
-            config: Settings without automatic ones (None): `warpgs.pipeline.train.by_views.settings_by_views` chooses those.
+            config: Settings without automatic ones (None): `warpgs.pipeline.train.settings.settings_by_views` chooses those.
             device: Device of the fit.
             background: Colour behind the scene.
             priors: Prior of each view; None to compute them if sampling or a loss term needs them.
@@ -396,3 +526,165 @@ class Trainer:
         self.stopping.load(tensors, plain["stopping"])
         self.set_views(self.views if self.stopping.ended is None else self.stopping.whole)
         self.generator.set_state(tensors["generator"])
+
+
+def train_views(scene: Scene, names: tuple[str, ...]) -> list[View]:
+    """Return the named views of a scene, in the order of the names."""
+    return [scene.view(n) for n in names]
+
+
+def run(
+    trainer: Trainer,
+    on_step: Callable[[StepReport], None],
+    save: Callable[[Trainer], None],
+    stopped: Callable[[], bool],
+    restore: Callable[[Trainer], bool] = lambda _: False,
+) -> None:
+    """Take all remaining steps; report each, and save at intervals and at the end.
+
+    A step that runs out of memory is tried once more with less memory (`Trainer.spare_memory`). If the state is incomplete, for
+    example during a change of the set of Gaussians, the fit continues from the last saved state. With several processes there
+    is no second try, because one process would be alone in that step.
+
+    Args:
+        trainer: The fit.
+        on_step: Called after each step.
+        save: Saves the state.
+        stopped: Returns whether to end after the current step.
+        restore: Loads the last saved state; returns False without one.
+
+    Raises:
+        NotFiniteError: The loss, or the state to save, is not finite; the state is not saved.
+        OutOfMemoryError: A step ran out of memory, and a second try failed or was not possible; a complete state before the
+            step is saved.
+        KeyboardInterrupt: ``stopped`` returned True after a step; the state after it is saved.
+    """
+    every, saved, ran_out = trainer.config.checkpoint_every, time.monotonic(), -1
+    while trainer.step < trainer.steps:
+        reports, failure = [], None
+        try:
+            reports = trainer.advance(every - trainer.step % every)
+        except OutOfMemoryError as e:
+            failure = e.with_traceback(None)  # whose frames hold tensors
+            failure.__cause__ = failure.__context__ = None
+        if failure is not None:
+            again, ran_out = trainer.step > ran_out and trainer.ranks.count == 1, trainer.step
+            try:
+                if not again or not (failure.intact or restore(trainer)):
+                    raise failure
+                trainer.spare_memory()
+            except ResourceError:
+                if failure.intact:
+                    save(trainer)
+                raise
+            continue
+        for report in reports:
+            on_step(report)
+        stop = trainer.taker.agreed(stopped())
+        due = trainer.step % every == 0 and time.monotonic() - saved >= trainer.config.checkpoint_seconds
+        if stop or due or trainer.step == trainer.steps:
+            save(trainer)
+            saved = time.monotonic()
+        if stop:
+            trainer.ranks.leave()
+            raise KeyboardInterrupt
+
+
+def complexity_figures(trainer: Trainer) -> dict:
+    """Return the size of a model for metrics.json: its Gaussians, mean degree and bytes, and why growth ended."""
+    degrees = stored_degrees(trainer.gaussians.sh)
+    figures = {
+        "count": len(degrees), "mean_degree": float(degrees.double().mean()), "bytes": model_bytes(degrees),
+        "cap": trainer.config.max_gaussians, "held_out": False, "why": "growth ended by schedule", "marginal_db": None,
+    }  # fmt: skip
+    return {"complexity": figures | trainer.stopping.figures()}
+
+
+def complexity_summary(figures: dict) -> str:
+    """Return the values of `complexity_figures` as one line for the user."""
+    f = figures["complexity"]
+    text = f"{f['count']:,} Gaussians of mean SH degree {f['mean_degree']:.2f}, {format_bytes(f['bytes'])} uncompressed"
+    if f["marginal_db"] is not None:
+        text += f"; left-out blocks gained {f['marginal_db']:+.3f} dB between the last two measurements"
+    return f"{text}; growth stopped because {f['why']}" if f["held_out"] else f"{text}; {f['why']}"
+
+
+# Warmup: a tiny fit during the preparation of the real fit, to load everything that the real fit uses on a CUDA device.
+#
+# Contexts, kernels, libraries and modules of Python are loaded at their first use, which took two to three seconds of a
+# fit on an H200. Semantics and matches are found on the CPU at the same time.
+
+STEPS = 3
+"""Number of steps of the tiny fit, one for each phase."""
+SIDE, POINTS, PLANES = 48, 200, 8
+"""Side of the tiny fit's views [px], number of its points, and number of its sweep planes."""
+
+
+def _views(generator: np.random.Generator) -> list[View]:
+    K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
+    cameras = []
+    for x in (-0.2, 0.2):
+        viewmat = np.eye(4)
+        viewmat[0, 3] = x
+        cameras.append(Camera(viewmat, K, SIDE, SIDE))
+    return [View(f"{i}", c, generator.random((SIDE, SIDE, 3), np.float32)) for i, c in enumerate(cameras)]
+
+
+def warm_up(config: FitConfig, device: torch.device, stopped: Callable[[], bool] = lambda: False) -> Trainer:
+    """Fit noise in two small views with the settings of the real fit, including refinement and sampling; score one view.
+
+    Args:
+        config: Settings of the real fit. If that fit sweeps on the device, these views are swept, too.
+        device: Device to work on.
+        stopped: Returns, after each step, whether to stop.
+
+    Returns:
+        The trainer, after its last step.
+
+    Raises:
+        KeyboardInterrupt: ``stopped`` returned True.
+    """
+    generator = np.random.default_rng(0)
+    views = _views(generator)
+    points = generator.uniform([-1, -1, 2], [1, 1, 4], (POINTS, 3))
+    cloud = PointCloud(points, generator.random((POINTS, 3), np.float32))
+    maps = [generator.random((SIDE, SIDE), np.float32) for _ in range(4)]
+    small = replace(
+        config, steps=STEPS, memory_limit=None, init=replace(config.init, source="points"),
+        density=replace(config.density, every=1),
+        strategy_config=find_strategy(config.strategy).warmup_config(config.strategy_config),
+    )  # fmt: skip
+    if hasattr(small.strategy_config, "every"):  # a strategy with events of its own, such as mcmc: it has some, too
+        small = replace(small, strategy_config=replace(small.strategy_config, every=1))
+    black = (0.0, 0.0, 0.0)
+    if sweeps(config.init, len(views)) and config.memory_limit is None:
+        sweep_depths(views, [(2, 4)] * len(views), SweepConfig(max_planes=PLANES), device)
+    fit = Trainer(views, cloud, small, device, black, [Prior(*maps, "noise", "noise") for _ in views])
+    run(fit, lambda _: None, lambda _: None, stopped)
+    score(views[0], render_view(fit.gaussians, views[0], fit.context.render_options())[0])
+    fit.taker.clear()  # their memory is for the fit that follows
+    return fit
+
+
+@contextlib.contextmanager
+def background_warmup(config: FitConfig, device: torch.device) -> Iterator[Callable[[], object]]:
+    """Run `warm_up` in a thread within the block, if the device is a GPU that networks for priors do not use.
+
+    Yields a function that waits for the end of the warmup and raises its errors. Until the function returns, nothing else may
+    use the device, since steps may be captured at that time. The thread ends before the block does, also after an error.
+    """
+    if device.type != "cuda" or config.priors.onnx_provider == "cuda":
+        yield lambda: None
+        return
+    stop = threading.Event()
+
+    def on_device() -> None:
+        with torch.cuda.device(device):
+            warm_up(config, device, stop.is_set)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="warmup") as thread:
+        done = thread.submit(on_device)
+        try:
+            yield done.result
+        finally:
+            stop.set()

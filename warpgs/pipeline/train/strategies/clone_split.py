@@ -1,17 +1,241 @@
-"""Clone, split and prune (Kerbl et al. 2023, section 5.2), without sampling."""
+"""Clone and split: Gaussians grow where their screen gradients are large."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Hashable, Iterator, Mapping
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import torch
 
-from warpgs import schema
+from warpgs import geometry, schema
+from warpgs.errors import UsageError
 from warpgs.pipeline.model.table import Column, DensityUpdate
-from warpgs.pipeline.train.context import Growth, StrategyContext
-from warpgs.pipeline.train.strategies.base import Strategy, register
-from warpgs.pipeline.train.strategies.gradient_growth import GradientGrowth
+from warpgs.pipeline.train.schedule import EventTimes, PhaseConfig
+from warpgs.pipeline.train.strategies.base import Growth, Strategy, StrategyContext, register
+from warpgs.scene import Gaussians
+
+# Growth by gradient: clone, split and prune (Kerbl et al. 2023, section 5.2), as a part of strategies.
+
+RESET_FREE_STEPS = 500
+"""No opacities are reset in this number of steps before the last event: transparent Gaussians would stay transparent."""
+
+
+@dataclass(frozen=True)
+class DensityConfig:
+    """Thresholds and times of densification."""
+
+    start: int = 500
+    """Steps before Gaussians are first added and removed; at most a quarter of the fit."""
+    every: int = 100
+    """Steps between events that add and remove Gaussians."""
+    stop_fraction: float = 0.5
+    """Fraction of the fit after which no Gaussians are added or removed. In a fit with phases, the start of phase 3 counts
+    instead."""
+    gradient: float = 2e-4
+    """Mean norm of the gradient of a projected mean, in half image widths and heights, above which a Gaussian is cloned or
+    split."""
+    clone_size: float = 0.01
+    """Gaussians smaller than this fraction of the scene's extent are cloned, larger ones split."""
+    prune_opacity: float = 0.005
+    """Gaussians below this opacity are removed."""
+    prune_size: float = 0.1
+    """Size above which Gaussians are removed after the first opacity reset, as a fraction of the scene's extent; none are
+    removed if more than half are larger. 0 to disable."""
+    reset_every: int = 0
+    """Steps between opacity resets, 3000 in Kerbl et al. 2023; 0 for no resets. With few views the fit does not recover from a
+    reset (docs/decisions/002-no-opacity-reset.md)."""
+    reset_opacity: float = 0.01
+    """Largest opacity after a reset."""
+    morton_order: bool = True
+    """Order the Gaussians along a Morton curve after each event (docs/decisions/009-morton-order.md)."""
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or self.start < 0 or self.reset_every < 0:
+            raise UsageError(
+                "density: `every` must be at least 1, `start` and `reset-every` at least 0, not "
+                f"{self.every}, {self.start} and {self.reset_every}"
+            )
+        for name in ("stop_fraction", "prune_opacity"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise UsageError(f"density: `{name.replace('_', '-')}` must be between 0 and 1, not {getattr(self, name)}")
+        for name in ("gradient", "clone_size", "prune_size"):
+            if not getattr(self, name) >= 0:
+                raise UsageError(f"density: `{name.replace('_', '-')}` must be at least 0, not {getattr(self, name)}")
+        if not 0 < self.reset_opacity < 1:
+            raise UsageError(f"density: `reset-opacity` must be in (0, 1), not {self.reset_opacity}")
+
+    def times(self, steps: int) -> EventTimes:
+        """Return the times of events in a fit of that many steps."""
+        return EventTimes.of_fit(self.start, self.every, self.stop_fraction, steps)
+
+
+def _exp(x: torch.Tensor) -> torch.Tensor:
+    """Return e^x computed in float64, since rounding in float32 depends on the processor (MKL)."""
+    return x.double().exp().to(x.dtype)
+
+
+def _split(gaussians: dict[str, torch.Tensor], ids: torch.Tensor, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    """Return two children of each Gaussian, sampled from its own distribution and 1.6 times smaller (Kerbl et al. 2023)."""
+    pair = ids.repeat(2)
+    rows = {n: t[pair] for n, t in gaussians.items()}
+    noise = torch.randn(len(pair), 3, generator=generator, dtype=torch.float32, device="cpu")
+    noise = noise.to(ids.device) * _exp(rows["log_scales"])
+    w, *vector = (rows["quats"] / rows["quats"].norm(dim=1, keepdim=True)).unbind(1)
+    axis = torch.stack(vector, 1)
+    cross = 2 * torch.linalg.cross(axis, noise)
+    rows["means"] = rows["means"] + noise + w[:, None] * cross + torch.linalg.cross(axis, cross)
+    rows["log_scales"] = rows["log_scales"] - math.log(1.6)
+    return rows
+
+
+def refine(
+    gaussians: Gaussians,
+    pull: torch.Tensor,
+    config: DensityConfig,
+    *,
+    extent: float,
+    capacity: int,
+    after_reset: bool,
+    generator: torch.Generator,
+    growing: torch.Tensor | None = None,
+    protected: torch.Tensor | None = None,
+) -> DensityUpdate:
+    """Clone small Gaussians and split large ones where the gradient of the mean is large; prune transparent and huge ones.
+
+    Args:
+        gaussians: The current set, N rows.
+        pull: Mean norm of the gradient of each projected mean, in half image widths and heights, shape [N].
+        config: Thresholds.
+        extent: Size of the scene [u].
+        capacity: Largest number of Gaussians after the change.
+        after_reset: True once opacities were reset; only then are huge Gaussians pruned.
+        generator: CPU generator of the children's positions, the same numbers on every device.
+        growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
+        protected: Gaussians that are not pruned, bool, shape [N]; None for none.
+
+    Returns:
+        The change. If all Gaussians would be pruned, the most opaque one is kept.
+    """
+    with torch.no_grad():
+        tensors = {n: t.detach() for n, t in gaussians.tensors().items()}
+        scales = _exp(tensors["log_scales"].amax(1))
+        logits = tensors["logit_opacities"]  # the rounding of torch's sigmoid depends on the number of threads
+        grows = pull > config.gradient
+        if growing is not None:
+            grows &= growing
+            pull = torch.where(growing, pull, 0)
+        free = max(0, capacity - len(gaussians))
+        if int(grows.sum()) > free:
+            strongest = torch.topk(pull, free).indices
+            grows = torch.zeros_like(grows).index_fill(0, strongest, True) & grows
+        small = scales <= config.clone_size * extent
+        faint = ~(logits >= geometry.logit(config.prune_opacity))
+        if after_reset and config.prune_size > 0:
+            huge = scales > config.prune_size * extent
+            if 2 * int(huge.sum()) <= len(gaussians):  # else the extent itself is small, since the cameras stand close together
+                faint |= huge
+        if protected is not None:
+            faint &= ~protected
+        if len(gaussians) > 0 and bool(faint.all()):
+            faint[logits.argmax()] = False
+        cloned = torch.nonzero(grows & small & ~faint).squeeze(1)
+        split = torch.nonzero(grows & ~small & ~faint).squeeze(1)
+        remove = faint.clone()
+        remove[split] = True
+        children = _split(tensors, split, generator)
+        added = {n: torch.cat([t[cloned], children[n]]) for n, t in tensors.items()}
+        return DensityUpdate(torch.nonzero(~remove).squeeze(1), added, torch.cat([cloned, split.repeat(2)]))
+
+
+class GradientGrowth:
+    """Growth and pruning by the gradients of projected means, which are gathered in columns of the table."""
+
+    STATE: ClassVar = {"was_reset": schema.flag}
+    """Schema of the plain values of `state`, by name."""
+
+    def __init__(self, context: StrategyContext):
+        """Begin without gradients, and before the first opacity reset."""
+        self.context, self.config = context, context.settings[DensityConfig]
+        self.was_reset = False
+        """True once opacities were reset, after which huge Gaussians are pruned."""
+
+    @staticmethod
+    def columns() -> dict[str, Column]:
+        """Return the columns for each projected mean: the sum of its gradient norms, and the number of renders that show it."""
+        return {"grad_sum": Column(0.0, inherited=False), "seen_count": Column(0.0, inherited=False)}
+
+    @property
+    def times(self) -> EventTimes:
+        """Times of refinement by the current phases: until the third phase, in a fit with phases."""
+        phases, planned = self.context.phases, self.context.settings[PhaseConfig]
+        times = self.config.times(phases.planned)
+        until = phases.stable_start if planned.coarse + planned.stable > 0 else min(times.until, phases.stable_start)
+        return replace(times, until=until)
+
+    def gathers(self, step: int) -> bool:
+        """Return whether gradients are gathered in a step."""
+        return step <= self.times.until
+
+    def statistics(
+        self, v_projected: torch.Tensor, visible: torch.Tensor, size: tuple[int, int]
+    ) -> dict[str, torch.Tensor]:  # fmt: skip
+        """Return the norm of each projected mean's gradient, and 1 for each mean that the view sees, else 0, shape [N] each.
+
+        The unit is half image widths and heights; arguments are those of `Strategy.statistics`.
+        """
+        # a product with a tensor of the two sizes would copy them to the device, which a captured step must not
+        norms = torch.hypot(v_projected[..., 0] * (0.5 * size[0]), v_projected[..., 1] * (0.5 * size[1]))
+        # not times visible: 0 times NaN is NaN
+        return {"grad_sum": torch.where(visible, norms, 0).sum(0), "seen_count": visible.sum(0)}
+
+    def refines(self, step: int) -> bool:
+        """Return whether the set is refined after a step."""
+        return self.times.due(step)
+
+    def resets(self, step: int) -> bool:
+        """Return whether opacities are reset after a step."""
+        every = self.config.reset_every
+        return every > 0 and step <= self.times.until - RESET_FREE_STEPS and step % every == 0
+
+    def due(self, step: int) -> bool:
+        """Return whether the set is refined or opacities are reset after a step."""
+        return self.refines(step) or self.resets(step)
+
+    def refine(self, growing: torch.Tensor | None = None, protected: torch.Tensor | None = None) -> Iterator[DensityUpdate]:
+        """Yield the change by `refine`, then order the Gaussians and reset the statistics.
+
+        Args:
+            growing: Gaussians that may be cloned and split, bool, shape [N]; None for all.
+            protected: Gaussians that are not pruned, bool, shape [N]; None for none.
+        """
+        t, columns = self.context, self.context.table.columns
+        pull = columns["grad_sum"] / columns["seen_count"].clamp_min(1)
+        yield refine(
+            t.gaussians, pull, self.config, extent=t.extent, capacity=t.capacity, after_reset=self.was_reset,
+            generator=t.generator, growing=growing, protected=protected,
+        )  # fmt: skip
+        if self.config.morton_order:
+            t.table.sort_along_curve()
+        for name in self.columns():
+            t.table.columns[name].zero_()
+
+    def reset_opacities(self) -> None:
+        """Lower every opacity to at most ``reset_opacity``."""
+        self.context.table.reset_opacities(self.config.reset_opacity)
+        self.was_reset = True
+
+    def state(self) -> dict[str, Any]:
+        """Return whether opacities were reset."""
+        return {"was_reset": self.was_reset}
+
+    def load(self, plain: Mapping[str, Any]) -> None:
+        """Load what `state` returned."""
+        self.was_reset = plain["was_reset"]
+
+
+# Clone, split and prune (Kerbl et al. 2023, section 5.2), without sampling.
 
 
 @register("clone_split")

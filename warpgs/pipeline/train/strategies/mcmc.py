@@ -15,12 +15,11 @@ import torch
 import warp as wp
 
 from warpgs.errors import UsageError
-from warpgs.kernels.step_buffers import Setting
+from warpgs.kernels import launch
+from warpgs.kernels.update import Setting
 from warpgs.pipeline.model.table import DensityUpdate
-from warpgs.pipeline.train.context import Growth
-from warpgs.pipeline.train.strategies.base import Strategy, register
-from warpgs.pipeline.train.strategies.event_times import EventTimes
-from warpgs.runtime import interop
+from warpgs.pipeline.train.schedule import EventTimes
+from warpgs.pipeline.train.strategies.base import Growth, Strategy, register
 from warpgs.scene import Gaussians
 
 MAX_COPIES = 51
@@ -136,11 +135,11 @@ def perturb(
     """
     g = {n: t.detach() for n, t in gaussians.tensors().items()}
     inputs = [
-        interop.view(settings, wp.float32), seed, noise_lr, interop.view(going, wp.bool), interop.view(g["quats"], wp.vec4),
-        interop.view(g["log_scales"], wp.vec3), interop.view(g["logit_opacities"], wp.float32),
-        interop.view(g["means"], wp.vec3),
+        launch.view(settings, wp.float32), seed, noise_lr, launch.view(going, wp.bool), launch.view(g["quats"], wp.vec4),
+        launch.view(g["log_scales"], wp.vec3), launch.view(g["logit_opacities"], wp.float32),
+        launch.view(g["means"], wp.vec3),
     ]  # fmt: skip
-    interop.launch(make_kernel(), len(gaussians), inputs, settings.device)
+    launch.launch(make_kernel(), len(gaussians), inputs, settings.device)
 
 
 @register("mcmc")

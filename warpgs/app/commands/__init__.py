@@ -1,1 +1,0 @@
-"""Commands: each module has ``run(arguments, about)``, which parses, calls and prints; no logic."""

@@ -1,0 +1,311 @@
+"""`warpgs fit`: flags, one call, lines; no logic."""
+
+import dataclasses
+import inspect
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from warpgs.app.flags import MAX_THREADS, check_range, flags_of, listed, load_own, parse_flags, settings_of, word_after
+from warpgs.device import parse_bytes
+from warpgs.errors import UsageError
+from warpgs.io.folder import READERS
+from warpgs.io.maps import NONE
+from warpgs.kernels.cameras import CAMERA_MODELS
+from warpgs.kernels.launch import set_threads
+from warpgs.pipeline.run.request import FitRequest, SceneRequest
+from warpgs.pipeline.train.loss import LOSS_TERMS
+from warpgs.pipeline.train.presets import PRESETS, origin_note, preset_settings
+from warpgs.pipeline.train.settings import FitConfig, check_budget
+from warpgs.pipeline.train.strategies.base import STRATEGIES
+from warpgs.pipeline.train.view_modules import VIEW_MODULES
+from warpgs.plugins import Registry, flag_group
+from warpgs.process import be_quiet, fast_imports, say
+from warpgs.ranks import join, place
+
+
+def scene_flags(*, positional: bool) -> tuple[type, Any]:
+    """Return the dataclass of the flags, and their defaults.
+
+    Args:
+        positional: True if the scene folder is a positional argument; False if the command has its own argument for scenes.
+    """
+    import tyro
+
+    if positional:
+        path, shown = tyro.MISSING, (tyro.conf.Positional, tyro.conf.arg(metavar="SCENE"))
+    else:
+        path, shown = "", (tyro.conf.Fixed, tyro.conf.Suppress)
+    return flags_of(SceneRequest, SceneRequest(path), {"path": shown})
+
+
+def scene_of(flags: Any, path: str) -> SceneRequest:
+    """Return the request for a scene folder from parsed flags; a user-defined reader is loaded.
+
+    Raises:
+        UsageError: There is no such reader.
+    """
+    asked = settings_of(SceneRequest, flags)
+    if asked.reader is not None:
+        reader = asked.reader
+        load_own(READERS.kind, reader, lambda: READERS.load(reader))
+    named = {n: getattr(asked, n) for n in ("score_masks", "matcher", "depths", "normals")}
+    found = {n: p if p is None or (p == NONE and n in ("depths", "normals")) else os.path.realpath(p) for n, p in named.items()}
+    return dataclasses.replace(asked, path=path, **found)
+
+
+# `warpgs fit`: flags derived from `FitConfig`: names, defaults and help texts are those of its fields.
+#
+# Defaults depend on the preset; a strategy and loss terms have their own settings. So the flags that determine other
+# flags are looked up first. Parses, calls, prints; no logic.
+
+CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view": 0, "--view-port": 1, "--lpips-weights": 1}
+"""Flags that may accompany --resume when a run keeps its settings, and the number of values of each."""
+
+
+def _request_type() -> type:
+    """Return the dataclass of the flags that are not settings of a fit: its input, output and machine."""
+
+    @dataclass(frozen=True, kw_only=True)
+    class Request:
+        out: Path
+        """Run folder to fill; new or empty."""
+        device: str = "auto"
+        """auto, cpu or cuda."""
+        threads: int = 0
+        """CPU threads; 0 for as many as there are cores."""
+        resume: bool = False
+        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
+        all settings from the run."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+        time_budget: float | None = None
+        """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
+        view: bool = False
+        """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
+        view_port: int = 8080
+        """Port of --view; 0 for any free one."""
+
+    return Request
+
+
+def _load(registry: Registry[Any], name: str) -> type[Any]:
+    """Return the class of a plug-in; the user's own code, named by module or file, is imported."""
+    return load_own(registry.kind, name, lambda: registry.load(name))
+
+
+Parts = dict[str, Any]
+"""Loss terms or view modules by the name of their flags."""
+
+
+def _parts(registry: Registry[Any], flag: str, arguments: list[str], base: tuple[Any, ...]) -> Parts:
+    """Return the parts of a registry that a flag names, with default settings; ``base`` if the flag is not given."""
+    given = word_after(arguments, flag)
+    if given is None:
+        return {flag_group(p.name): p for p in base}
+    parts: Parts = {}
+    for name in filter(None, (n.strip() for n in ("" if given == "none" else given).split(","))):
+        if flag_group(name) in parts:
+            raise UsageError(f"{flag} {given}: two of these names define the flags --{flag_group(name)}; leave one out")
+        kind = _load(registry, name)
+        try:
+            parts[flag_group(name)] = kind()
+        except TypeError as e:
+            raise UsageError(
+                f"the {registry.kind} {name!r} has a setting without a default ({e}); give every field a default"
+            ) from e
+    return parts
+
+
+def _view_modules(arguments: list[str], base: FitConfig) -> Parts:
+    """Return the view modules that a command line names; built-in modules also have a flag each."""
+    modules = _parts(VIEW_MODULES, "--view-modules", arguments, base.view_modules)
+    for name in VIEW_MODULES.names():
+        flag = name.replace("_", "-")
+        words = [w for w in (a.replace("_", "-") for a in arguments) if w in (f"--{flag}", f"--no-{flag}")]
+        if words and words[-1] == f"--{flag}":
+            modules.setdefault(name, VIEW_MODULES.find(name)())
+        elif words:
+            modules.pop(name, None)
+    return modules
+
+
+def _preset(arguments: list[str]) -> tuple[FitConfig, str]:
+    """Return the settings that the flags start from, and a description of their source."""
+    name = word_after(arguments, "--preset")
+    base, origin = load_own("preset", str(name), lambda: preset_settings(name))
+    strategy = word_after(arguments, "--strategy")
+    if strategy is None or strategy == base.strategy:
+        return base, origin
+    own = _load(STRATEGIES, strategy).Config
+    return dataclasses.replace(base, strategy=strategy, strategy_config=None if own is None else own()), origin
+
+
+def _choices() -> str:
+    """Return the names that can be chosen, as text for the user."""
+    plug_ins: dict[str, Registry[Any]] = {
+        "strategies": STRATEGIES, "loss terms": LOSS_TERMS, "readers": READERS, "camera models": CAMERA_MODELS,
+        "view modules": VIEW_MODULES,
+    }  # fmt: skip
+    lines = {"presets": PRESETS.described(), **{title: registry.described() for title, registry in plug_ins.items()}}
+    return "\n\n".join(listed(title, about) for title, about in lines.items())
+
+
+def _size() -> Any:
+    """Return the specification of a flag for a size in bytes, such as 2GiB."""
+    import tyro
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar="SIZE", instance_from_str=lambda words: parse_bytes(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, int),
+        str_from_instance=lambda value: ["none" if value is None else f"{value}B"],
+    )  # fmt: skip
+
+
+def _names(parts: Parts) -> Any:
+    """Return the specification of a flag that names parts of a registry; their settings are flags of their own."""
+    import tyro
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(parts.values()),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [",".join(t.name for t in value) or "none"],
+    )  # fmt: skip
+
+
+def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
+    """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
+    import tyro
+
+    special = {
+        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
+        "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
+    }  # fmt: skip
+    chosen = dataclasses.replace(base, loss_terms=tuple(terms.values()), view_modules=tuple(modules.values()))
+    kind, default = flags_of(FitConfig, chosen, special)
+    fields: list[tuple[str, Any, Any]] = [("config", Annotated[kind, tyro.conf.arg(name="")], field(default=default))]
+    own = {} if base.strategy_config is None else {flag_group(base.strategy): base.strategy_config}
+    reading, unread = scene_flags(positional=True)
+    fields.append(("reading", Annotated[reading, tyro.conf.arg(name="")], field(default=unread)))
+    kinds = (FitConfig, SceneRequest, _request_type())
+    taken = {f.name for kind in kinds for f in dataclasses.fields(kind)} | {"config", "reading"}
+    for name, settings in [*own.items(), *terms.items(), *modules.items()]:
+        if name in taken:
+            raise UsageError(f"the plug-in name {name} is taken by a flag of warpgs; rename the plug-in")
+        taken.add(name)
+        group, default = flags_of(type(settings), settings)
+        fields.append((f"{name}_settings", Annotated[group, tyro.conf.arg(name=name)], field(default=default)))
+    for name in VIEW_MODULES.names():
+        about = (inspect.getdoc(VIEW_MODULES.find(name)) or "").partition("\n\n")[0]
+        fields.append((name, Annotated[bool, tyro.conf.arg(help=about)], field(default=name in modules)))
+    return dataclasses.make_dataclass("Fit", fields, bases=(_request_type(),), frozen=True, kw_only=True)
+
+
+def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
+    """Return the settings of parsed flags."""
+
+    def settings(name: str, part: Any) -> Any:
+        return settings_of(type(part), getattr(a, f"{name}_settings"))
+
+    config, own = settings_of(FitConfig, a.config), base.strategy_config
+    if own is not None:
+        config = dataclasses.replace(config, strategy_config=settings(flag_group(base.strategy), own))
+    found, learned = (tuple(settings(n, p) for n, p in parts.items()) for parts in (terms, modules))
+    return dataclasses.replace(config, loss_terms=found, view_modules=learned)
+
+
+def _check_time_budget(a: Any, arguments: list[str]) -> None:
+    """Raise UsageError for an invalid time budget, or one that is given together with --steps or --resume."""
+    if a.time_budget is None:
+        return
+    if a.resume or word_after(arguments, "--steps"):
+        raise UsageError(
+            "--time-budget chooses the number of steps; leave out --steps. To continue a run, give only --out RUN --resume"
+        )
+    check_budget(a.time_budget)
+
+
+def _names_a_run_alone(arguments: list[str]) -> bool:
+    """Return whether arguments continue a run without giving any of its settings."""
+    words = [w for a in arguments for w in a.split("=", 1)]
+    while words:
+        if words[0] not in CONTINUING:
+            return False
+        words = words[1 + CONTINUING[words[0]] :]
+    return "--resume" in arguments
+
+
+def _continued(arguments: list[str], about: str) -> FitRequest:
+    """Return the request that continues a run with its original settings."""
+    from warpgs.pipeline.run.folder import stored_request
+
+    @dataclass(frozen=True, kw_only=True)
+    class Continue:
+        out: Path
+        """Run folder."""
+        resume: bool = False
+        """Continue the run."""
+        device: str | None = None
+        """auto, cpu or cuda. Default: the device of the run."""
+        threads: int = 0
+        """CPU threads; 0 for as many as there are cores."""
+        view: bool = False
+        """Show the model in a browser while it trains."""
+        view_port: int = 8080
+        """Port of --view; 0 for any free one."""
+        lpips_weights: Path | None = None
+        """File of `warpgs convert-lpips`; a run does not store the file, so give it again to measure LPIPS."""
+
+    a = parse_flags(Continue, arguments, "warpgs fit", about)
+    check_range("--threads", a.threads, 0, MAX_THREADS)
+    check_range("--view-port", a.view_port, 0, 65535)
+    if a.threads:
+        set_threads(a.threads)
+    request = stored_request(a.out)
+    say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    device, view_port = a.device or request.device, a.view_port if a.view else None
+    return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
+
+
+def request_of(arguments: list[str], about: str) -> FitRequest:
+    """Return the request for the arguments of a command line.
+
+    Raises:
+        UsageError: A flag is wrong, or a plug-in cannot be loaded.
+    """
+    if _names_a_run_alone(arguments):
+        return _continued(arguments, about)
+    base, origin = _preset(arguments)
+    parts = _parts(LOSS_TERMS, "--loss-terms", arguments, base.loss_terms), _view_modules(arguments, base)
+    a: Any = parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")
+    scene = scene_of(a.reading, a.reading.path)
+    check_range("--threads", a.threads, 0, MAX_THREADS)
+    check_range("--view-port", a.view_port, 0, 65535)
+    if a.threads:
+        set_threads(a.threads)
+    config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
+    _check_time_budget(a, arguments)
+    notes = (origin_note(origin, base, config),)
+    if word_after(arguments, "--preset") is None:
+        say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
+    view_port = a.view_port if a.view else None
+    return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
+
+
+def run_fit(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` describes it in its help."""
+    if place()[0] > 0:
+        be_quiet()
+    request = request_of(arguments, about)
+    with fast_imports():
+        from warpgs.pipeline.run.fit import fit_request
+    ranks = join(request.device)
+    if request.view_port is None or not ranks.first:
+        fit_request(request, ranks=ranks)
+        return 0
+    from warpgs.viewer.watch import live_view
+
+    with live_view(request.out, request.view_port) as live:
+        fit_request(request, on_model=live.look, ranks=ranks)
+    return 0

@@ -1,0 +1,381 @@
+"""The machine: processors, memory and its units, sizes that repeat from step to step, the cache of kernels."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import os
+import platform
+import re
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, NamedTuple
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.folders import cache_home, private_folder
+from warpgs.locks import open_to_others
+from warpgs.process import say
+
+if TYPE_CHECKING:
+    import torch
+
+
+CPU_INFO = Path("/proc/cpuinfo")
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may run on, at least 1; all cores if that is unknown."""
+    try:
+        return len(os.sched_getaffinity(0)) or 1  # missing on macOS and Windows
+    except (AttributeError, OSError):
+        return os.cpu_count() or 1
+
+
+def processor_name() -> str:
+    """Return the processor's model where the system names it, else its kind; never empty."""
+    try:
+        for line in CPU_INFO.read_text("utf-8", errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass  # only on Linux
+    return platform.processor() or platform.machine() or "unknown"
+
+
+UNITS = {"B": 1} | {f"{p}{u}": b**i for i, p in enumerate("KMGT", 1) for u, b in (("B", 1000), ("iB", 1024))}
+"""Bytes of each unit by name."""
+
+
+def parse_bytes(text: str) -> int:
+    """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes.
+
+    Raises:
+        UsageError: The text is not a size, or the size is below one byte or not below 2^63.
+    """
+    found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
+    units = {u.lower(): b for u, b in UNITS.items()}
+    if not found or found[2].lower() not in units:
+        raise UsageError(
+            f"memory limit {text[:40]!r} is not a size: give a number and a unit of {', '.join(UNITS)}, such as 2GiB"
+        )
+    size = float(found[1]) * units[found[2].lower()]
+    if not 1 <= size < 2**63:
+        raise UsageError(f"memory limit {text[:40]!r} must be at least one byte and less than 2^63")
+    return int(size)
+
+
+def format_bytes(size: float) -> str:
+    """Return a size [bytes] as text for people to read."""
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if size < 1024:
+            return f"{size:.0f} {unit}" if unit in ("B", "KiB") else f"{size:.1f} {unit}"
+        size /= 1024
+    return f"{size:.1f} TiB"
+
+
+# Sizes of a training step, and the bytes that its parts need at each moment.
+#
+# Each part declares its bytes beside its allocations, in a function of `StepSizes`; the memory plan only adds them up.
+
+FLOAT = 4
+"""Bytes of a float32 or int32."""
+BINNING, LOSS, BLENDING, PROJECTION, SAMPLING = "binning", "loss", "blending", "projection", "sampling"
+"""Moments at which a step may need the most memory: while instances are sorted, while the loss and its gradient are computed,
+in the backward passes of blending and of projection, and while a sampling event renders a view."""
+STEP = (BINNING, LOSS, BLENDING, PROJECTION)
+"""Moments of every step."""
+
+
+@dataclass(frozen=True)
+class StepSizes:
+    """Sizes that determine the memory of a training step."""
+
+    width: int
+    """Width of the largest view [px]."""
+    height: int
+    """Height of the largest view [px]."""
+    row: int
+    """Bytes of one Gaussian's parameters."""
+    views: int = 1
+    """Number of views."""
+    masked: bool = False
+    """True if a view has a mask."""
+    cutout: bool = False
+    """True if the images have an alpha channel."""
+    depth: bool = False
+    """True if a loss term reads depth."""
+    cuda: bool = False
+    """True on a CUDA device."""
+    count: int = 0
+    """Number of Gaussians."""
+    instances: int = 0
+    """Number of (Gaussian, tile) instances of the image or, if ``chunked``, of its heaviest chunk."""
+    chunked: bool = False
+    """True if the image is rendered in chunks."""
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels of the largest view."""
+        return self.width * self.height
+
+
+Needs = Mapping[str, int]
+"""Bytes by moment."""
+
+
+def add_needs(parts: Iterable[Callable[[StepSizes], Needs]], sizes: StepSizes) -> dict[str, int]:
+    """Return the sum of the bytes that parts declare, by moment."""
+    total: dict[str, int] = {}
+    for part in parts:
+        for moment, needed in part(sizes).items():
+            total[moment] = total.get(moment, 0) + needed
+    return total
+
+
+ASSUMED_BYTES = 2 * 2**30
+"""Assumed memory of a machine that does not report it [bytes]: the memory of a small machine."""
+
+OWN_CGROUPS = Path("/proc/self/cgroup")
+CGROUPS = Path("/sys/fs/cgroup")
+
+
+NO_MEMORY = (
+    "out of memory", "can't allocate memory", "cannot allocate memory", "not enough memory", "insufficient memory",
+    "failed to allocate", "bad_alloc", "bad allocation", "unable to allocate",
+)  # fmt: skip
+"""Parts of the messages of torch, Warp, OpenCV, ONNX Runtime, numpy and C++ on lack of memory, in lower case."""
+
+
+class Memory(NamedTuple):
+    """Installed and available bytes; cached files that the system would drop count as available."""
+
+    installed: int
+    available: int
+
+
+def available_bytes(device: torch.device) -> int:
+    """Return the memory that is free now on a device [bytes]; on CUDA including memory that torch holds unused."""
+    if device.type == "cuda":
+        import torch
+
+        free, _ = torch.cuda.mem_get_info(device)
+        return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return _machine_or_assumed().available
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an error, or one of its causes, reports too little memory."""
+    found: BaseException | None = error
+    while found is not None:
+        text = str(found).lower()
+        if isinstance(found, MemoryError) or getattr(found, "errno", None) == errno.ENOMEM or any(w in text for w in NO_MEMORY):
+            return True
+        found = found.__cause__
+    return False
+
+
+def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
+    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True.
+
+    ``purpose`` may state the use of the memory, such as " for step 3".
+    """
+    remedy = (
+        "Reduce the memory of the fit with --memory-limit or --downscale, or end other programs; --resume continues from the "
+        "last checkpoint"
+        if fitting
+        else "End other programs, and try again"
+    )
+    reason = (str(error).strip() or type(error).__name__).splitlines()[0].partition(" GPU ")[0].rstrip(".")
+    return f"out of memory{purpose} ({reason[:200]}). {remedy}"
+
+
+@functools.cache
+def installed_bytes(device: torch.device) -> int:
+    """Return the memory of a device [bytes], on a CPU at most the limit of the container; queried once."""
+    if device.type == "cuda":
+        import torch
+
+        return torch.cuda.get_device_properties(device).total_memory
+    return _machine_or_assumed().installed
+
+
+def machine_memory() -> Memory | None:
+    """Return the memory of the machine within the limits of the container, if any; None if unknown."""
+    found = [m for m in (_system_memory(), container_memory()) if m is not None]
+    if not found:
+        return None
+    return Memory(min(m.installed for m in found), max(0, min(m.available for m in found)))
+
+
+def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
+    """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit.
+
+    Only Linux has control groups; on other systems, and without a limit, this is None. Both versions of control groups are
+    read, from the process's own group up to the root, since the limits of all of them apply (kernel documentation, cgroup-v2
+    "Memory" and cgroup-v1 "Memory Resource Controller"). Cached files that were not used lately count as free: the kernel drops
+    them first.
+
+    Args:
+        own: File that lists the process's groups; None for /proc/self/cgroup.
+        mount: Folder in which groups are mounted; None for /sys/fs/cgroup.
+    """
+    limits, rooms = [], []
+    for folder, limit_name, used_name, cache_name in _groups(own or OWN_CGROUPS, mount or CGROUPS):
+        limit, used = _number(folder / limit_name), _number(folder / used_name)
+        if limit is None or limit >= 2**60:  # version 1 writes "no limit" as a number near 2^63
+            continue
+        limits.append(limit)
+        rooms.append(limit if used is None else limit - max(0, used - _row(folder / "memory.stat", cache_name)))
+    return Memory(min(limits), min(rooms)) if limits else None
+
+
+def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
+    """Yield each memory group's folder, with the names of its limit file, its use file and a row of its ``memory.stat``."""
+    rows = [row.split(":", 2) for row in _text(own).splitlines()]
+    paths = {"": "/", "memory": "/"} | {c: p for _, names, p in (r for r in rows if len(r) == 3) for c in names.split(",")}
+    versions = {
+        "": (mount, "memory.max", "memory.current", "inactive_file"),
+        "memory": (mount / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    }
+    for controller, (root, *names) in versions.items():
+        parts = PurePosixPath(paths[controller]).parts[1:]
+        # a path that leaves the mounted tree is a group that cannot be seen from here
+        for end in range(0 if ".." in parts else len(parts), -1, -1):
+            yield root.joinpath(*parts[:end]), *names
+
+
+def _system_memory() -> Memory | None:
+    """Return the memory that psutil reports; None where psutil is missing or the system denies access."""
+    try:
+        import psutil
+
+        found = psutil.virtual_memory()
+        return Memory(int(found.total), int(found.available))
+    except (ImportError, AttributeError, KeyError, OSError, RuntimeError, ValueError):
+        return None
+
+
+def _machine_or_assumed() -> Memory:
+    found = machine_memory()
+    if found is None:
+        _say_assumed()
+        return Memory(ASSUMED_BYTES, ASSUMED_BYTES)
+    return found
+
+
+@functools.cache
+def _say_assumed() -> None:
+    say(
+        f"warpgs: the memory of this system is unknown (neither psutil nor a container reports it); "
+        f"{ASSUMED_BYTES / 2**30:.0f} GiB are assumed",
+        error=True,
+    )
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8")
+    except (OSError, ValueError):
+        return ""
+
+
+def _number(path: Path) -> int | None:
+    """Return the number in a file; None for `max` or a missing file."""
+    text = _text(path).strip()
+    return int(text) if text.isdecimal() else None
+
+
+def _row(path: Path, name: str) -> int:
+    """Return the number behind a name in a file of rows, 0 where it is missing."""
+    rows = (row.split() for row in _text(path).splitlines())
+    return next((int(r[1]) for r in rows if len(r) == 2 and r[0] == name and r[1].isdecimal()), 0)
+
+
+# The folder of compiled kernels: Warp's default, if this user and no other can write to it; else a private folder.
+#
+# Warp runs the kernels that it finds there, so anyone with write access can run code as this user.
+
+REMEDY = "Set WARP_CACHE_PATH to a folder of your own to keep compiled kernels"
+
+
+class KernelCache(NamedTuple):
+    """Folder of compiled kernels."""
+
+    folder: Path
+    """Folder, without the subfolder that names Warp's version."""
+    refused: str
+    """Reason why the usual folder is not used; empty if it is used."""
+
+
+@functools.cache
+def prepare_kernel_cache() -> KernelCache:
+    """Choose the folder, and set it in Warp's settings before `wp.init`; print a line on stderr if the folder is private.
+
+    Raises:
+        ResourceError: There is no writable folder.
+    """
+    import warp
+
+    chosen = choose_kernel_cache(warp.config.kernel_cache_dir)
+    if chosen.refused:
+        say(
+            f"warpgs: {chosen.refused}; kernels are compiled into {chosen.folder} for this process only, which takes a "
+            f"minute or two. {REMEDY}",
+            error=True,
+        )
+    if chosen.refused or warp.config.kernel_cache_dir is None:
+        warp.config.kernel_cache_dir = str(chosen.folder)
+    return chosen
+
+
+def choose_kernel_cache(configured: str | None = None) -> KernelCache:
+    """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable.
+
+    Args:
+        configured: Value of ``warp.config.kernel_cache_dir``: set by the user's program, or by Warp once started.
+
+    Raises:
+        ResourceError: Neither the usual nor the private folder can be written.
+    """
+    folder, refused = _usual(configured)
+    if folder is not None:
+        refused = _fault(folder)
+        if not refused:
+            return KernelCache(folder, "")
+    try:
+        own = private_folder() / "kernels"
+        own.mkdir(exist_ok=True)
+        return KernelCache(own, refused)
+    except (ResourceError, OSError) as e:
+        raise ResourceError(f"no folder for compiled kernels can be written: {refused}, and {e}. {REMEDY}") from e
+
+
+def _usual(configured: str | None) -> tuple[Path | None, str]:
+    """Return the requested folder or Warp's default; or None, and the reason."""
+    asked = configured or os.environ.get("WARP_CACHE_PATH")
+    if asked:
+        folder = Path(os.path.expanduser(asked))  # as a shell does, but not within quotes
+        if asked.startswith("~") and not folder.is_absolute():
+            return None, f"the kernel cache {asked} is in an unknown home folder"
+        return folder.resolve(), ""
+    home = cache_home()
+    if home is None:
+        return None, "no home folder for a kernel cache"
+    # where Warp's appdirs would put it; Warp adds its version
+    return home.joinpath(*(("NVIDIA", "warp", "Cache") if sys.platform == "win32" else ("warp",))).resolve(), ""
+
+
+def _fault(folder: Path) -> str:
+    """Return why a folder cannot be used, or an empty text if it can; a missing folder is made."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder) as f:
+            f.write(b"0")
+            f.flush()
+        others = open_to_others(folder, depth=3)  # its versions, the modules in them, and their files
+    except OSError as e:
+        return f"the kernel cache {folder} cannot be written ({e.strerror or e})"
+    return f"the kernel cache {folder} is not safe: other users can write to {others}" if others else ""

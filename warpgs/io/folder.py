@@ -1,0 +1,532 @@
+"""Scene folders: the interface of a reader, and what all readers do alike."""
+
+from __future__ import annotations
+
+import abc
+import math
+import posixpath
+import re
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, ClassVar
+
+import numpy as np
+
+from warpgs.constants import POSE_TOLERANCE
+from warpgs.errors import DataError, UsageError
+from warpgs.files import inside, is_within
+from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
+from warpgs.io.images import BLACK, MAX_PIXELS, REDUCED, Lens, LoadedImage, decode, list_images, load_image, unread_note
+from warpgs.io.maps import NO_MAPS, NOTHING_NAMED, GivenMaps, MapOptions, NamedMaps
+from warpgs.plugins import Registry
+from warpgs.scene import Camera, Scene, View
+
+# Readers of scene formats: the base class, the registry, and the choice of a reader by name, class or object.
+#
+# One module of `warpgs.io` holds one format and registers its reader. Adding a format means adding one such module; a
+# user's own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``file.py:Class``
+# (examples/06_own_format.py).
+
+DEFAULT_MAX_SIDE = 1600
+"""Default of the longest side of an image [px]: 12 MP of a phone would take hours on a CPU."""
+
+
+def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
+    """Return the factor and the longest side [px] (0 for no limit) that follow from two settings, each None if not given."""
+    if max_side is None:
+        max_side = DEFAULT_MAX_SIDE if downscale is None else 0
+    return 1 if downscale is None else downscale, max_side
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """Options for reading a scene folder."""
+
+    downscale: int = 1
+    """Factor, at least 1, by which both image sides shrink."""
+    strict: bool = False
+    """True to treat a frame without an image file as an error instead of a note."""
+    allow_outside: bool = False
+    """True to allow names and links that point to files outside the scene folder."""
+    masks: str = "ignore"
+    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
+    mask_keeps: str = "white"
+    """Colour of a mask file that keeps a pixel: white or black."""
+    black_is_empty: bool = True
+    """True to make dark pixels around an object transparent, if every image shows an object on black."""
+    max_pixels: int = MAX_PIXELS
+    """Largest number of pixels that an image or a mask may have."""
+    max_side: int = 0
+    """Largest image side [px], after ``downscale``; 0 for no limit."""
+    lenses: str = "undistort"
+    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (`Camera.model` names the lens)."""
+    maps: MapOptions = NO_MAPS
+    """Given maps of depth and normals."""
+    on_image: Callable[[Path], object] | None = None
+    """Called with the file of each image before it is decoded; None for no call."""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
+            raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
+        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or not 0 <= self.max_side:
+            raise UsageError(f"--max-side must be a whole number of pixels, 0 for no limit, not {self.max_side!r}")
+        if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
+            raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
+        if self.masks not in ("ignore", "cutout"):
+            raise UsageError(f"--masks must be ignore or cutout, not {self.masks!r}")
+        if self.lenses not in ("undistort", "native"):
+            raise UsageError(f"--lenses must be undistort or native, not {self.lenses!r}")
+        if self.mask_keeps not in ("white", "black"):
+            raise UsageError(f"--mask-keeps must be white or black, not {self.mask_keeps!r}")
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Files of a format in a folder."""
+
+    found: str
+    """Files of the format that were found, such as ``poses_bounds.npy``, as the subject of a sentence."""
+    missing: str = ""
+    """Missing files; empty if the folder is complete."""
+
+
+class Reader(abc.ABC):
+    """Base class of the readers of scene formats."""
+
+    name: ClassVar[str] = ""
+    """Name of the format: the name given to `register`, else the class attribute, else the name of the class."""
+    description: ClassVar[str] = ""
+    """Files of the format, then its name in brackets, on one line, for the error message on an unknown folder."""
+    priority: ClassVar[int] = 100
+    """Priority if a folder has several complete formats, lowest first; the built-in readers have 10 to 50."""
+
+    _declared_name: ClassVar[str] = ""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.name = cls._declared_name = cls.__dict__.get("name", cls.__name__)
+
+    @abc.abstractmethod
+    def probe(self, folder: Path) -> Probe | None:
+        """Look for the format in a folder, by file names only.
+
+        Returns:
+            The found and missing files; None if no file belongs to the format.
+        """
+
+    @abc.abstractmethod
+    def read(self, folder: Path, options: ReadOptions) -> Scene:
+        """Read a scene folder in which `probe` found everything.
+
+        Returns:
+            The scene in file coordinates: cameras as camera_from_world with OpenCV axes, images at their final size, notes on
+            automatic choices. `warpgs.io.load.load_scene` sorts the views, normalises the coordinates, and adds score masks and
+            the fingerprint.
+
+        Raises:
+            warpgs.DataError: A file is missing or malformed; the message names file, reason and fix.
+        """
+
+    def scene(self, folder: Path, views: list[View], notes: list[str], **fields: Any) -> Scene:
+        """Return a `Scene` of this format; ``fields`` are further fields (points, background, pixels)."""
+        return Scene(str(folder), self.name, tuple(views), notes=tuple(notes), **fields)
+
+
+READERS: Registry[Reader] = Registry("reader", Reader, __package__)  # type: ignore[type-abstract]
+
+register = READERS.register
+"""Class decorator ``@register("name")`` that adds a reader to the built-in ones."""
+
+
+def all_readers() -> list[Reader]:
+    """Return a reader of every registered format, by ascending ``priority``, then by name."""
+    return sorted((READERS.find(name)() for name in READERS.names()), key=lambda r: (r.priority, r.name))
+
+
+def find_reader(choice: str | type[Reader] | Reader) -> Reader:
+    """Return the reader for a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader object.
+
+    A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
+
+    Raises:
+        UsageError: There is no such reader, or it does not derive from `Reader`.
+    """
+    if isinstance(choice, Reader):
+        return choice
+    if not isinstance(choice, (str, type)):
+        raise UsageError(f"{choice!r} is not a reader; give a name, module:Class, or a class or object derived from Reader")
+    if isinstance(choice, type) or ":" not in choice:
+        return READERS.find(choice)()
+    cls = READERS.load(choice)
+    cls.name = cls._declared_name  # a scene's format is named by its reader, not by the place of the code
+    return cls()
+
+
+def _numbers(names: list[str]) -> list[int] | None:
+    """Return the number that distinguishes each name: the first group of digits that differs between all names; or None."""
+    groups = [re.findall(r"[0-9]{1,12}", PurePosixPath(n).stem) for n in names]
+    for place in range(min(map(len, groups), default=0)):
+        values = [int(g[place]) for g in groups]
+        if len(set(values)) == len(values):
+            return values
+    return None
+
+
+def named_by_dtu(names: list[str]) -> bool:
+    """Return True where all names are DTU's own, `rect_001_3_r5000.png`, which count from 1."""
+    return all(re.search(r"rect_[0-9]+_", n) for n in names)
+
+
+def image_ids(names: list[str]) -> list[int] | None:
+    """Return the ids of image files from the numbers in their names; None if no number distinguishes the names.
+
+    DTU's own names, `rect_001_3_r5000.png`, count from 1, so number 1 is id 0; other numbers are used unchanged.
+    """
+    values = _numbers(names)
+    if values is None:
+        return None
+    return [v - 1 for v in values] if named_by_dtu(names) else values
+
+
+def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: str) -> dict[int, str]:
+    """Return the names of the images with the wanted ids.
+
+    Args:
+        names: All image names of a scan, sorted.
+        wanted: Ids that a protocol picks, counted from 0.
+        least: Smallest number of images for which the ids of the protocol apply.
+        where: Protocol and scene, for errors.
+
+    Returns:
+        Name by id. Names without numbers are counted in sorted order. Numbered images must have no gaps: after a gap, the
+        numbers might differ from the protocol's ids.
+
+    Raises:
+        DataError: There are too few images, or some ids are missing; the message names them.
+    """
+    if len(names) < least:
+        raise DataError(
+            f"{where}: the protocol needs {least} views, and the scene has {len(names)}; restore the scan, or use llff:K or "
+            "every:N"
+        )
+    ids = image_ids(names)
+    if ids is None:
+        return {i: names[i] for i in wanted}
+    first = 1 if min(ids) == 1 and not named_by_dtu(names) else 0  # files renamed 001, 002, ... count from one
+    by_id = {i - first: name for i, name in zip(ids, names)}
+    missing = [i for i in range(max(least, len(names))) if i not in by_id]
+    if missing:
+        shown = ", ".join(map(str, missing[:8])) + (", ..." if len(missing) > 8 else "")
+        raise DataError(
+            f"{where}: images with the ids {shown} are missing (ids are counted from 0, names run from {names[0]} to "
+            f"{names[-1]}); restore them, because the protocol's ids would otherwise select other views"
+        )
+    return {i: by_id[i] for i in wanted}
+
+
+def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
+    """Return a pose [4, 4] with its rotation made exactly orthonormal.
+
+    Raises:
+        DataError: The pose is not finite, or its upper left 3 x 3 block is not a rotation; ``where`` is file and image.
+    """
+    if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
+        raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")
+    R = viewmat[:3, :3]
+    # entries of a rotation are at most 1; the bound keeps the squares of wild ones from overflowing
+    error = float(np.abs(R @ R.T - np.eye(3)).max()) if np.abs(R).max() < 1e3 else np.inf
+    if error > POSE_TOLERANCE:
+        raise DataError(
+            f"{where}: the pose is not rigid (R R^T is off by {error:.2g}): it scales or shears. Give pure rotations"
+        )
+    if np.linalg.det(R) < 0:
+        raise DataError(f"{where}: the pose mirrors the scene (determinant -1); two axes are probably swapped")
+    result = np.eye(4)
+    result[:3, :3] = nearest_rotation(R)
+    result[:3, 3] = viewmat[:3, 3]
+    return result
+
+
+def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
+    """Return the rotation [3, 3] of a quaternion wxyz of any length.
+
+    Raises:
+        DataError: The quaternion is zero or not finite.
+    """
+    q = np.array(quat, np.float64)
+    norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
+    if not 1e-12 < norm < np.inf:
+        raise DataError(f"{where}: the rotation quaternion {tuple(quat)} is zero or not finite; estimate the pose again")
+    return rotation_matrices(q / norm)
+
+
+def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.ndarray:
+    """Return camera_from_world [4, 4] with OpenCV axes from a camera-to-world matrix.
+
+    Args:
+        matrix: Camera to world, shape [3, 4] or [4, 4].
+        where: File and image, for errors.
+        opengl: True if the camera looks along -z with +y up (OpenGL, Blender); y and z are then negated.
+
+    Raises:
+        DataError: The matrix is not rigid or not finite.
+    """
+    pose = np.eye(4)
+    pose[: matrix.shape[0]] = matrix
+    p, q, r, s = pose[3].tolist()  # numpy's allclose would take a quarter of the time of a pose
+    if np.isfinite(pose).all() and not (max(abs(p), abs(q), abs(r)) <= 1e-6 and abs(s - 1) <= 1e-5):
+        raise DataError(f"{where}: the last row of the pose is {pose[3].tolist()}, not 0 0 0 1; is the matrix transposed?")
+    if opengl:
+        pose[:3, 1:3] *= -1
+    pose = rigid(pose, where)
+    result = np.eye(4)
+    result[:3, :3] = pose[:3, :3].T
+    result[:3, 3] = -matmul(pose[:3, :3].T, pose[:3, 3])
+    return result
+
+
+MAX_NAME_LENGTH = 4096
+
+
+def has_folder(root: Path, *patterns: str) -> bool:
+    """Return whether ``root`` contains a folder of one of the names or glob patterns."""
+    return any(p.is_dir() for pattern in patterns for p in root.glob(pattern))
+
+
+def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
+    """Return the path of a file that a scene names.
+
+    Args:
+        folder: Folder to which the name is relative.
+        name: Name as in the scene's file.
+        where: The scene's file and the place in it, for errors.
+        root: Folder that must contain the file, links followed; None for ``folder``.
+        allow_outside: Allow links that point outside the folder.
+
+    Returns:
+        The path; the file may not exist.
+
+    Raises:
+        DataError: The name is empty or not a file name, or points outside the scene folder.
+    """
+    usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
+    if usable:
+        try:
+            name.encode("utf-8", "surrogateescape")
+        except UnicodeEncodeError:
+            usable = False
+    if not usable:
+        raise DataError(f"{where}: {str(name)[:80]!r} is not a file name; name an image file")
+    path = folder / name
+    if "\\" in name and not path.is_file():
+        path = folder / name.replace("\\", "/")  # written on Windows
+    if not allow_outside and not is_within(path, root or folder):
+        raise DataError(f"{where}: {name!r} points outside the scene folder; move the file inside, or pass --allow-outside")
+    return path
+
+
+def view_name(name: str) -> str:
+    """Return the normalised name of a view from a file name: "./a//b.png" gives "a/b.png".
+
+    Renders are stored under these names, so no name is absolute or contains "..": "../a.png" gives "outside/a.png".
+    """
+    plain = posixpath.normpath(name)
+    kept = [part for part in plain.split("/") if part not in ("", "..")]
+    return "/".join(["outside", *kept] if plain.startswith(("/", "../")) else kept)
+
+
+def view_name_of(path: Path, root: Path) -> str:
+    """Return the view name of a file: its path below ``root`` without following links, else a path below `outside`."""
+    plain, base = (posixpath.normpath(p.absolute().as_posix()) for p in (path, root))
+    return view_name(plain[len(base) + 1 :] if Path(plain).is_relative_to(base) else plain)
+
+
+class SceneFolder:
+    """A scene folder with the options for reading it. Readers open all images and masks through it."""
+
+    def __init__(self, root: Path, options: ReadOptions):
+        self.root, self.options = root, options
+        self._reduced = False
+        self._maps = GivenMaps(options.maps, options.max_pixels, options.allow_outside)
+
+    def inside(self, path: Path) -> Path:
+        """Return a path after a check that no link in it points outside the scene folder, unless this is allowed.
+
+        Raises:
+            DataError: A link points outside.
+        """
+        return path if self.options.allow_outside else inside(path, self.root, "the scene folder")
+
+    def child(self, folder: Path, name: object, where: str, *, root: Path | None = None) -> Path:
+        """Return the path of a file that the scene names (see the function `child`)."""
+        return child(folder, name, where, root=root, allow_outside=self.options.allow_outside)
+
+    def image(
+        self,
+        path: Path,
+        lens: Lens | Callable[[int, int], Lens],
+        *,
+        downscale: int | None = None,
+        mask: np.ndarray | None = None,
+        background: tuple[float, float, float] = BLACK,
+        named: NamedMaps = NOTHING_NAMED,
+    ) -> LoadedImage:
+        """Load an image of the scene as `load_image` does, and its maps of depth and normals.
+
+        Args:
+            path: The image file.
+            lens: Its intrinsics, or a function that returns them for width and height [px].
+            downscale: Factor by which both sides shrink: 1 for images of a folder such as `images_4`, which have been resized
+                already. None for the factor that the user gave.
+            mask: Weight of each pixel, in [0, 1], shape [H, W], from the method `mask`.
+            background: Colour in [0, 1] behind transparent pixels.
+            named: Maps that the scene names for the image.
+
+        Returns:
+            The image, float32, shape [H, W, 3], with intrinsics for its size.
+
+        Raises:
+            DataError: The file is outside the folder, or `load_image` rejects it; or a map is invalid.
+            ResourceError: There is not enough memory to decode the image.
+            UsageError: A side becomes too small, or the camera model does not support a map.
+        """
+        if self.options.on_image is not None:
+            self.options.on_image(path)
+        loaded = load_image(
+            self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
+            max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout", max_side=self.options.max_side,
+            native=self.options.lenses == "native",
+        )  # fmt: skip
+        self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
+        return self._maps.attached(loaded, path, named)
+
+    def mask(self, path: Path) -> np.ndarray:
+        """Return the weights of a mask file of the scene: float32 [H, W], 1 to keep a pixel, 0 to mask it out."""
+        return read_mask(self.inside(path), self.options.mask_keeps, self.options.max_pixels)
+
+    def find_mask(self, image: Path, images_root: Path, folder: Path | None = None) -> np.ndarray | None:
+        """Return the mask [H, W] of an image, or None without one.
+
+        The mask is in ``folder``, by default `masks` beside the image folder. For photo.jpg it is photo.png, photo.jpg.png or
+        photo.jpg.
+        """
+        folder = folder or images_root.parent / "masks"
+        if not image.is_relative_to(images_root) or not folder.is_dir():
+            return None
+        relative = image.relative_to(images_root)
+        for candidate in (folder / relative.with_suffix(".png"), folder / f"{relative.as_posix()}.png", folder / relative):
+            if candidate.is_file():
+                return self.mask(candidate)
+        return None
+
+    def images(self, base: str = "images") -> tuple[Path, int, str]:
+        """Choose the image folder: `images_N` for a factor N, else the full-size folder, whose images are then resampled.
+
+        Returns:
+            The folder, the remaining factor for resampling, and a note for the user (empty if there was no choice).
+
+        Raises:
+            DataError: There is no image folder, or it is a link that points outside the scene folder.
+        """
+        folder, factor, note = _image_folder(self.root, self.options.downscale, base)
+        return self.inside(folder), factor, note
+
+    def pixel_source(self, by_folder: bool) -> str:
+        """Return the source of a scene's pixels, for result files: the folder, and "as stored" or the kind of resampling.
+
+        Call it after all images are read, because ``max_side`` may have reduced any of them.
+
+        Args:
+            by_folder: True if the format supports folders `images_N` (`images`); False if its reader reads the files that the
+                scene names.
+        """
+        name, factor = "images", self.options.downscale
+        if by_folder:
+            folder, factor, _ = self.images()
+            name = folder.name
+        how = f"area-resampled by {factor}" if factor > 1 else "as stored"
+        return f"{name} {how}, {REDUCED}at most {self.options.max_side} px a side" if self._reduced else f"{name} {how}"
+
+
+def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels.
+
+    Raises:
+        DataError: The file cannot be read.
+    """
+    gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
+    return gray if keeps == "white" else 1 - gray
+
+
+def _image_folder(root: Path, downscale: int, base: str) -> tuple[Path, int, str]:
+    ready = root / f"{base}_{downscale}"
+    if downscale > 1 and ready.is_dir() and list_images(ready):
+        return ready, 1, f"images taken from {ready.name}"
+    full = root / base
+    if full.is_dir() and list_images(full):
+        return full, downscale, f"images area-resampled by {downscale}" if downscale > 1 else ""
+    others = {int(n): p for p in root.glob(f"{base}_*") if (n := p.name[len(base) + 1 :]).isdecimal() and list_images(p)}
+    if not others:
+        unread = unread_note(full)
+        raise DataError(f"{full}: {unread}" if unread else f"{full}: missing, or without images; put the images into it")
+    largest = others[min(others)]
+    how = f", area-resampled by {downscale}" if downscale > 1 else ""
+    return largest, downscale, f"no full-size folder '{base}': images taken from {largest.name}{how}"
+
+
+def resampling_note(downscale: int) -> list[str]:
+    """Return the note of a format that always resamples its images; an empty list for a factor of 1."""
+    return [f"images area-resampled by {downscale}"] if downscale > 1 else []
+
+
+class ViewList:
+    """Views of a scene in the order of reading, and counts of changes to their pixels."""
+
+    def __init__(self) -> None:
+        self.views: list[View] = []
+        self._done: Counter[str] = Counter()
+        self._kept: dict[str, float] = {}
+        self._names: set[str] = set()
+
+    def claim(self, name: str, where: str) -> str:
+        """Return and reserve the name of a view before its image is decoded.
+
+        Raises:
+            DataError: Another view has this name.
+        """
+        if name in self._names:
+            raise DataError(f"{where}: the image {name!r} is listed twice; remove one of its cameras")
+        self._names.add(name)
+        return name
+
+    def add(self, name: str, viewmat: np.ndarray, loaded: LoadedImage) -> None:
+        """Append a view of an image at its final size; ``viewmat`` is camera_from_world [4, 4] in file units, rigid."""
+        height, width = loaded.image.shape[:2]
+        camera = Camera(viewmat, loaded.K, width, height, loaded.camera_model, loaded.distortion)
+        maps = {"depth": loaded.depth, "normals": loaded.normals}
+        self.views.append(View(name, camera, loaded.image, loaded.mask, alpha=loaded.alpha, **maps))
+        self._done.update(loaded.done)
+        if loaded.kept is not None:
+            self._kept[name] = loaded.kept
+
+    def notes(self, options: ReadOptions | None = None) -> list[str]:
+        """Return notes on changes to the pixels; with ``options`` also assumptions about masks."""
+        done = [f"{n} image{'s' if n != 1 else ''} {what}" for what, n in sorted(self._done.items())]
+        return done + ([] if options is None else self._mask_notes(options))
+
+    def _mask_notes(self, options: ReadOptions) -> list[str]:
+        cutout = options.masks == "cutout"
+        if not self._kept:
+            return ["--masks cutout changes nothing: no image has a mask file"] if cutout else []
+        mean = math.fsum(self._kept.values()) / len(self._kept)
+        notes = [
+            f"masks keep {mean:.1%} of the pixels, the {options.mask_keeps} ones (--mask-keeps {options.mask_keeps}); "
+            f"the others {'are transparent' if cutout else 'are ignored'} (--masks {options.masks})"
+        ]
+        for fraction, what in ((0.0, "keep no pixel"), (1.0, "keep every pixel")):
+            names = [n for n, kept in self._kept.items() if kept == fraction]
+            if names:
+                notes.append(f"masks that {what}: {', '.join(names[:5])}{' ...' if len(names) > 5 else ''} ({len(names)})")
+        return notes

@@ -1,0 +1,465 @@
+"""Maps beside the photographs: depth, normals and masks that the user gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from warpgs.errors import DataError, UsageError
+from warpgs.files import inside, open_input, unread_reason
+from warpgs.geometry import CENTRAL
+from warpgs.io.images import MAX_PIXELS, LoadedImage, decode_png, turn_upright, undistortion_maps
+from warpgs.scene import DEPTH_KINDS, GivenDepth, View
+
+SUFFIXES = (".png", ".npy")
+UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
+"""Suffixes of unsupported files that may hold maps, for a message."""
+NONE = "none"
+"""Value in place of a folder, to ignore maps."""
+CONFIDENCE = ".confidence"
+"""Ending of a confidence map's file name, before its suffix."""
+MILLIMETRES = 0.001
+"""Default length of a unit of integers: RGB-D cameras store depth in millimetres, with poses in metres."""
+MAX_DEPTH = 1e12
+"""Largest depth [file units]; maps with larger values are rejected."""
+AXES = ("opencv", "opengl")
+UNIT_TOLERANCE = 0.1
+"""Largest difference of a normal's length from 1; eight bits round by less than 0.01."""
+NO_NORMAL = 0.5
+"""Length below which a vector counts as missing, such as gray in an image of normals."""
+MAX_STRAY = 0.05
+"""Largest fraction of a map's normals that may have another length, or face away from the camera."""
+
+
+@dataclass(frozen=True)
+class MapOptions:
+    """Given maps of depth and normals, and the meaning of their numbers."""
+
+    depths: Path | None = None
+    """Folder of depth maps; None for the maps that the scene names, ``none`` to ignore these."""
+    normals: Path | None = None
+    """Folder of normal maps; None for the maps that the scene names, ``none`` to ignore these."""
+    depth_kind: str = "metric"
+    """Meaning of the depth maps, one of `DEPTH_KINDS`."""
+    depth_unit: float | None = None
+    """Length of one unit of a depth map in units of the cameras; None means 0.001 for integers and 1 for floats."""
+    normal_axes: str = "opencv"
+    """Axes of the normals: camera axes of OpenCV (y down, z forward) or OpenGL (y up, z back)."""
+
+    def __post_init__(self) -> None:
+        if self.depth_kind not in DEPTH_KINDS:
+            raise UsageError(f"--depth-kind must be one of {', '.join(DEPTH_KINDS)}, not {self.depth_kind!r}")
+        if self.normal_axes not in AXES:
+            raise UsageError(f"--normal-axes must be one of {', '.join(AXES)}, not {self.normal_axes!r}")
+        unit = self.depth_unit
+        if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
+            raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
+
+
+NO_MAPS = MapOptions()
+"""Options of a scene without maps."""
+
+
+class MapFolder:
+    """The maps of a folder, found by the names of images."""
+
+    def __init__(self, folder: Path, flag: str, allow_outside: bool):
+        """List a folder; links in it may point outside the folder only with ``allow_outside``.
+
+        Raises:
+            DataError: The folder is missing or holds no map, two files are for one image, or a link points outside.
+        """
+        self.folder, self.flag = folder, flag
+        if not folder.is_dir():
+            raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
+        self._files: dict[str, Path] = {}
+        others: set[str] = set()
+        for file in sorted(folder.rglob("*")):
+            suffix = file.suffix.lower()
+            if file.name[0] == "." or (suffix in SUFFIXES and not file.is_file()):
+                continue
+            if suffix in UNREAD:
+                others.add(suffix)
+            if suffix not in SUFFIXES:
+                continue
+            key = file.relative_to(folder).with_suffix("").as_posix()
+            if key in self._files:
+                raise DataError(f"{file}: {self._files[key].name} is for the same image; remove one of them")
+            self._files[key] = file if allow_outside else inside(file, folder, "the folder of maps")
+        if not any(not key.endswith(CONFIDENCE) for key in self._files):
+            found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "add"
+            raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
+        self.taken: set[str] = set()
+        """Keys of the maps that images requested."""
+
+    def find(self, image: Path) -> tuple[Path | None, Path | None]:
+        """Return the files of map and confidence of an image; None for a missing one.
+
+        A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match is used.
+        """
+        tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
+        for tail in tails:
+            for key in (tail.with_suffix("").as_posix(), tail.as_posix()):
+                if key in self._files and not key.endswith(CONFIDENCE):
+                    self.taken.add(key)
+                    return self._files[key], self._files.get(key + CONFIDENCE)
+        return None, None
+
+    def unmatched(self) -> DataError:
+        """Return the error for a folder in which no image found a map."""
+        names = [key for key in self._files if not key.endswith(CONFIDENCE)]
+        return DataError(
+            f"{self.folder}: none of its {len(names)} maps has the name of an image (the first is {names[0]!r}); name each "
+            f"map like its image, with .png or .npy, or give another {self.flag}"
+        )
+
+
+def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C].
+
+    Raises:
+        DataError: The file is missing, larger than ``max_pixels``, of another type or shape, or damaged.
+    """
+    if path.suffix.lower() == ".npy":
+        return _read_array(path, max_pixels)
+    return decode_png(path, max_pixels)
+
+
+def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+    try:
+        open_input(path).close()
+        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
+    except Exception as e:  # numpy raises a dozen types on malformed files
+        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); write it again") from e
+    if not isinstance(found, np.ndarray):
+        found.close()
+        raise DataError(f"{path}: is an archive of arrays, not one array [height, width]; save the map alone")
+    if found.dtype.kind not in "fu" or found.dtype.itemsize > 8:
+        raise DataError(f"{path}: its numbers are {found.dtype}; save float32, or uint16 in millimetres")
+    while found.ndim > 2 and found.shape[0] == 1:
+        found = found[0]
+    if found.ndim not in (2, 3) or 0 in found.shape or (found.ndim == 3 and found.shape[2] > 4):
+        raise DataError(f"{path}: must be an array [height, width] or [height, width, 3], not {list(found.shape)}")
+    if found.shape[0] * found.shape[1] > max_pixels:
+        raise DataError(
+            f"{path}: the map is {found.shape[1]} x {found.shape[0]} px, more than the limit of {max_pixels:,} pixels; shrink "
+            "it, or raise the limit with --max-pixels"
+        )
+    if found.dtype in (np.uint8, np.uint16):
+        return np.array(found)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(found, np.float32)
+
+
+def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
+    """Return the one channel of a map [H, W]; a gray map may be stored in three equal channels."""
+    if raw.ndim == 2:
+        return raw
+    if raw.shape[2] == 1 or (raw.shape[2] == 3 and (raw == raw[..., :1]).all()):
+        return raw[..., 0]
+    raise DataError(
+        f"{path}: is a colour image of {raw.shape[2]} channels, not a {what}; save the values as NPY or gray 16-bit PNG"
+    )
+
+
+def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values.
+
+    Raises:
+        DataError: The file is not a map, or its values cannot be depths.
+    """
+    raw = _gray(path, read_numbers(path, max_pixels), "depth map")
+    metric = options.depth_kind == "metric"
+    if raw.dtype == np.uint8 and metric:
+        raise DataError(
+            f"{path}: has 8 bits, too few for metric depth; save 16-bit PNG, or give --depth-kind relative or disparity"
+        )
+    values = raw.astype(np.float32)
+    finite = np.isfinite(values)
+    if not finite.any():
+        raise DataError(f"{path}: no depth is finite; write the map again, or remove the file")
+    values = np.where(finite, values, 0)
+    if (values < 0).any():
+        raise DataError(
+            f"{path}: {int((values < 0).sum()):,} depths are negative, down to {values.min():.4g}; depth must be positive "
+            f"along the camera's axis, or 0 for missing values"
+        )
+    if metric:
+        unit = options.depth_unit or (MILLIMETRES if raw.dtype.kind == "u" else 1.0)
+        with np.errstate(over="ignore"):
+            values = values * np.float32(unit)
+    if not values.any():
+        raise DataError(f"{path}: contains no depth, all values are 0 or not finite; remove the file: maps are optional")
+    if not values.max() < MAX_DEPTH:
+        raise DataError(f"{path}: depths go up to {values.max():.4g}, beyond {MAX_DEPTH:.0e}; use 0 for missing values")
+    return values
+
+
+def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
+
+    uint8 and uint16 maps are divided by 2 if they hold only the levels 0, 1 and 2, else by the largest value of their type.
+
+    Raises:
+        DataError: The file is not a map, of another shape, or not in [0, 1].
+    """
+    raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
+    if raw.shape != shape:
+        raise DataError(
+            f"{path}: is {raw.shape[1]} x {raw.shape[0]} px, its depth map {shape[1]} x {shape[0]}; make both equal in size"
+        )
+    values = raw.astype(np.float32)
+    if raw.dtype.kind == "u":
+        largest = int(raw.max())
+        values /= 2 if 0 < largest <= 2 else np.iinfo(raw.dtype).max
+    if not ((values >= 0) & (values <= 1)).all():
+        raise DataError(f"{path}: confidence must be in [0, 1], but ranges from {values.min():.4g} to {values.max():.4g}")
+    return values
+
+
+def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
+
+    Raises:
+        DataError: The file is not a map of normals, contains none, or too many of its vectors have another length than 1.
+    """
+    raw = read_numbers(path, max_pixels)
+    if raw.ndim != 3 or raw.shape[2] != 3:
+        shape = " x ".join(map(str, raw.shape))
+        raise DataError(f"{path}: is {shape}, normals need three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
+    black = (raw == 0).all(-1)
+    values = raw.astype(np.float32)
+    if raw.dtype.kind == "u":
+        values = values * np.float32(2 / np.iinfo(raw.dtype).max) - 1
+    usable = np.isfinite(values).all(-1) & ~black
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(np.where(usable[..., None], values, 0), axis=-1)
+    known = usable & (lengths >= NO_NORMAL)
+    if not known.any():
+        raise DataError(f"{path}: contains no normals; remove the file: normals are optional")
+    stray = float((~(np.abs(lengths[known] - 1) <= UNIT_TOLERANCE)).mean())
+    if not stray <= MAX_STRAY:
+        raise DataError(
+            f"{path}: {stray:.0%} of its vectors are not unit normals (median length {float(np.median(lengths[known])):.3g}); "
+            "save PNG as (n + 1) / 2, or NPY with unit vectors"
+        )
+    known &= np.abs(lengths - 1) <= UNIT_TOLERANCE
+    normals = np.where(known[..., None], values / np.where(known, lengths, 1)[..., None], 0).astype(np.float32)
+    if options.normal_axes == "opengl":
+        normals = normals * np.array([1, -1, -1], np.float32)
+    return normals
+
+
+SAME_SURFACE = 0.05
+"""Largest relative difference between neighbours that are taken for one surface when a map is enlarged."""
+
+
+def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return a map [H, W] or [H, W, C] at another size; 0 marks missing values.
+
+    In a reduced map, a pixel takes the known value nearest to its centre, which keeps sparse depths. An enlarged map is
+    interpolated between known neighbours on one surface; elsewhere a pixel takes the nearest value.
+    """
+    import cv2
+
+    rows, columns = values.shape[:2]
+    if (rows, columns) == (height, width):
+        return values
+    if height * width >= rows * columns:
+        nearest = cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST)
+        known = (values != 0) if values.ndim == 2 else (values != 0).any(-1)
+        between = cv2.resize(values, (width, height), interpolation=cv2.INTER_LINEAR)
+        whole = cv2.resize(known.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 1 - 1e-6
+        off = np.abs(between - nearest)
+        off, size = (off, np.abs(nearest)) if values.ndim == 2 else (off.max(-1), np.ones((height, width), np.float32))
+        smooth = whole & (off <= SAME_SURFACE * size)
+        return np.where(smooth if values.ndim == 2 else smooth[..., None], between, nearest)
+    at = np.nonzero(values if values.ndim == 2 else values.any(-1))
+    row, column = (np.asarray((i + 0.5) * new / old) for i, new, old in zip(at, (height, width), (rows, columns)))
+    i, j = np.minimum(row.astype(int), height - 1), np.minimum(column.astype(int), width - 1)
+    order = np.argsort(-((row - i - 0.5) ** 2 + (column - j - 0.5) ** 2), kind="stable")  # the nearest is written last
+    found = np.zeros((height, width, *values.shape[2:]), values.dtype)
+    found[i[order], j[order]] = values[at[0][order], at[1][order]]
+    return found
+
+
+def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndarray:
+    """Rotate, undistort and resize a map like its image; the result has shape [h, w] or [h, w, C] of the image's final size.
+
+    Args:
+        loaded: The image at its final size.
+        values: The map, upright or oriented like the stored image, at the image's size or another size of the same aspect,
+            shape [H, W] or [H, W, C].
+        path: File of the map, for errors.
+
+    Raises:
+        DataError: The aspects differ, or the map holds vectors and the image was rotated.
+    """
+    import cv2
+
+    height, width = loaded.full_size
+    rows, columns = values.shape[:2]
+    if loaded.orientation in (5, 6, 7, 8) and _same_aspect(values.shape, (width, height)):
+        if values.ndim == 3:
+            raise DataError(
+                f"{path}: its image is rotated by an EXIF tag, and normals are not rotated with it; save both upright"
+            )
+        values = turn_upright(values, loaded.orientation)
+    elif not _same_aspect(values.shape, (height, width)):
+        raise DataError(
+            f"{path}: the map is {columns} x {rows} px, its image {width} x {height}: the aspects differ. Give a map of the "
+            "whole image"
+        )
+    final = loaded.image.shape[:2]
+    if loaded.undone is not None:
+        values = resized(values, width, height)
+        K = np.diag([width / final[1], height / final[0], 1.0]) @ loaded.K
+        columns_of, rows_of = undistortion_maps(K, loaded.undone, width, height)
+        values = cv2.remap(values, columns_of, rows_of, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    values = resized(values, final[1], final[0])
+    if loaded.mask is not None:
+        values = np.where(loaded.mask if values.ndim == 2 else loaded.mask[..., None], values, 0)
+    return np.ascontiguousarray(values, np.float32)
+
+
+def _same_aspect(shape: tuple[int, ...], size: tuple[int, int]) -> bool:
+    """Return True where a raster has the aspect of a size (height, width), within a pixel of the smaller one."""
+    return abs(shape[1] * size[0] - shape[0] * size[1]) <= max(*size, *shape[:2])
+
+
+DEPTHS, NORMALS = "--depths", "--normals"
+
+
+@dataclass(frozen=True)
+class NamedMaps:
+    """Maps that the files of a scene name for an image."""
+
+    depth: Path | None = None
+    """Depth map."""
+    normals: Path | None = None
+    """Normal map."""
+    unit: float | None = None
+    """Length of one unit of the depth map in units of the cameras, if the scene specifies it."""
+
+
+NOTHING_NAMED = NamedMaps()
+"""No maps."""
+
+
+class GivenMaps:
+    """Depth and normal maps of a scene, from the folders that the user names or the files that the scene names."""
+
+    def __init__(self, options: MapOptions, max_pixels: int, allow_outside: bool):
+        """List the files of the folders in ``options``.
+
+        Raises:
+            DataError: A folder is missing, or holds no map.
+        """
+        self.options, self.max_pixels = options, max_pixels
+
+        def folder(path: Path | None, flag: str) -> MapFolder | None:
+            return MapFolder(path, flag, allow_outside) if path is not None and str(path) != NONE else None
+
+        self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
+
+    def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
+        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene.
+
+        Raises:
+            DataError: A map cannot be read, does not fit its image, or its values cannot be depths or normals.
+            UsageError: The camera model of the image does not support the map.
+        """
+        depth, confidence, options = named.depth, None, self.options
+        if options.depths is not None:
+            depth, confidence = self.depths.find(image) if self.depths is not None else (None, None)
+        elif depth is not None and options.depth_unit is None:
+            options = replace(options, depth_unit=named.unit)
+        normals = named.normals
+        if options.normals is not None:
+            normals = self.normals.find(image)[0] if self.normals is not None else None
+        if depth is not None:
+            loaded = replace(loaded, depth=self._depth(loaded, depth, confidence, options))
+        return loaded if normals is None else replace(loaded, normals=self._normals(loaded, normals))
+
+    def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: MapOptions) -> GivenDepth:
+        if loaded.camera_model not in CENTRAL or loaded.camera_model == "fisheye":
+            raise UsageError(
+                f"{path}: depth is not supported for the camera model {loaded.camera_model}; leave out --lenses "
+                f"native, or the map ({DEPTHS} none)"
+            )
+        stored = read_depth(path, options, self.max_pixels)
+        values, sure = in_pixels_of(loaded, stored, path), None
+        if confidence is not None:
+            known = read_confidence(confidence, stored.shape, self.max_pixels)
+            sure = in_pixels_of(loaded, np.where(stored > 0, known, 0), confidence)
+            values = np.where(sure > 0, values, 0)
+        if not values.any():
+            raise DataError(
+                f"{path}: no pixel has a depth after mask, confidence and --downscale; remove the file: depth maps are optional"
+            )
+        return GivenDepth(values, options.depth_kind, sure)
+
+    def _normals(self, loaded: LoadedImage, path: Path) -> np.ndarray:
+        if loaded.camera_model != "pinhole":
+            raise UsageError(
+                f"{path}: normals need pinholes, not the camera model {loaded.camera_model}; leave out --lenses native, or the "
+                f"map ({NORMALS} none)"
+            )
+        normals = in_pixels_of(loaded, read_normals(path, self.options, self.max_pixels), path)
+        size = np.linalg.norm(normals, axis=-1, keepdims=True)
+        normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0.5)
+        height, width = normals.shape[:2]
+        K = loaded.K
+        x, y = np.meshgrid((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0], (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])
+        along = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2]
+        known = normals.any(-1)
+        away = float((along[known] > 0).mean()) if known.any() else 1.0
+        if not known.any():
+            raise DataError(f"{path}: no pixel inside the mask has a normal; remove the file: normals are optional")
+        if away > 0.5:
+            other = "opencv" if self.options.normal_axes == "opengl" else "opengl"
+            raise DataError(
+                f"{path}: {away:.0%} of its normals face away from the camera in {self.options.normal_axes} axes; give "
+                f"--normal-axes {other}, or turn them towards the camera"
+            )
+        return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
+
+
+def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool) -> list[str]:
+    """Return notes on the maps of a scene's views.
+
+    Raises:
+        DataError: A folder is given, but no view has a map in it.
+    """
+    notes = []
+    flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
+    for name, (path, flag) in flags.items():
+        having = [v for v in views if getattr(v, name) is not None]
+        if path is not None and str(path) != NONE and not having:
+            raise MapFolder(path, flag, allow_outside).unmatched()
+        if not having:
+            continue
+        where = f"from {path}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
+        what = "normals" if name == "normals" else "depth maps"
+        notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)}, {where}")
+    return notes
+
+
+def _about(name: str, views: Sequence[View], options: MapOptions) -> str:
+    """Return a description of the values of the maps, for a note."""
+    if name == "normals":
+        return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"
+    share = float(np.mean([(v.depth.values > 0).mean() for v in views if v.depth is not None]))
+    unit = "a unit is 0.001 for integers, else 1" if options.depth_unit is None else f"a unit is {options.depth_unit:g}"
+    words = {
+        "metric": f"metric ({unit}; change it with --depth-unit)", "relative": "depth of unknown scale and shift",
+        "disparity": "inverse depth of unknown scale and shift",
+    }  # fmt: skip
+    return f"{share:.1%} of their pixels, {words[options.depth_kind]}"

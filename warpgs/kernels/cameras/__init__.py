@@ -1,1 +1,0 @@
-"""Camera models, one file each; `base` defines their interface."""

@@ -1,0 +1,772 @@
+"""Torch and Warp side by side: tensors as arrays, launches, memory for kernels, derivatives."""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import ctypes
+import functools
+import math
+import os
+import threading
+from collections.abc import Callable, Sequence
+from queue import SimpleQueue
+from typing import Any, NamedTuple
+
+import torch
+import warp as wp
+from torch._subclasses.fake_tensor import FakeTensor
+
+from warpgs.device import prepare_kernel_cache
+from warpgs.errors import ResourceError, UsageError
+from warpgs.kernels.native import load_module, source
+from warpgs.openmp import warn_if_spinning
+from warpgs.process import hidden_stderr
+
+wp.config.log_level = wp.LOG_WARNING  # its banner and compile notes are not for users
+
+
+@contextlib.contextmanager
+def _without_driver_notice():
+    """Hide the warning that Warp's native code prints where there is no CUDA driver."""
+    with contextlib.nullcontext() if torch.cuda.is_available() else hidden_stderr():
+        yield
+
+
+prepare_kernel_cache()
+with _without_driver_notice():
+    wp.init()  # device_from_torch fails before this
+
+REALS = {torch.float32: wp.float32, torch.float64: wp.float64}
+"""Warp's scalar type by torch's."""
+
+CHUNKS_PER_THREAD = 8
+"""Ranges per thread of a CPU launch: several, so that a few heavy tiles do not hold up the rest."""
+
+FEW_THREADS = 4
+"""Number of threads above which each gets half as many ranges: Python hands out ranges one at a time."""
+
+SERIAL_WORK = 20_000
+"""Work (items times cost) below which a launch stays on the calling thread: a hand-over costs 50 us. A range has at least half
+as much work, unless there would be fewer ranges than threads."""
+
+MAX_SIZE = 2**31 - 1
+"""Largest number of entries of an axis, and of items of a launch: Warp indexes them with signed 32-bit integers."""
+
+
+def _check_size(size: int) -> None:
+    """Raise ResourceError where kernels cannot index so many entries."""
+    if size > MAX_SIZE:
+        raise ResourceError(
+            f"an array of {size:,} entries is beyond the {MAX_SIZE:,} that kernels can index; use fewer Gaussians or "
+            "coefficients, smaller images, or fewer cameras at once"
+        )
+
+
+def check_device(name: str, tensor: torch.Tensor) -> None:
+    """Raise ValueError unless kernels can read the memory of a tensor [...]: on a CPU or a CUDA device, and allocated."""
+    if not (tensor.is_cpu or tensor.is_cuda):
+        raise ValueError(f"{name} is on {tensor.device}, but the kernels run on cpu and cuda only; .to('cpu') moves it")
+    if type(tensor) is not torch.Tensor and isinstance(tensor, FakeTensor):
+        raise ValueError(f"{name} is a fake tensor, without memory; leave FakeTensorMode before the call")
+
+
+def real_of(tensor: torch.Tensor) -> type:
+    """Return the Warp scalar type of a tensor, float32 or float64.
+
+    Raises:
+        TypeError: The tensor has another type.
+    """
+    if tensor.dtype not in REALS:
+        raise TypeError(f"kernels take float32 or float64 tensors, not {tensor.dtype}")
+    return REALS[tensor.dtype]
+
+
+def set_threads(count: int) -> None:
+    """Set the number of threads of CPU launches, at least 1. This sets torch's own number of threads, so both agree."""
+    torch.set_num_threads(count)
+
+
+class _Pool:
+    """Threads that make the calls of a queue.
+
+    The locks of `concurrent.futures` and of `threading.Thread.start` can stay locked after an interrupt; the queue's cannot.
+    """
+
+    def __init__(self, count: int):
+        self.calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        for _ in range(count):
+            _thread.start_new_thread(self._serve, ())
+
+    def submit(self, call: Callable[[], None]) -> None:
+        """Let the next free thread make a call, which must not raise."""
+        self.calls.put(call)
+
+    def _serve(self) -> None:
+        while True:
+            self.calls.get()()
+
+
+@functools.cache
+def _pool(count: int, process: int) -> _Pool:
+    return _Pool(count)
+
+
+class View(NamedTuple):
+    """A tensor as a kernel argument: its memory, read as elements of a Warp type."""
+
+    tensor: torch.Tensor
+    dtype: object
+    axes: int | None = None
+    """1 for a flat array, 2 for rows of the last axis, 0 for a flat array with the gaps between rows, None for the axes of the
+    tensor."""
+
+    def shape(self) -> tuple[int, ...]:
+        """Return the sizes of the axes that a kernel sees, followed by the shape of an element."""
+        if self.axes is None:
+            return tuple(self.tensor.shape)
+        if self.axes == 0:
+            last = sum((n - 1) * step for n, step in zip(self.tensor.shape, self.tensor.stride()))
+            return (last + 1 if self.tensor.numel() else 0,)
+        count, width = self.tensor.numel(), self.tensor.shape[-1]
+        return (count,) if self.axes == 1 else (count // max(width, 1), width)
+
+    def array(self) -> wp.array:
+        """Return the tensor's memory as a Warp array of the shape [...], without a copy and without gradient."""
+        tensor = self.tensor.detach()
+        if self.axes is not None:
+            tensor = tensor.view(self.shape()) if self.axes else tensor.as_strided(self.shape(), (1,))
+        for size in tensor.shape:
+            _check_size(size)
+        return wp.from_torch(tensor, dtype=self.dtype, requires_grad=False)
+
+    def row_stride(self) -> int:
+        """Return the number of entries from one row of the last axis to the next."""
+        tensor = self.tensor
+        for axis in range(-2, -tensor.ndim - 1, -1):
+            if tensor.shape[axis] > 1:  # the stride of an axis of one entry may be any number
+                return tensor.stride(axis)
+        return tensor.shape[-1]
+
+
+def view(tensor: torch.Tensor, dtype) -> View:
+    """Return a contiguous tensor of any shape as a kernel argument with elements of Warp type ``dtype``."""
+    return View(tensor, dtype)
+
+
+def flat(tensor: torch.Tensor, dtype) -> View:
+    """Return a contiguous tensor of any shape [...] as an argument of one axis, without the cost of ``tensor.view(-1)``."""
+    return View(tensor, dtype, 1)
+
+
+def rows(tensor: torch.Tensor, dtype) -> View:
+    """Return a tensor [..., K] as an argument of two axes. Each row must be contiguous, and all rows the same stride apart."""
+    return View(tensor, dtype, 2)
+
+
+def span(tensor: torch.Tensor, dtype) -> View:
+    """Return a tensor [..., K] as an argument of one axis, from the first to the last entry, gaps between rows included.
+
+    Each row must be contiguous; `View.row_stride` is the distance from one row to the next.
+    """
+    return View(tensor, dtype, 0)
+
+
+def warp_device(device: torch.device) -> wp.Device:
+    """Return Warp's object for a torch device, also for a CUDA device without a number."""
+    if device.type == "cuda" and device.index is None:
+        device = torch.device("cuda", torch.cuda.current_device())
+    return wp.device_from_torch(device)
+
+
+@functools.cache
+def _several_devices() -> bool:
+    return torch.cuda.device_count() > 1
+
+
+def _current(device: torch.device):
+    """Return a context in which a CUDA device is current; afterwards the caller's device is current again.
+
+    Warp makes a device current when it works there, and does not restore the previous device; torch then uses Warp's device.
+    """
+    return torch.cuda.device(device) if _several_devices() else contextlib.nullcontext()
+
+
+@functools.cache
+def _warp_stream(device: torch.device, pointer: int) -> wp.Stream:
+    with _current(device):
+        return wp.Stream(warp_device(device), cuda_stream=pointer)
+
+
+def warp_stream(device: torch.device) -> wp.Stream:
+    """Return torch's current stream of a CUDA device as Warp's object."""
+    # torch.cuda.current_stream creates a Python object each time and is ten times slower
+    index = torch.cuda.current_device() if device.index is None else device.index
+    return _warp_stream(device, torch._C._cuda_getCurrentRawStream(index))
+
+
+def _is_struct(value) -> bool:
+    """Return whether a kernel argument is an instance of a Warp struct."""
+    return hasattr(value, "__ctype__") and not isinstance(value, wp.array)
+
+
+_LOADING = threading.Lock()
+"""Lock held while a CPU module is loaded, since several threads must not compile at once. In debug mode it is also held while a
+kernel runs, since kernels of that mode are not thread-safe."""
+_SORTING = threading.RLock()
+"""Lock held by a thread while it sorts: Warp has one stream for all threads of a device."""
+
+
+@contextlib.contextmanager
+def stream_of(device: torch.device):
+    """Run Warp's own work (sorts, scans) on torch's current stream of that device; do nothing on a CPU.
+
+    Kernels started with `launch` need no such context.
+    """
+    if device.type != "cuda":
+        yield
+        return
+    wanted, where = warp_stream(device), warp_device(device)
+    with _SORTING, _current(device):
+        before = where.stream
+        where.set_stream(wanted, sync=False)
+        try:
+            yield
+        finally:
+            where.set_stream(before, sync=False)
+
+
+def _copied(struct):
+    """Return another instance of a Warp struct with the same numbers."""
+    packed = struct.__ctype__()
+    return type(struct)(type(packed).from_buffer_copy(packed))
+
+
+class _Recorded:
+    """A kernel with a launch that is recorded once; later calls only replace its arguments.
+
+    ``wp.launch`` packs and checks every argument anew. That took 47 us on an H200's host and 140 us on a CPU of 2.6 GHz. The
+    recorded launch keeps the packed arguments; a call writes pointers, sizes and scalars into them.
+    """
+
+    def __init__(self, kernel, device: torch.device, block_dim: int):
+        self.kernel, self.device, self.block_dim = kernel, warp_device(device), block_dim
+        self.command, self.known, self.dtypes = None, [], []
+        self.lock = threading.Lock()  # autograd launches from a thread of its own
+
+    def launch(self, count: int, inputs: Sequence, stream: wp.Stream) -> None:
+        with self.lock:
+            self.patched(count, inputs).launch(stream)
+
+    def patched(self, count: int, inputs: Sequence) -> wp.Launch:
+        """Return the recorded launch with these arguments; the first call records it."""
+        if self.command is None:
+            load_module(self.kernel.module, self.device, self.block_dim)
+            self.dtypes = [a.tensor.dtype if isinstance(a, View) else None for a in inputs]
+            for i, a in enumerate(inputs):
+                if isinstance(a, View):
+                    self._check(i, a.tensor)
+            own = [a.array() if isinstance(a, View) else _copied(a) if _is_struct(a) else a for a in inputs]
+            where = {"device": self.device, "block_dim": self.block_dim}
+            command = wp.launch(self.kernel, count, inputs=[0, *own], record_cmd=True, **where)
+            command.fwd_args = None  # else the first call's arrays would stay in memory
+            self.known = [None] * len(inputs)
+            self.command = command  # set last: after an interrupt there is no launch
+        else:
+            self._patch(count, inputs)
+        return self.command
+
+    def _patch(self, count: int, inputs: Sequence) -> None:
+        command, known = self.command, self.known
+        if command.bounds.size != count:
+            command.set_dim(count)
+        for i, value in enumerate(inputs):
+            # In a loop most arguments are those of the call before, memory addresses included.
+            if type(value) is View:
+                tensor = value.tensor
+                address, shape, dtype, before = tensor.data_ptr(), tensor.shape, tensor.dtype, known[i]
+                strided = value.axes in (0, 2) and value.row_stride()  # others are contiguous
+                if (
+                    before is not None
+                    and before[0] == address
+                    and before[1] == shape
+                    and before[2] == strided
+                    and before[3] is dtype
+                ):
+                    continue
+                self._check(i, tensor)
+                packed = command.params[i + 2]  # after the bounds and ``begin``
+                seen = value.shape()
+                for size in seen[: packed.ndim]:
+                    _check_size(size)  # it would wrap around
+                known[i] = None  # an interrupt here must leave no half-written entry
+                packed.data = address
+                for axis in range(packed.ndim):
+                    packed.shape[axis] = seen[axis]
+                if packed.ndim == 2:
+                    packed.strides[0] = (strided or tensor.stride(0)) * tensor.element_size()
+                known[i] = (address, shape, strided, dtype)
+            elif known[i] != value:
+                if _is_struct(value):
+                    ctypes.pointer(command.params[i + 2])[0] = value.__ctype__()  # copies its numbers
+                elif isinstance(value, (int, float)):
+                    command.params[i + 2].value = value
+                else:  # vectors and matrices
+                    command.set_param_at_index(i + 1, value)
+                known[i] = value
+
+    def _check(self, i: int, tensor: torch.Tensor) -> None:
+        """Raise TypeError unless argument i, a tensor [...], has the recorded scalar type, and memory on the device."""
+        kind, dtype = "cuda" if self.device.is_cuda else "cpu", tensor.dtype
+        if dtype is self.dtypes[i] and tensor.device.type == kind and (tensor.data_ptr() or not tensor.numel()):
+            return
+        label = self.kernel.adj.args[i + 1].label  # after ``begin``
+        fake = isinstance(tensor, FakeTensor)
+        found = "a FakeTensor without memory" if fake else f"{dtype} on {tensor.device}"
+        raise TypeError(f"{self.kernel.key}: {label} must be {self.dtypes[i]} on {kind}, not {found}")
+
+
+@functools.cache
+def _recorded(kernel, device: torch.device, block_dim: int) -> _Recorded:
+    return _Recorded(kernel, device, block_dim)
+
+
+class _OfThread(threading.local):
+    """Recorded launches on the CPU by thread and kernel: two threads may launch a kernel at once, with different arguments."""
+
+    def __init__(self):
+        self.recorded: dict[object, _Recorded] = {}
+        self.shared: _SharedLaunch | None = None  # the last launch, if an interrupt may have left threads at work
+
+
+_OF_THREAD = _OfThread()
+
+
+class _SharedLaunch:
+    """A recorded CPU launch whose ranges several threads process.
+
+    The threads work in raw memory of the caller, so `run` leaves none at work, on whatever way it ends. A thread that starts
+    after the end finds ``open`` False and touches nothing.
+    """
+
+    def __init__(self, kernel, recorded: wp.Launch, count: int, chunks: int, inputs: Sequence):
+        self.kernel, self.recorded, self.count, self.chunks = kernel, recorded, count, chunks
+        self.inputs = inputs  # keeps their memory
+        self.left = iter(range(chunks))  # each thread processes the next range after finishing one
+        self.open, self.ended, self.working, self.error = True, False, 0, None
+        # Only `with` statements of raw locks are safe from interrupts: Condition and Event may stay locked.
+        self.lock = threading.Lock()
+        self.busy = threading.Lock()  # held while other threads work
+
+    def run(self, pool: _Pool, helpers: int) -> None:
+        """Process all ranges on this thread and at most ``helpers`` others."""
+        try:
+            for _ in range(helpers):
+                pool.submit(self.help)
+            self.work()  # here, too: each hand-over costs processor time
+        finally:
+            interrupt = None
+            while not self.ended:
+                try:  # around the call, since an interrupt may come before its first line
+                    self.finish()
+                except BaseException as error:  # a second Ctrl-C
+                    interrupt = error
+            if interrupt is not None:
+                raise interrupt
+        if self.error is not None:
+            raise self.error
+
+    def help(self) -> None:
+        """Process ranges on another thread, unless the launch has ended."""
+        with self.lock:
+            if not self.open:
+                return
+            self.working += 1
+            if self.working == 1:
+                self.busy.acquire()
+        try:
+            self.work()
+        except BaseException as error:
+            self.error = error
+        finally:
+            with self.lock:
+                self.working -= 1
+                if self.working == 0:
+                    self.busy.release()
+
+    def work(self) -> None:
+        """Process ranges until none is left."""
+        first, count, chunks = self.recorded, self.count, self.chunks
+        # a recorded launch of its own for each thread, which shares the packed arrays
+        bounds, begin = type(first.bounds)((count,)), type(first.params[1])(0)
+        params = [bounds, begin, *first.params[2:]]
+        command = wp.Launch(self.kernel, first.device, hooks=first.hooks, params=params, bounds=bounds)
+        for i in self.left:
+            begin.value, end = count * i // chunks, count * (i + 1) // chunks
+            bounds.shape[0] = bounds.size = end - begin.value
+            command.launch()
+
+    def finish(self) -> None:
+        """Let no thread begin another range, and wait for those at work."""
+        for _ in self.left:  # some are left after an error or an interrupt
+            pass
+        with self.lock:
+            self.open = False
+        with self.busy:
+            self.ended = True
+
+
+def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: int = 1, block_dim: int = 256) -> None:
+    """Launch ``kernel`` over ``count`` independent items; the kernel's first argument is the number of the first item.
+
+    On a CPU, as many threads as torch uses share the items; results are repeatable, since each item has its own output memory.
+
+    Args:
+        kernel: Warp kernel whose item number is ``begin + wp.tid()``.
+        count: Number of items.
+        inputs: Arguments after ``begin``.
+        device: Device of the arrays.
+        cost: Rough work of an item in units of 10 ns, which decides whether threads pay.
+        block_dim: CUDA threads per block.
+
+    Raises:
+        ResourceError: There are more items, or entries along an axis, than 32-bit integers can index.
+    """
+    if count == 0:
+        return
+    _check_size(count)
+    if device.type == "cuda":
+        with _current(device):
+            _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
+        return
+    if device.type != "cpu":
+        raise ValueError(f"{kernel.key}: the kernels run on cpu and cuda only, not on {device}")
+    if _OF_THREAD.shared is not None:
+        _OF_THREAD.shared.finish()
+        _OF_THREAD.shared = None
+    # A kernel of Warp 1.19 for x86 keeps a pointer into its stack in a static variable, which only optimised code leaves out.
+    if wp.config.mode == "debug":
+        with _LOADING:
+            arrays = [a.array() if isinstance(a, View) else a for a in inputs]
+            load_module(kernel.module, warp_device(device), 1)
+            wp.launch(kernel, count, inputs=[0, *arrays], device="cpu", record_tape=False)
+        return
+    recorded = _OF_THREAD.recorded.get(kernel)
+    if recorded is None:
+        with _LOADING:  # launches on a CPU are compiled for blocks of one thread
+            recorded = _Recorded(kernel, device, 1)
+            first = recorded.patched(count, inputs)
+        _OF_THREAD.recorded[kernel] = recorded  # only now: a launch that failed has no command
+    else:
+        first = recorded.patched(count, inputs)
+    threads = torch.get_num_threads()
+    if threads == 1 or count == 1 or count * cost < SERIAL_WORK:
+        first.launch()
+        return
+    warn_if_spinning()
+    each = CHUNKS_PER_THREAD if threads <= FEW_THREADS else CHUNKS_PER_THREAD // 2
+    chunks = min(count, threads * each, max(threads, 2 * count * cost // SERIAL_WORK))
+    _OF_THREAD.shared = _SharedLaunch(kernel, first, count, chunks, inputs)
+    _OF_THREAD.shared.run(_pool(threads - 1, os.getpid()), min(threads, chunks) - 1)
+    _OF_THREAD.shared = None
+
+
+@functools.cache
+def _symbols(pattern: str) -> tuple[str | int, ...]:
+    return tuple(int(symbol) if symbol.isdigit() else symbol for symbol in pattern.split())
+
+
+def check(**tensors: tuple[torch.Tensor, str]) -> dict[str, int]:
+    """Check shapes, scalar types and devices of named tensors against patterns such as ``means=(means, "N 3")``.
+
+    A capital letter is a size that must agree wherever it occurs.
+
+    Returns:
+        The sizes by letter.
+
+    Raises:
+        TypeError: An argument is not a tensor or is sparse, a scalar type is neither float32 nor float64, or types differ.
+        ValueError: A shape or a device is wrong; the message names the argument and both values, expected and found.
+    """
+    sizes: dict[str, int] = {}
+    first_name, first = "", None
+    for name, (tensor, pattern) in tensors.items():
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name} must be a torch tensor, not {type(tensor).__name__}")
+        if tensor.layout != torch.strided:
+            raise TypeError(f"{name} must be dense, not {tensor.layout}; {name}.to_dense() converts it")
+        if first is None:
+            first_name, first = name, tensor
+            check_device(name, tensor)
+            if tensor.dtype not in REALS:
+                raise TypeError(f"{name} must be float32 or float64, not {tensor.dtype}; {name}.float() converts it")
+        if tensor.dtype != first.dtype:
+            raise TypeError(f"{name} is {tensor.dtype} but {first_name} is {first.dtype}; give both the same type")
+        if tensor.device != first.device:
+            raise ValueError(f"{name} is on {tensor.device} but {first_name} is on {first.device}; move one of them")
+        wanted, found = _symbols(pattern), tensor.shape
+        fits = len(wanted) == len(found)
+        for symbol, size in zip(wanted, found):
+            expected = symbol if type(symbol) is int else sizes.setdefault(symbol, size)
+            fits = fits and expected == size
+        if not fits:
+            known = ", ".join(f"{k}={v}" for k, v in sizes.items())
+            raise ValueError(f"{name} must have shape [{', '.join(map(str, wanted))}] ({known}), not {list(found)}")
+    return sizes
+
+
+# Allocators, which group a function's tensors by lifetime, so that captured kernels find them at the same addresses.
+#
+# For tensors that are at another address each time, `fetch` reads the address when the kernel runs.
+
+ALIGNMENT = 256
+"""Alignment of the parts of a block [bytes]: enough for sorts and 16-byte loads, and whole cache lines."""
+
+
+class Allocator:
+    """Provider of a function's tensors; this class allocates each with torch."""
+
+    def output(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that the caller may keep."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    def saved(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that the backward pass needs."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    def workspace(self, shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> torch.Tensor:
+        """Return a new tensor of a shape [...] that is needed only until the function returns."""
+        return torch.empty(shape, dtype=dtype, device=device)
+
+
+TORCH = Allocator()
+"""The allocator of torch."""
+
+
+def _bytes(shape: tuple[int, ...], dtype: torch.dtype) -> int:
+    """Return the aligned size of a tensor [bytes]."""
+    return -(-math.prod(shape) * dtype.itemsize // ALIGNMENT) * ALIGNMENT
+
+
+class SizingAllocator(Allocator):
+    """An allocator of torch that records the requested sizes."""
+
+    def __init__(self):
+        self.outputs: list[tuple[torch.Tensor, tuple[int, ...]]] = []
+        """For each output tensor, an empty tensor of its type and device, and its shape."""
+        self.saved_bytes = self.workspace_bytes = 0
+        """Sizes of all saved tensors, and of all workspace, with alignment."""
+
+    def output(self, shape, dtype, device):
+        """Return a new tensor of a shape [...], and note its shape."""
+        tensor = super().output(shape, dtype, device)
+        self.outputs.append((tensor.new_empty(0), tuple(shape)))
+        return tensor
+
+    def saved(self, shape, dtype, device):
+        """Return a new tensor of a shape [...], and add its size to `saved_bytes`."""
+        self.saved_bytes += _bytes(shape, dtype)
+        return super().saved(shape, dtype, device)
+
+    def workspace(self, shape, dtype, device):
+        """Return a new tensor of a shape [...], and add its size to `workspace_bytes`."""
+        self.workspace_bytes += _bytes(shape, dtype)
+        return super().workspace(shape, dtype, device)
+
+
+class Arena(Allocator):
+    """An allocator of the tensors that a function requested before: outputs one by one, the others as parts of two blocks."""
+
+    def __init__(self, sizes: SizingAllocator, byte: torch.Tensor, workspace: torch.Tensor | None = None):
+        """Ask torch for all of the memory.
+
+        Args:
+            sizes: Allocator that the function ran with before.
+            byte: Any tensor of bytes on the device. (`new_empty` takes half the time of `torch.empty`.)
+            workspace: A block that is not in use; None to allocate one.
+        """
+        self.outputs = [kind.new_empty(shape) for kind, shape in sizes.outputs]
+        """Output tensors, in the order in which the function asks for them."""
+        self.block = byte.new_empty(sizes.saved_bytes) if sizes.saved_bytes else None
+        """Block of the saved tensors, or None."""
+        self._workspace = byte.new_empty(sizes.workspace_bytes) if workspace is None else workspace
+        self.begin()
+
+    def begin(self) -> None:
+        """Start again: the next requests get the same tensors, from the first on."""
+        self._asked = self._saved_to = self._workspace_to = 0
+
+    def addresses(self) -> tuple[int, ...]:
+        """Return the addresses of all memory that is handed out."""
+        block = 0 if self.block is None else self.block.data_ptr()
+        return *[t.data_ptr() for t in self.outputs], block, self._workspace.data_ptr()
+
+    def place(self, tensor: torch.Tensor) -> tuple[int, tuple[int, ...], torch.dtype]:
+        """Return the place of a saved tensor [...], as the arguments of `part` that follow the block."""
+        begin = tensor.data_ptr() - self.block.data_ptr() if tensor.numel() else 0  # an empty tensor has no address
+        return begin, tuple(tensor.shape), tensor.dtype
+
+    def output(self, shape, dtype, device):
+        """Return the next of the output tensors, of the given shape [...]."""
+        tensor = self.outputs[self._asked]
+        self._asked += 1
+        return tensor
+
+    def saved(self, shape, dtype, device):
+        """Return the next part of the block, as a tensor of a shape [...]."""
+        begin, self._saved_to = self._saved_to, self._saved_to + _bytes(shape, dtype)
+        return part(self.block, begin, shape, dtype)
+
+    def workspace(self, shape, dtype, device):
+        """Return the next part of the workspace, as a tensor of a shape [...]."""
+        begin, self._workspace_to = self._workspace_to, self._workspace_to + _bytes(shape, dtype)
+        return part(self._workspace, begin, shape, dtype)
+
+
+def part(block: torch.Tensor, begin: int, shape: tuple[int, ...], dtype: torch.dtype) -> torch.Tensor:
+    """Return a part of a block of bytes [B], from byte ``begin`` on, as a tensor of ``shape`` [...]."""
+    return block[begin : begin + math.prod(shape) * dtype.itemsize].view(dtype).view(shape)
+
+
+@functools.cache
+def make_fetch():
+    """Make the kernel of `fetch`."""
+
+    @wp.func_native(source("allocator_fetch.cu"))
+    def body(item: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)): ...
+
+    @wp.kernel(enable_backward=False, module="warpgs.runtime.allocator.fetch")
+    def fetch(begin: int, table: wp.uint64, first: int, second: int, out: wp.array(dtype=float)):
+        body(begin + wp.tid(), table, first, second, out)
+
+    return fetch
+
+
+def fetch(table: int, first: int, second: int, out: torch.Tensor) -> None:
+    """Copy three tensors into one, from the addresses that a table holds when the kernel runs.
+
+    Args:
+        table: Address of a table of three addresses of float32 numbers, in memory that the device of ``out`` can read.
+        first: Count of numbers at the first address.
+        second: Count of numbers at the first two addresses together; the rest is at the third.
+        out: Result, float32, contiguous, any shape.
+    """
+    launch(make_fetch(), out.numel(), [table, first, second, flat(out, wp.float32)], out.device)
+
+
+class _NotTwice(torch.autograd.Function):
+    """A gradient that depends on tensors, and raises where its own gradient is requested."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: torch.Tensor, *tensors: torch.Tensor | None) -> torch.Tensor:
+        return gradient.view_as(gradient)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
+        raise UsageError("the kernels have no second derivatives: leave out create_graph=True, or detach the gradient")
+
+
+def keep(ctx: Any, *tensors: torch.Tensor | None) -> None:
+    """Save tensors of any shape [...] for the backward pass, in which `kept` returns them."""
+    ctx.save_for_backward(*tensors)
+    hooked = torch._C._autograd._top_saved_tensors_default_hooks(True) is not None  # may return copies
+    ctx.places = [None if t is None else (t.shape, t.dtype, t.device, None if hooked else t.data_ptr()) for t in tensors]
+
+
+def kept(ctx: Any) -> tuple[Any, ...]:
+    """Return the tensors [...] that `keep` saved.
+
+    Raises:
+        RuntimeError: The ``.data`` of a tensor was replaced, which autograd does not track. The gradient would be wrong, and
+            with another shape or type the kernels would read and write out of bounds.
+    """
+    tensors = ctx.saved_tensors
+    for tensor, place in zip(tensors, ctx.places, strict=True):
+        if tensor is None:
+            continue
+        shape, dtype, device, address = place
+        now = tensor.shape, tensor.dtype, tensor.device
+        if now != (shape, dtype, device) or (address is not None and tensor.data_ptr() != address):
+            before, after = (f"{list(s)} {t} on {d}" for s, t, d in ((shape, dtype, device), now))
+            raise RuntimeError(
+                f"the .data of a tensor was replaced between the forward and the backward pass ({before}, now {after}): "
+                "replace it after the backward pass, or render again"
+            )
+    return tuple(tensors)
+
+
+def first_order(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Wrap the backward method of an autograd function that has no derivative itself.
+
+    A second derivative with respect to any saved tensor raises an error. torch's `once_differentiable` would report instead
+    that the tensor was not used. Without ``create_graph``, the wrapper adds nothing to the gradients.
+
+    Raises:
+        UsageError: A gradient of a gradient is requested.
+    """
+
+    @functools.wraps(backward)
+    def once(ctx: Any, *gradients: torch.Tensor | None) -> Any:
+        if not torch.is_grad_enabled():
+            return backward(ctx, *gradients)
+        with torch.no_grad():
+            found = backward(ctx, *gradients)
+        sources = (*gradients, *ctx.saved_tensors)
+        return tuple(None if v is None else _NotTwice.apply(v, *sources) for v in found)
+
+    return once
+
+
+class _WithoutGradient(torch.autograd.Function):
+    """Values that autograd connects to their source, so that a gradient through them is an error and not silently zero."""
+
+    @staticmethod
+    def forward(ctx: Any, name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
+        ctx.name = name
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: torch.Tensor) -> None:
+        raise UsageError(
+            f"{ctx.name} has no gradient: use {ctx.name}.detach(), or a loss of rgb, alpha, depth or features instead"
+        )
+
+
+def without_gradient(name: str, values: torch.Tensor, source: torch.Tensor) -> torch.Tensor:
+    """Return values of any shape [...]; a gradient through them is an error where ``source`` [...] requires gradients.
+
+    Args:
+        name: Name of the values in the error.
+        values: Values that were computed from ``source`` without autograd, shape [...].
+        source: Tensor that the gradient would go to, shape [...].
+    """
+    found: torch.Tensor = _WithoutGradient.apply(name, values, source)
+    return found
+
+
+def refuse_transforms() -> None:
+    """Check that no transform of torch.func is active.
+
+    Raises:
+        UsageError: A transform is active.
+    """
+    if torch._C._are_functorch_transforms_active():
+        raise UsageError(
+            "rasterize does not support torch.func (grad, vmap, jacrev, jvp): use torch.autograd.grad or backward() for "
+            "gradients, torch.autograd.functional.jacobian for Jacobians, and a batch of cameras [C, 4, 4] instead of vmap"
+        )
+
+
+@functools.lru_cache(maxsize=64)
+def _array_at(address: int, size: int, dtype: object, device: torch.device) -> wp.array:
+    """Return memory at an address as a Warp array, which does not own it; the caller must keep the tensor."""
+    return wp.array(ptr=address, shape=size, dtype=dtype, device=warp_device(device))
+
+
+def sort_pairs(keys: View, values: View, count: int, **bits: int) -> None:
+    """Sort the first ``count`` pairs stably by their keys; the second half of both tensors [2 M] is workspace.
+
+    On a GPU the sort runs on the stream of `stream_of`. ``bits`` are arguments of `wp.utils.radix_sort_pairs`.
+    """
+    arrays = (_array_at(t.data_ptr(), t.numel(), dtype, t.device) for t, dtype, _ in (keys, values))
+    wp.utils.radix_sort_pairs(*arrays, count, **bits)

@@ -1,0 +1,640 @@
+"""Plane sweeps: depths of the planes, their costs, and the scanlines that smooth them."""
+
+import functools
+import math
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+import warp as wp
+
+from warpgs import geometry
+from warpgs.kernels import launch
+from warpgs.kernels.native import EXACT
+from warpgs.scene import Camera
+
+# Depths of a plane sweep on a CPU: the best plane of each pixel, and round trips through another view's depth.
+#
+# Kernels use float64 and one task per pixel. No operations are fused, so depths are the same bits on any processor.
+
+BEHIND = 1e-9
+"""Ratio of a point's depth to its depth in the first view, up to which the point counts as behind a camera."""
+STEP = 1e-3
+"""Step of the central difference that gives the change of depth per pixel, as a fraction of the inverse depth."""
+
+
+@functools.cache
+def make_depth_kernels():
+    """Make the kernels."""
+    real = wp.float64
+    module = "warpgs.kernels.plane_depths"
+
+    @wp.kernel(enable_backward=False, module=module)
+    def best(
+        begin: int, costs: wp.array2d(dtype=wp.int16), planes: int, first: real, step: real,
+        # outputs
+        inverses: wp.array(dtype=real),
+    ):  # fmt: skip
+        pixel = begin + wp.tid()
+        lowest = int(costs[pixel, 0])
+        k = int(0)
+        for d in range(1, planes):
+            cost = int(costs[pixel, d])
+            if cost < lowest:
+                lowest = cost
+                k = d
+        k = wp.clamp(k, 1, planes - 2)
+        left = real(costs[pixel, k - 1])
+        right = real(costs[pixel, k + 1])
+        bend = left - real(2.0) * real(costs[pixel, k]) + right
+        offset = real(0.0)
+        if bend > real(0.0):  # costs are whole numbers
+            offset = wp.clamp(real(0.5) * (left - right) / bend, real(-1.0), real(1.0))
+        inverses[pixel] = first + (real(k) + offset) * step
+
+    @wp.func
+    def project(turn: wp.mat33d, shift: wp.vec3d, x: real, y: real, w: real) -> wp.vec3d:
+        """Return the position of a pixel at inverse depth w in another view, and whether it is in front of that camera."""
+        p = turn * wp.vec3d(x, y, real(1.0)) + w * shift
+        ahead = p[2] > real(BEHIND)
+        z = wp.where(ahead, p[2], real(1.0))
+        return wp.vec3d(p[0] / z, p[1] / z, wp.where(ahead, real(1.0), real(0.0)))
+
+    @wp.kernel(enable_backward=False, module=module)
+    def check(
+        begin: int, own: wp.array2d(dtype=real), found: wp.array2d(dtype=real), turn: wp.mat33d, shift: wp.vec3d,
+        turn_back: wp.mat33d, shift_back: wp.vec3d, to_ray: wp.mat33d, center: wp.vec3d, most: real, cosine: real,
+        # outputs
+        sensitivity: wp.array2d(dtype=real), agrees: wp.array2d(dtype=wp.uint8),
+    ):  # fmt: skip
+        i = begin + wp.tid()
+        row = i // own.shape[1]
+        column = i - row * own.shape[1]
+        x = real(column) + real(0.5)
+        y = real(row) + real(0.5)
+        w = own[row, column]
+        good = int(0)
+        there = project(turn, shift, x, y, w)
+        if there[2] > real(0.0) and there[0] >= real(0.0) and there[1] >= real(0.0):
+            if there[0] < real(found.shape[1]) and there[1] < real(found.shape[0]):
+                back = project(turn_back, shift_back, there[0], there[1], found[int(there[1]), int(there[0])])
+                distance = wp.vec3d(back[0] - x, back[1] - y, real(0.0))
+                point = to_ray * wp.vec3d(x, y, real(1.0)) / w
+                other = point - center
+                apart = wp.dot(point, other) < cosine * wp.length(point) * wp.length(other)
+                if apart and back[2] > real(0.0) and wp.length(distance) < most:
+                    good = 1
+        if good == 1:
+            near = project(turn, shift, x, y, w + real(STEP) * w)
+            far = project(turn, shift, x, y, w - real(STEP) * w)
+            slide = wp.length(wp.vec3d(near[0] - far[0], near[1] - far[1], real(0.0)))
+            if near[2] * far[2] > real(0.0):
+                moved = real(2.0) * real(STEP) / w / slide  # dz = -dw / w^2
+                sensitivity[row, column] = wp.min(sensitivity[row, column], moved)
+        agrees[row, column] = wp.uint8(good)
+
+    return SimpleNamespace(best=best, check=check)
+
+
+def best_inverses(costs: torch.Tensor, inverses: np.ndarray) -> np.ndarray:
+    """Return each pixel's inverse depth [1/u] of least cost, refined by a parabola through three costs, float64, shape [H, W].
+
+    Args:
+        costs: Integers, int16, shape [H, W, P] with P at least D.
+        inverses: Inverse depths of the D planes, evenly spaced, at least three, shape [D].
+    """
+    height, width, padded = costs.shape
+    found = torch.empty(height, width, dtype=torch.float64, device="cpu")
+    inputs = [
+        launch.view(costs.reshape(-1, padded), wp.int16), len(inverses), float(inverses[0]),
+        float(inverses[1] - inverses[0]), launch.view(found.view(-1), wp.float64),
+    ]  # fmt: skip
+    launch.launch(make_depth_kernels().best, height * width, inputs, costs.device, cost=max(1, len(inverses) // 10))
+    return found.numpy()
+
+
+def _between(first: Camera, second: Camera) -> tuple[wp.mat33d, wp.vec3d]:
+    """Return the turn [3, 3] and shift [3] that map a pixel p = (x, y, 1) at inverse depth w to turn p + w shift."""
+    rotation, translation = geometry.relative_pose(first, second)
+    turn = geometry.matmul(geometry.matmul(second.K, rotation), geometry.inverse(first.K))
+    return wp.mat33d(*turn.ravel()), wp.vec3d(*geometry.matmul(second.K, translation[:, None])[:, 0])
+
+
+def check_round_trip(
+    first: Camera, second: Camera, own: np.ndarray, found: np.ndarray, sensitivity: np.ndarray, *, most: float,
+    min_parallax: float,
+) -> np.ndarray:  # fmt: skip
+    """Return a mask of the pixels with enough parallax to which a round trip through another view's depth leads back.
+
+    Args:
+        first: Camera of the view.
+        second: Camera of the other view.
+        own: Inverse depths of the view [1/u], float64, shape [H, W].
+        found: Inverse depths of the other view [1/u], float64, at its size.
+        sensitivity: Change of depth per pixel [u/px], float64, contiguous, shape [H, W]; lowered in place where this pair of
+            views has a smaller value.
+        most: Largest distance [px] between the pixel and the end of the round trip.
+        min_parallax: Smallest angle between the two rays [deg].
+
+    Returns:
+        Mask, bool, shape [H, W].
+    """
+    agrees = torch.empty(own.shape, dtype=torch.uint8, device="cpu")
+    rotation, translation = geometry.relative_pose(first, second)
+    center = -geometry.matmul(rotation.T, translation[:, None])[:, 0]
+    maps = [launch.view(torch.from_numpy(np.ascontiguousarray(a)), wp.float64) for a in (own, found, sensitivity)]
+    inputs = [
+        *maps[:2], *_between(first, second), *_between(second, first), wp.mat33d(*geometry.inverse(first.K).ravel()),
+        wp.vec3d(*center), most, math.cos(math.radians(min_parallax)), maps[2], launch.view(agrees, wp.uint8),
+    ]  # fmt: skip
+    launch.launch(make_depth_kernels().check, own.size, inputs, agrees.device, cost=5)
+    return agrees.numpy().astype(bool)
+
+
+# Matching costs of a plane sweep on a CPU: other images are warped by a plane's homography and correlated in windows.
+#
+# A task owns some rows and some planes. Colours and the sums over windows are integers, and no multiplication is fused
+# with a sum, so that costs are the same bits on any processor and number of threads. Loops over `LANES` pixels
+# vectorise.
+
+LANES = 16
+"""Neighbouring pixels or planes that are computed together, in a loop that vectorises."""
+ROWS = 32
+"""Rows of a task. Windows also need some rows above and below, which the neighbouring tasks compute as well."""
+PLANES = 16
+"""Planes of a task: 32 bytes of each pixel's costs, half a cache line."""
+WHITE = 4095
+"""Brightness 1 as an integer: so fine that rounding is far below the noise of 8-bit images."""
+LOW = WHITE + 1
+"""Added to colours while they are interpolated, so that the colour outside of an image, -`WHITE`, becomes positive."""
+MIDDLE = 2048
+"""Subtracted from colours before they are multiplied, which keeps sums small."""
+MAX_RADIUS = 3
+"""Largest half side of a window [px]: 49 squares of the largest colour, `WHITE` + `MIDDLE`, fit into 32 bits with a sign."""
+NEUTRAL = 0.5
+"""Cost of correlation 0: where a plane projects outside of the other image, or a window has no texture."""
+
+
+@functools.cache
+def make_costs_kernel():
+    """Make the kernel."""
+    ints = wp.types.vector(LANES, wp.int32)
+    reals = wp.types.vector(LANES, wp.float32)
+
+    @wp.func
+    def at(first: wp.int32, lane: wp.int32) -> wp.int32:
+        """Return an index that the compiler can see is not negative; else it would load each lane separately."""
+        return wp.max(first, 0) + lane
+
+    @wp.func
+    def mirror(i: wp.int32, count: wp.int32) -> wp.int32:
+        """Return the number in [0, count) of a row or column beyond the border, mirrored at the centre of the last one."""
+        period = wp.max(2 * (count - 1), 1)
+        i = wp.abs(i) % period
+        return wp.min(i, period - i) % count
+
+    @wp.func
+    def warp_row(
+        y: wp.int32, pitch: wp.int32, images: wp.array(dtype=wp.int32), offset: wp.int32, other_width: wp.int32,
+        other_height: wp.int32, h: wp.array(dtype=wp.float32), first: wp.int32, ring: wp.array(dtype=wp.int32), into: wp.int32,
+    ):  # fmt: skip
+        """Write a row of the other image as the first camera sees it: centred colours, below -MIDDLE outside."""
+        fy = float(y)
+        cx = h[first + 1] * fy + h[first + 2]
+        cy = h[first + 4] * fy + h[first + 5]
+        cz = h[first + 7] * fy + h[first + 8]
+        ax = h[first]
+        ay = h[first + 3]
+        az = h[first + 6]
+        most_x = float(other_width) + 0.995
+        most_y = float(other_height) + 0.995
+        stride = other_width + 2
+        found = ints()
+        for step in range(pitch // LANES):
+            x = step * LANES
+            for lane in range(LANES):
+                fx = float(x + lane)
+                z = az * fx + cz
+                ahead = z > 1.0e-6
+                inverse = 1.0 / wp.where(ahead, z, 1.0)
+                # positions in the image with its frame of one pixel
+                u = wp.where(ahead, (ax * fx + cx) * inverse + 1.0, 0.0)
+                v = wp.where(ahead, (ay * fx + cy) * inverse + 1.0, 0.0)
+                iu = int(wp.min(wp.max(u, 0.0), most_x) * 256.0 + 0.5)
+                iv = int(wp.min(wp.max(v, 0.0), most_y) * 256.0 + 0.5)
+                wx = iu & 255
+                wy = iv & 255
+                i = wp.max(offset + (iv >> 8) * stride + (iu >> 8), 0)
+                a = images[i]
+                b = images[i + stride]
+                upper = (a & 65535) * (256 - wx) + (a >> 16) * wx
+                lower = (b & 65535) * (256 - wx) + (b >> 16) * wx
+                found[lane] = ((upper * (256 - wy) + lower * wy + 32768) >> 16) - (LOW + MIDDLE)
+            for lane in range(LANES):
+                ring[at(into + x, lane)] = found[lane]
+
+    @wp.func
+    def add_row(
+        own: wp.array(dtype=wp.int32), row: wp.int32, ring: wp.array(dtype=wp.int32), slot: wp.int32, sign: wp.int32,
+        sums: wp.int32, side: wp.int32, pitch: wp.int32,
+    ):  # fmt: skip
+        """Add a row to the sums over the columns of windows, or subtract it; the sums lie behind the rows in ``ring``."""
+        s = ints()
+        q = ints()
+        p = ints()
+        for step in range(pitch // LANES):
+            x = step * LANES
+            for lane in range(LANES):
+                w = ring[at(slot + x, lane)]
+                signed = sign * w
+                s[lane] = ring[at(sums + x, lane)] + signed
+                q[lane] = ring[at(sums + side + x, lane)] + signed * w
+                p[lane] = ring[at(sums + 2 * side + x, lane)] + signed * own[at(row + x, lane)]
+            for lane in range(LANES):
+                ring[at(sums + x, lane)] = s[lane]
+                ring[at(sums + side + x, lane)] = q[lane]
+                ring[at(sums + 2 * side + x, lane)] = p[lane]
+
+    @wp.func
+    def correlate_row(
+        own_sums: wp.array(dtype=wp.int32), roots: wp.array(dtype=wp.float32), row: wp.int32,
+        ring: wp.array(dtype=wp.int32), slot: wp.int32, sums: wp.int32, side: wp.int32, pitch: wp.int32, radius: wp.int32,
+        noise: wp.float32, number: wp.int32, totals: wp.array(dtype=wp.float32), total: wp.int32, least: wp.int32,
+    ):  # fmt: skip
+        """Add the costs of a row to their sum over the other images, and to the smallest."""
+        whole = float((2 * radius + 1) * (2 * radius + 1))
+        share = 1.0 / whole
+        s = ints()
+        q = ints()
+        p = ints()
+        sum_out = reals()
+        least_out = reals()
+        for step in range(pitch // LANES):
+            x = step * LANES
+            for lane in range(LANES):
+                s[lane] = 0
+                q[lane] = 0
+                p[lane] = 0
+            for k in range(2 * radius + 1):
+                for lane in range(LANES):
+                    s[lane] = s[lane] + ring[at(sums + x + k - radius, lane)]
+                    q[lane] = q[lane] + ring[at(sums + side + x + k - radius, lane)]
+                    p[lane] = p[lane] + ring[at(sums + 2 * side + x + k - radius, lane)]
+            for lane in range(LANES):
+                mean = float(s[lane]) * share
+                variance = wp.max(float(q[lane]) - float(s[lane]) * mean, 0.0) + noise
+                shared = float(p[lane]) - float(own_sums[at(row + x, lane)]) * mean
+                cost = 0.5 - 0.5 * (shared * roots[at(row + x, lane)]) / wp.sqrt(variance)
+                cost = wp.where(ring[at(slot + x, lane)] >= -MIDDLE, cost, NEUTRAL)
+                before = wp.where(number == 0, 0.0, totals[at(total + x, lane)])
+                lowest = wp.where(number == 0, 2.0, totals[at(least + x, lane)])
+                sum_out[lane] = before + cost
+                least_out[lane] = wp.min(lowest, cost)
+            for lane in range(LANES):
+                totals[at(total + x, lane)] = sum_out[lane]
+                totals[at(least + x, lane)] = least_out[lane]
+
+    @wp.func
+    def mirror_columns(ring: wp.array(dtype=wp.int32), sums: wp.int32, radius: wp.int32, width: wp.int32):
+        """Write the sums over columns beyond both borders of the image."""
+        for k in range(1, radius + 1):
+            ring[sums - k] = ring[sums + mirror(-k, width)]
+            ring[sums + width - 1 + k] = ring[sums + mirror(width - 1 + k, width)]
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
+    def match(
+        begin: int, own: wp.array(dtype=int), own_sums: wp.array(dtype=int), roots: wp.array(dtype=float),
+        images: wp.array(dtype=int), shapes: wp.array(dtype=int), h: wp.array(dtype=float), height: int, width: int,
+        pitch: int, others: int, planes: int, padded: int, radius: int, noise: float, unit: int,
+        # rows of the other image and sums over columns; costs; costs as whole numbers, of a task each
+        ring: wp.array(dtype=int), totals: wp.array(dtype=float), found: wp.array(dtype=wp.int16),
+        # outputs
+        costs: wp.array(dtype=wp.int16),
+    ):  # fmt: skip
+        task = begin + wp.tid()
+        blocks = padded // PLANES
+        top = (task // blocks) * ROWS
+        bottom = wp.min(top + ROWS, height)
+        first_plane = (task - (task // blocks) * blocks) * PLANES
+        window = 2 * radius + 1
+        side = pitch + 2 * radius
+        rows = task * (window * pitch + 3 * side)
+        sums = rows + window * pitch + radius
+        base = task * 2 * ROWS * pitch
+        whole = task * ROWS * PLANES * pitch
+        share = 0.5 / float(others)
+        levels = float(unit)
+        rounded = ints()
+        for k in range(PLANES):
+            plane = first_plane + k
+            if plane < planes:
+                for number in range(others):
+                    offset = shapes[3 * number]
+                    other_width = shapes[3 * number + 1]
+                    other_height = shapes[3 * number + 2]
+                    first = 9 * (plane * others + number)
+                    for i in range(3 * side):
+                        ring[at(sums - radius, i)] = 0
+                    for y in range(top - radius, bottom + radius):
+                        slot = rows + ((y + radius - top) % window) * pitch
+                        if y > top + radius:
+                            add_row(own, mirror(y - window, height) * pitch, ring, slot, -1, sums, side, pitch)
+                        warp_row(mirror(y, height), pitch, images, offset, other_width, other_height, h, first, ring, slot)
+                        add_row(own, mirror(y, height) * pitch, ring, slot, 1, sums, side, pitch)
+                        middle = y - radius
+                        if middle >= top:
+                            mirror_columns(ring, sums, radius, width)
+                            mirror_columns(ring, sums + side, radius, width)
+                            mirror_columns(ring, sums + 2 * side, radius, width)
+                            centre = rows + ((middle + radius - top) % window) * pitch
+                            total = base + (middle - top) * pitch
+                            correlate_row(
+                                own_sums, roots, middle * pitch, ring, centre, sums, side, pitch, radius, noise, number,
+                                totals, total, total + ROWS * pitch,
+                            )  # fmt: skip
+            for y in range(bottom - top):
+                total = base + y * pitch
+                least = total + ROWS * pitch
+                into = whole + (y * PLANES + k) * pitch
+                for step in range(pitch // LANES):
+                    x = step * LANES
+                    for lane in range(LANES):
+                        cost = totals[at(total + x, lane)] * share + 0.5 * totals[at(least + x, lane)]
+                        scaled = int(wp.min(wp.max(cost, 0.0), 1.0) * levels + 0.5)
+                        # planes past the last have the worst cost, so that paths do not change
+                        rounded[lane] = wp.where(plane < planes, scaled, unit)
+                    for lane in range(LANES):
+                        found[at(into + x, lane)] = wp.int16(rounded[lane])
+        for y in range(bottom - top):
+            for x in range(width):
+                pixel = ((top + y) * width + x) * padded + first_plane
+                for k in range(PLANES):
+                    costs[at(pixel, k)] = found[at(whole + (y * PLANES + k) * pitch, x)]
+
+    return match
+
+
+def _packed(gray: np.ndarray) -> np.ndarray:
+    """Return colours, int32, with a border of one outside pixel; the upper half of each number holds the right neighbour."""
+    framed = np.ones((gray.shape[0] + 3, gray.shape[1] + 2), np.int32)
+    framed[1:-2, 1:-1] = _whole(gray) + LOW
+    framed = framed.ravel()
+    return framed | (np.roll(framed, -1) << 16)
+
+
+def _whole(gray: np.ndarray) -> np.ndarray:
+    return np.rint(gray.astype(np.float64) * WHITE).astype(np.int32)
+
+
+def _window_sums(values: np.ndarray, radius: int) -> np.ndarray:
+    """Return the sums over windows, int64, shape [H, W]; the image is mirrored beyond its border."""
+    for axis in (0, 1):
+        sides = [(radius + 1, radius) if a == axis else (0, 0) for a in (0, 1)]
+        total = np.cumsum(np.pad(values, sides, mode="reflect"), axis)
+        last, first = (np.take(total, np.arange(values.shape[axis]) + k, axis) for k in (2 * radius + 1, 0))
+        values = last - first
+    return values
+
+
+def plane_costs(
+    gray: np.ndarray, others: Sequence[np.ndarray], homographies: np.ndarray, window: int, noise: float, unit: int
+) -> torch.Tensor:
+    """Return the matching costs of an image against others, which are warped to it by the homographies of D planes.
+
+    The cost of one other image is 0.5 (1 - correlation). The result is half the mean of these costs plus half the smallest: an
+    image that does not see the point contributes, but cannot outvote one that does.
+
+    Args:
+        gray: Brightness in [0, 1], float32, shape [H, W].
+        others: Brightness of N other images, of any size.
+        homographies: Homographies from pixels of the image to pixels of each other image, shape [D, N, 3, 3]. Pixel centres are
+            at integers. The sign makes the third coordinate positive in front of the other camera.
+        window: Side of the square in which pixels are correlated [px], odd, at most 2 `MAX_RADIUS` + 1.
+        noise: Number that is added to the variance of a window.
+        unit: Integer that stands for cost 1, below 2^15.
+
+    Returns:
+        Costs, int16, shape [H, W, P]: P is D rounded up to a multiple of `LANES`, and costs past D are ``unit``.
+
+    Raises:
+        ValueError: The window is too small or too large.
+    """
+    radius = window // 2
+    if not 1 <= radius <= MAX_RADIUS:
+        raise ValueError(f"window must be 3 to {2 * MAX_RADIUS + 1} px, not {window}")
+    height, width = gray.shape
+    pitch, padded = (-(-n // LANES) * LANES for n in (width, len(homographies)))
+    centred = (_whole(gray) - MIDDLE).astype(np.int64)
+    own_sums, squares = _window_sums(centred, radius), _window_sums(centred * centred, radius)
+    added = noise * window**2 * WHITE**2
+    roots = 1 / np.sqrt(squares - own_sums**2 / window**2 + added)
+    beside = [(0, 0), (0, pitch - width)]
+    own, sums, roots = (
+        torch.from_numpy(np.pad(a, beside).astype(t).ravel())
+        for a, t in ((centred, np.int32), (own_sums, np.int32), (roots, np.float32))
+    )
+    images = [_packed(g) for g in others]
+    starts = np.cumsum([0, *(len(i) for i in images[:-1])])
+    shapes = np.array([(s, g.shape[1], g.shape[0]) for s, g in zip(starts, others)], np.int32)
+    blocks = padded // PLANES
+    tasks = -(-height // ROWS) * blocks
+    ring = torch.empty(tasks * (window * pitch + 3 * (pitch + 2 * radius)), dtype=torch.int32, device="cpu")
+    totals = torch.empty(tasks * 2 * ROWS * pitch, dtype=torch.float32, device="cpu")
+    found = torch.empty(tasks * ROWS * PLANES * pitch, dtype=torch.int16, device="cpu")
+    costs = torch.empty(height, width, padded, dtype=torch.int16, device="cpu")
+    h = torch.from_numpy(homographies.astype(np.float32).ravel())
+    view = launch.view
+    inputs = [
+        view(own, wp.int32), view(sums, wp.int32), view(roots, wp.float32),
+        view(torch.from_numpy(np.concatenate(images)), wp.int32), view(torch.from_numpy(shapes.ravel()), wp.int32),
+        view(h, wp.float32), height, width, pitch, len(others), len(homographies), padded, radius, added, unit,
+        view(ring, wp.int32), view(totals, wp.float32), view(found, wp.int16), view(costs.view(-1), wp.int16),
+    ]  # fmt: skip
+    launch.launch(make_costs_kernel(), tasks, inputs, costs.device, cost=ROWS * PLANES * pitch * len(others) // 2)
+    return costs
+
+
+FAR_AWAY_16 = 2**14
+"""Number above every path cost to which a penalty can be added in 16 bits."""
+
+
+@functools.cache
+def make_scanline_kernel_cpu():
+    """Make the kernel."""
+    shorts = wp.types.vector(LANES, wp.int16)
+
+    @wp.func
+    def at(first: wp.int32, lane: wp.int32) -> wp.int32:
+        """Return an index that the compiler can see is not negative; else it would load each lane separately."""
+        return wp.max(first, 0) + lane
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=EXACT)
+    def follow(
+        begin: int, costs: wp.array(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
+        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+        # whether sums begin with this line; two rows of costs for each line
+        fresh: int, path: wp.array(dtype=wp.int16),
+        # outputs
+        total: wp.array(dtype=wp.int16),
+    ):  # fmt: skip
+        line = begin + wp.tid()
+        pitch = planes + 2 * LANES
+        rows = line * 2 * pitch + LANES
+        step = wp.int16(small)
+        out = shorts()
+        sums = shorts()
+        least = shorts()
+        for way in range(2):
+            for i in range(2 * pitch):
+                path[at(rows - LANES, i)] = wp.int16(FAR_AWAY_16)
+            for i in range(planes):
+                path[at(rows + pitch, i)] = wp.int16(0)
+            lowest = wp.int16(0)
+            for k in range(length):
+                j = wp.where(way == 0, k, length - 1 - k)
+                edge = wp.where(way == 0, k - 1, j)
+                pixel = (line * line_step + j * pixel_step) * planes
+                most = wp.int16(0)  # the most that any change of depth may add to the best of the pixel before
+                if k > 0:
+                    most = lowest + wp.int16(bounds[line * line_edge + edge * pixel_edge])
+                to = rows + (k & 1) * pitch
+                before = rows + pitch - (k & 1) * pitch
+                set = fresh != 0 and way == 0
+                for lane in range(LANES):
+                    least[lane] = wp.int16(FAR_AWAY_16)
+                for chunk in range(planes // LANES):
+                    d = chunk * LANES
+                    for lane in range(LANES):
+                        beside = wp.min(path[at(before + d - 1, lane)], path[at(before + d + 1, lane)]) + step
+                        best = wp.min(wp.min(path[at(before + d, lane)], most), beside)
+                        cost = costs[at(pixel + d, lane)] + best - lowest
+                        out[lane] = cost
+                        least[lane] = wp.min(least[lane], cost)
+                        sums[lane] = wp.where(set, wp.int16(0), total[at(pixel + d, lane)]) + cost
+                    for lane in range(LANES):
+                        path[at(to + d, lane)] = out[lane]
+                        total[at(pixel + d, lane)] = sums[lane]
+                lowest = least[0]
+                for lane in range(1, LANES):
+                    lowest = wp.min(lowest, least[lane])
+
+    return follow
+
+
+BLOCK = 32
+"""Threads of a block: few, so that some hundred lines spread over many multiprocessors."""
+FAR_AWAY = 2**20
+"""Number above every path cost."""
+LARGEST = 2**13 - 1
+"""Largest cost plus penalties: the sum of four paths then fits into signed 16 bits."""
+
+
+@functools.cache
+def make_scanline_kernel():
+    """Make the kernel; a thread owns a line."""
+
+    @wp.kernel(enable_backward=False, module="warpgs.kernels.scanlines")
+    def follow(
+        begin: int, costs: wp.array2d(dtype=wp.int16), bounds: wp.array(dtype=int), small: int, planes: int,
+        # pixels of a line: where it starts, from one to the next, how many; the same for the steps between them
+        line_step: int, pixel_step: int, length: int, line_edge: int, pixel_edge: int,
+        # outputs
+        path: wp.array2d(dtype=int), total: wp.array2d(dtype=wp.int16),
+    ):  # fmt: skip
+        line = begin + wp.tid()
+        path[line, planes] = FAR_AWAY
+        for way in range(2):
+            lowest = int(0)
+            for k in range(length):
+                j = k
+                edge = k - 1
+                if way == 1:
+                    j = length - 1 - k
+                    edge = j
+                pixel = line * line_step + j * pixel_step
+                most = int(0)  # the most that any change of depth may add to the best of the pixel before
+                if k > 0:
+                    most = lowest + bounds[line * line_edge + edge * pixel_edge]
+                left = int(FAR_AWAY)
+                here = path[line, 0]
+                least = int(FAR_AWAY)
+                for d in range(planes):
+                    right = path[line, d + 1]
+                    cost = int(costs[pixel, d])
+                    if k > 0:
+                        cost += wp.min(wp.min(here, most), wp.min(left, right) + small) - lowest
+                    path[line, d] = cost
+                    total[pixel, d] = wp.int16(int(total[pixel, d]) + cost)
+                    least = wp.min(least, cost)
+                    left = here
+                    here = right
+                lowest = least
+
+    return follow
+
+
+def scanline_costs(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
+    """Return the sum of the path costs from above, below, left and right.
+
+    A path's cost at pixel k and plane d is L(k, d) = C(k, d) + min(L(k-1, d), L(k-1, d +- 1) + small, min_i L(k-1, i) + limit)
+    - min_i L(k-1, i), with the limit of the step from k - 1 to k (Hirschmüller 2008, eq. 13). Not differentiable.
+
+    Args:
+        costs: C in whole units, at least 0, int16, shape [H, W, D] with D at least 1.
+        down: Limits of the steps from a row to the next, at least 0, int32, shape [H - 1, W].
+        across: Limits of the steps from a column to the next, at least 0, int32, shape [H, W - 1].
+        small: Penalty for a change of one plane, at least 0. Costs and penalties together are at most `LARGEST`.
+
+    Returns:
+        The sums, int16, shape [H, W, D].
+
+    Raises:
+        ValueError: A shape, type or device disagrees.
+    """
+    height, width, planes = costs.shape
+    for name, tensor, dtype, shape in (
+        ("costs", costs, torch.int16, (height, width, planes)),
+        ("down", down, torch.int32, (height - 1, width)), ("across", across, torch.int32, (height, width - 1)),
+    ):  # fmt: skip
+        if tensor.dtype != dtype or tuple(tensor.shape) != shape or tensor.device != costs.device:
+            raise ValueError(
+                f"{name} must be {dtype} of shape {list(shape)} on {costs.device}, "
+                f"not {tensor.dtype} of shape {list(tensor.shape)} on {tensor.device}"
+            )
+    if costs.device.type == "cpu":
+        return _on_cpu(costs, down, across, small)
+    total = torch.zeros_like(costs, memory_format=torch.contiguous_format)
+    flat = [launch.view(t.contiguous().view(-1, planes), wp.int16) for t in (costs, total)]
+    for lines, length, steps, bounds, edges in _ways(height, width, down, across):
+        path = torch.empty(lines, planes + 1, dtype=torch.int32, device=costs.device)
+        inputs = [
+            flat[0], launch.view(bounds.contiguous().view(-1), wp.int32), small, planes, *steps, length, *edges,
+            launch.view(path, wp.int32), flat[1],
+        ]  # fmt: skip
+        launch.launch(make_scanline_kernel(), lines, inputs, costs.device, cost=max(1, length * planes // 2), block_dim=BLOCK)
+    return total
+
+
+def _ways(height: int, width: int, down: torch.Tensor, across: torch.Tensor):
+    """Return the number of lines, their length, strides of pixels, limits and strides of limits: along rows, then columns."""
+    return (height, width, (width, 1), across, (width - 1, 1)), (width, height, (1, width), down, (1, width))
+
+
+def _on_cpu(costs: torch.Tensor, down: torch.Tensor, across: torch.Tensor, small: int) -> torch.Tensor:
+    """Return the sums of `scanline_costs`; a number of planes that is a multiple of `scanlines_cpu.LANES` saves a copy."""
+    height, width, planes = costs.shape
+    more = -planes % LANES
+    if more:  # extra planes with the worst cost, which no path prefers
+        costs = torch.nn.functional.pad(costs, (0, more), value=int(costs.max()))
+    total, padded = torch.empty_like(costs, memory_format=torch.contiguous_format), planes + more
+    flat = [launch.view(t.contiguous().view(-1), wp.int16) for t in (costs, total)]
+    for fresh, (lines, length, steps, bounds, edges) in zip((1, 0), _ways(height, width, down, across)):
+        path = torch.empty(lines * 2 * (padded + 2 * LANES), dtype=torch.int16, device="cpu")
+        inputs = [
+            flat[0], launch.view(bounds.contiguous().view(-1), wp.int32), small, padded, *steps, length, *edges, fresh,
+            launch.view(path, wp.int16), flat[1],
+        ]  # fmt: skip
+        launch.launch(make_scanline_kernel_cpu(), lines, inputs, costs.device, cost=max(1, length * padded // 20))
+    return total[..., :planes]

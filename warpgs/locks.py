@@ -1,0 +1,316 @@
+"""Who may write: one writer a folder, and folders that only their owner can read."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import errno
+import json
+import os
+import platform
+import shlex
+import shutil
+import stat
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from filelock import FileLock, Timeout, lock_descriptor
+
+from warpgs import schema
+from warpgs.errors import FolderHeldError, ResourceError, UsageError
+from warpgs.files import LOCK, remove_leftovers, writing_into
+from warpgs.folders import NO_LOCKS, Folder, RefusedError, cache_home, open_folder, sweep_temporary_files
+
+
+def open_to_others(folder: Path, depth: int = 0) -> Path | None:
+    """Return the first path through which another user can change a folder's contents, or None.
+
+    On Windows nothing is checked: mode bits have no meaning there, and the folder of a user's caches is private. Root is
+    trusted, as root may do anything, and so is the owner of the whole file system.
+
+    Args:
+        folder: An existing folder, without links in its path.
+        depth: Levels of the folder's contents that are checked as well.
+    """
+    if not hasattr(os, "getuid"):
+        return None
+    trusted = {os.getuid(), 0, Path(folder.anchor).stat().st_uid}
+    for above in folder.parents:  # users with write access there can replace this folder
+        found = above.stat()
+        sticky = found.st_mode & stat.S_ISVTX  # as /tmp: users can move only their own files
+        if found.st_uid not in trusted or (_writable_by_others(found, trusted) and not sticky):
+            return above
+    if _writable_by_others(folder.stat(), trusted):
+        return folder
+    if not folder.stat().st_mode & (stat.S_IXGRP | stat.S_IXOTH):
+        return None  # other users cannot enter it
+    for level in range(1, depth + 1):
+        for path in folder.glob("/".join("*" * level)):
+            try:
+                found = path.lstat()
+            except FileNotFoundError:  # another process has put its new file in place
+                continue
+            if stat.S_ISLNK(found.st_mode) or _writable_by_others(found, trusted):
+                return path
+    return None
+
+
+def _writable_by_others(found: os.stat_result, trusted: set[int]) -> bool:
+    if found.st_uid not in trusted or found.st_mode & stat.S_IWOTH:
+        return True
+    return bool(found.st_mode & stat.S_IWGRP) and not _is_own_group(found.st_gid)
+
+
+def _is_own_group(gid: int) -> bool:
+    """Return whether a group belongs to this user alone: many systems make a group per user, with the user's name or number."""
+    import grp
+    import pwd
+
+    try:
+        name = pwd.getpwuid(os.getuid()).pw_name
+        group = grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return set(group.gr_mem) <= {name} and (gid == os.getuid() or group.gr_name == name)
+
+
+SIGNED_WITHIN = 50
+"""Number of attempts to read the signature of a lock's holder, a hundredth of a second apart."""
+MOST_LETTERS = 200
+"""Length at which a command is cut short in a message."""
+
+
+@contextlib.contextmanager
+def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
+    """Lock a folder, and make it if it is missing, so that no other process writes into it during the block.
+
+    The system releases the lock when the process that holds it ends, even if it is killed. The lock also excludes processes in
+    other containers. The lock file names the holder. Leftovers of killed writers are removed from the folder and from the
+    system's temporary files. In the block nothing below the folder is written through a link (`output_folder`). If an error
+    ends the block, a folder that was made here is removed if it is still empty; other folders are never removed.
+
+    Args:
+        folder: The folder.
+        parts: Folders in it that are written under the same lock; none may be a link.
+
+    Returns:
+        A list with a note for the user if the file system has no locks, otherwise an empty list.
+
+    Raises:
+        FolderHeldError: Another process holds the folder.
+        ResourceError: The folder cannot be written.
+    """
+    sweep_temporary_files()
+    with writing_into(folder) as made:
+        try:
+            with open_folder(folder) as opened, _held(opened) as locked:
+                for name in (".", *parts):
+                    remove_leftovers(folder / name)
+                note = f"{folder}: its file system has no locks; do not start a second process that writes there"
+                yield [] if locked else [note]
+        except BaseException:
+            if made:
+                with contextlib.suppress(OSError), open_folder(folder.absolute().parent) as above:
+                    above.rmdir(folder.name)  # where it is not empty, or in use, it stays
+            raise
+
+
+@contextlib.contextmanager
+def hold_file(path: Path) -> Iterator[list[str]]:
+    """Hold the folder of a file that the block writes; see `hold_folder`.
+
+    Raises:
+        FolderHeldError: Another process holds the folder.
+        ResourceError: The folder cannot be written.
+        UsageError: The path is a folder, or too long.
+    """
+    check_file_path(path)
+    with hold_folder(path.parent) as notes:
+        yield notes
+
+
+def check_file_path(path: Path) -> None:
+    """Check, before the work, that a file can be written at a path: it is not a folder, and not too long.
+
+    Raises:
+        UsageError: The path is a folder, or too long.
+    """
+    try:
+        is_folder = stat.S_ISDIR(path.lstat().st_mode)
+    except OSError as e:
+        if e.errno == errno.ENAMETOOLONG:
+            raise UsageError(f"{path}: the name of the file is too long; choose a shorter one") from e
+        return  # no such path, or an error that `hold_folder` reports
+    if is_folder:
+        raise UsageError(f"{path}: is a folder; give the name of the file to write, such as one in this folder")
+
+
+def check_free(folder: Path) -> None:
+    """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free.
+
+    Raises:
+        FolderHeldError: Another process holds it.
+    """
+    with contextlib.suppress(OSError), open_folder(folder) as opened:
+        with os.fdopen(opened.open_regular(LOCK, os.O_RDWR), "r+b", buffering=0) as file:
+            _lock(file, folder)
+
+
+@contextlib.contextmanager
+def _held(folder: Folder) -> Iterator[bool]:
+    """Hold the lock of a folder; yields whether the file system has locks."""
+    while True:
+        file = _open(folder)
+        try:
+            locked = _lock(file, folder.path)
+            # the last holder may have removed the lock file between the two calls; then other processes lock a new file
+            if not locked or os.fstat(file.fileno()).st_nlink:
+                break
+        except BaseException:
+            file.close()
+            raise
+        file.close()
+    try:
+        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
+            _sign(file)
+        yield locked
+    finally:
+        # Windows cannot remove an open file; other systems must remove it while the lock is held
+        if sys.platform == "win32":
+            file.close()
+        try:
+            with contextlib.suppress(OSError):
+                folder.unlink(LOCK)
+        finally:
+            file.close()
+
+
+def _open(folder: Folder) -> BinaryIO:
+    """Open a lock file to read and write, made if it is missing."""
+    try:
+        return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
+    except RefusedError as e:
+        raise ResourceError(f"{folder.path}: cannot be written, as {e}") from e
+    except OSError as e:
+        raise ResourceError(
+            f"{folder.path}: cannot be written, as its lock {LOCK} cannot be opened ({e.strerror or e}); choose another "
+            "folder, or make this one writable"
+        ) from e
+
+
+def _lock(file: BinaryIO, folder: Path) -> bool:
+    """Lock an open file; return False where its file system has no locks.
+
+    Raises:
+        FolderHeldError: Another process holds it.
+        ResourceError: The file cannot be locked.
+    """
+    try:
+        if lock_descriptor(file.fileno(), blocking=False):
+            return True
+    except OSError as e:
+        if e.errno in NO_LOCKS:
+            return False
+        raise ResourceError(f"{folder}: cannot be locked ({e.strerror or e}); choose another folder") from e
+    raise FolderHeldError(
+        f"{folder}: {_holder(file)} is writing there. Wait until that process ends, end it, or choose another folder"
+    )
+
+
+def _sign(file: BinaryIO) -> None:
+    """Write the owner into a lock file; Windows locks its first byte, which no other process may then read."""
+    program = Path(sys.argv[0])
+    name = program.parent.name if program.name == "__main__.py" else program.name  # of `python -m warpgs`
+    command = shlex.join([name, *sys.argv[1:]])
+    now = datetime.datetime.now().astimezone().isoformat(" ", "seconds")
+    values = {"process": os.getpid(), "host": platform.node(), "since": now, "command": command}
+    file.truncate(0)
+    file.seek(0)
+    file.write(b"\n" + json.dumps(values).encode())
+
+
+def _holder(file: BinaryIO) -> str:
+    """Return a text that names the holder of a lock file; wait briefly for the signature, since the lock may be new."""
+    for _ in range(SIGNED_WITHIN):
+        words = _signed(file)
+        if words is not None:
+            return words
+        time.sleep(0.01)
+    return "another process"
+
+
+def _signed(file: BinaryIO) -> str | None:
+    """Return who signed a lock file; None if the signature is missing or incomplete."""
+    try:
+        file.seek(1)
+        found = schema.parse(file.read(schema.MAX_BYTES))
+        command = found["command"] if len(found["command"]) <= MOST_LETTERS else f"{found['command'][:MOST_LETTERS]}..."
+        return f"process {found['process']} on {found['host']}, since {found['since']}, `{command}`,"
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+PRIVATE_LOCK = "lock"
+WAIT_FOR_OTHERS = 60.0
+"""Longest wait while another farm makes its own folder [s]."""
+
+
+@contextlib.contextmanager
+def private_shared_folder(base: Path | None) -> Iterator[Path]:
+    """Make a new folder with a random name that only this user can enter (mode 0700), and remove it after the block.
+
+    Folders of killed farms, whose locks are free, are removed as well.
+
+    Args:
+        base: Parent of the new folder; None for ``warpgs/slurm`` in the user's cache.
+
+    Raises:
+        ResourceError: The folder cannot be written or locked.
+        UsageError: There is no home folder, or other users can write to ``base`` or to a folder above it.
+    """
+    home = cache_home()
+    if base is None and home is None:
+        raise UsageError("--engine slurm needs a home folder for its job files; name another folder with --slurm-folder")
+    base = (base or home / "warpgs" / "slurm").absolute()
+    try:
+        base.mkdir(mode=0o700, parents=True, exist_ok=True)
+        base = base.resolve()
+        others = open_to_others(base)
+        if others is not None:
+            raise UsageError(
+                f"{base}: not safe for Slurm's job files: other users can write to {others} and could run code as you; "
+                "name a private folder that all nodes see with --slurm-folder"
+            )
+        with FileLock(
+            base / PRIVATE_LOCK, timeout=WAIT_FOR_OTHERS, mode=0o600
+        ):  # no other farm is between making and locking its own
+            _sweep(base)
+            made = Path(tempfile.mkdtemp(dir=base))
+            lock = FileLock(made / PRIVATE_LOCK, mode=0o600)
+            lock.acquire()
+    except (OSError, NotImplementedError, Timeout) as e:
+        raise ResourceError(
+            f"{base}: Slurm's job files cannot be written ({getattr(e, 'strerror', None) or e}); name another private folder "
+            "that all nodes see with --slurm-folder"
+        ) from e
+    try:
+        yield made
+    finally:
+        lock.release()
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _sweep(base: Path) -> None:
+    """Remove the folders of farms that have ended."""
+    for old in base.iterdir():
+        if old.is_dir() and not old.is_symlink():
+            try:
+                with FileLock(old / PRIVATE_LOCK, blocking=False):
+                    pass
+            except Timeout:
+                continue
+            shutil.rmtree(old, ignore_errors=True)

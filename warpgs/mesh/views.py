@@ -1,0 +1,333 @@
+"""Depth of a model's surface as many views see it, and where the views agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from warpgs.constants import NEAR
+from warpgs.errors import UsageError
+from warpgs.geometry import back_project, pinhole_of, relative_pose, rotation_matrices
+from warpgs.kernels.tsdf import face_cosines
+from warpgs.priors.sweep import matching_views, shared_sight
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Gaussians
+
+# Depth of a surface along each ray: where the Gaussians of a pixel are densest, and the fraction of their weight there.
+#
+# The depth of a Gaussian's mean, which the rasterizer reports, makes steps on a slanted surface. Here, a Gaussian's
+# depth is where its density along the ray is largest.
+
+CONTRIBUTORS = 32
+"""Number of Gaussians that are used for a pixel: those with the largest blending weights."""
+BAND = 0.02
+"""Largest difference from the median depth, as a fraction of the median, that counts as the same surface."""
+MIN_SHARE = 0.5
+"""A pixel shows a surface if at least this fraction of its weights is within `BAND` of the median depth
+(docs/decisions/027-mesh-depth.md)."""
+BLOCK = 2**15
+"""Number of pixels that are processed at a time: 38 MB for the matrices of their Gaussians."""
+
+
+def whitening(gaussians: Gaussians, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return for each Gaussian a linear map of camera space that makes the Gaussian isotropic; and the Gaussians' means.
+
+    Args:
+        gaussians: N Gaussians.
+        camera: Camera, arrays of numpy.
+
+    Returns:
+        Matrices, shape [N, 3, 3], and the means in camera space [u], shape [N, 3]. Each row of a matrix is a unit axis of the
+        Gaussian, times the smallest scale divided by the scale of this axis.
+    """
+    view = torch.as_tensor(camera.viewmat, dtype=gaussians.means.dtype, device=gaussians.means.device)
+    axes = rotation_matrices(torch.nn.functional.normalize(gaussians.quats, dim=1))
+    # elementwise, not as a product of matrices: its bits would depend on the processor
+    turned = (axes.mT[:, :, None] * view[None, None, :3, :3]).sum(-1)
+    means = (gaussians.means[:, None] * view[None, :3, :3]).sum(-1) + view[:3, 3]
+    scales = gaussians.log_scales
+    return turned * torch.exp(scales.amin(1, keepdim=True) - scales)[..., None], means
+
+
+def densest_depths(matrices: torch.Tensor, means: torch.Tensor, rays: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+    """Return the z-depth [u] at which each of k Gaussians is densest along a ray, shape [P, k].
+
+    The depth of the mean replaces a depth that is 0, negative or not finite.
+
+    Args:
+        matrices: Matrices of `whitening`, shape [N, 3, 3].
+        means: Means in camera space [u], shape [N, 3].
+        rays: Directions in camera space with z = 1, shape [P, 3].
+        ids: Indices of the Gaussians, shape [P, k].
+    """
+    own, mean = matrices[ids], means[ids]
+    along = (own * rays[:, None, None]).sum(-1)
+    center = (own * mean[:, :, None]).sum(-1)
+    squared = (along * along).sum(-1)
+    depth = (along * center).sum(-1) / squared
+    return torch.where((squared > 0) & torch.isfinite(depth) & (depth > 0), depth, mean[..., 2])
+
+
+def weighted_median(depths: torch.Tensor, weights: torch.Tensor) -> torch.Tensor:
+    """Return the weighted median [P] of depths [P, k] with weights [P, k]; depths of weight 0 are ignored."""
+    order = torch.where(weights > 0, depths, torch.inf).argsort(dim=1, stable=True)
+    sums = weights.gather(1, order).cumsum(1)
+    half = (2 * sums >= sums[:, -1:]).int().argmax(1, keepdim=True)
+    return depths.gather(1, order.gather(1, half))[:, 0]
+
+
+def surface_depth(
+    gaussians: Gaussians, camera: Camera, ids: torch.Tensor, weights: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the median depth of each pixel's Gaussians, and the fraction of their weights within `BAND` of that depth.
+
+    Args:
+        gaussians: N Gaussians in the units of the camera.
+        camera: Pinhole camera, arrays of numpy.
+        ids: Indices of each pixel's Gaussians, -1 for none, shape [H, W, k].
+        weights: Their blending weights, 0 for none, shape [H, W, k].
+
+    Returns:
+        z-depth [u] and fraction in [0, 1], shape [H, W] each; 0 and 0 where a pixel has no Gaussian.
+    """
+    height, width, k = ids.shape
+    if not len(gaussians):
+        return weights.new_zeros(height, width), weights.new_zeros(height, width)
+    matrices, means = whitening(gaussians, camera)
+    rows, columns = (torch.arange(n, dtype=means.dtype, device=means.device) + 0.5 for n in (height, width))
+    x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])
+    y = (rows - float(camera.K[1, 2])) / float(camera.K[1, 1])
+    rays = torch.stack([x.repeat(height), y.repeat_interleave(width), x.new_ones(height * width)], 1)
+    found = []
+    for first in range(0, len(rays), BLOCK):
+        part = slice(first, first + BLOCK)
+        w, i = weights.reshape(-1, k)[part], ids.reshape(-1, k)[part].clamp_min(0).long()
+        depths, sums = densest_depths(matrices, means, rays[part], i), w.sum(1)
+        median = weighted_median(depths, w)
+        near = (depths - median[:, None]).abs() <= BAND * median[:, None]
+        share = torch.where(near, w, 0).sum(1) / torch.where(sums > 0, sums, 1)
+        found.append(torch.stack([torch.where(sums > 0, median, 0), share]))
+    depth, share = torch.cat(found, 1).reshape(2, height, width)
+    return depth, share
+
+
+DEPTHS = ("median", "mean")
+"""Kinds of rendered depth that can be fused."""
+MIN_ALPHA = 0.5
+"""Least opacity of a pixel that shows a surface."""
+EMPTY = 0.02
+"""Opacity below which a pixel is empty: five of 255 levels."""
+SAMPLES = 200_000
+"""Number of pixels of all views that are sampled to find the extent of the surfaces."""
+KEPT_PIXELS = 2**24
+"""Largest number of pixels of all views together for which renders are kept, 320 MiB; otherwise every use renders again."""
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """Surface that one camera sees."""
+
+    camera: Camera
+    """Pinhole camera, arrays of numpy."""
+    depth: torch.Tensor
+    """z-depth [u], shape [H, W]; infinite for an empty pixel, 0 where the depth is uncertain."""
+    weights: torch.Tensor
+    """Weight of each pixel, in [0, 1], shape [H, W]: the cosine between ray and normal, times alpha if there is a surface."""
+    image: torch.Tensor
+    """Colours, shape [H, W, 3]."""
+
+
+@torch.no_grad()
+def surface_view(gaussians: Gaussians, camera: Camera, options: RasterizeOptions, depth: str = "median") -> SurfaceView:
+    """Render what a camera sees of the surface.
+
+    Args:
+        gaussians: N Gaussians in the units of the camera.
+        camera: Camera, arrays of numpy; a lens is replaced by the pinhole of the same K.
+        options: Settings of the rasterizer.
+        depth: Depth to use, one of `DEPTHS`.
+
+    Raises:
+        UsageError: The camera has no pinhole of the same K, or the depth is unknown.
+    """
+    if depth not in DEPTHS:
+        raise UsageError(f"depth {depth!r} is not one of {', '.join(DEPTHS)}")
+    camera = pinhole_of(camera)
+    r = rasterize(gaussians, camera, replace(options, heaviest=CONTRIBUTORS if depth == "median" else 0))
+    z = r.depth
+    if r.heaviest_ids is not None and r.heaviest_weights is not None:
+        z, share = surface_depth(gaussians, camera, r.heaviest_ids, r.heaviest_weights)
+        z = torch.where(share >= MIN_SHARE, z, 0)
+    z = torch.where(r.alpha >= MIN_ALPHA, z, torch.where(r.alpha <= EMPTY, torch.inf, 0.0)).contiguous()
+    weights = face_cosines(z, camera) * torch.where(torch.isfinite(z), r.alpha, 1.0)
+    return SurfaceView(camera, z, weights, r.rgb.contiguous())
+
+
+class SurfaceViews:
+    """Surfaces that the cameras see, in the order of the cameras; they can be iterated several times.
+
+    If all views together have at most `KEPT_PIXELS` pixels, each view is rendered once and kept. Otherwise every iteration
+    renders the views again, one at a time.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], options: RasterizeOptions, depth: str,
+        stage: Callable[[str], object] = lambda line: None,
+    ) -> None:  # fmt: skip
+        """Prepare to render a model from all cameras.
+
+        Args:
+            gaussians: N Gaussians in the units of the cameras.
+            cameras: Cameras, arrays of numpy.
+            options: Settings of the rasterizer.
+            depth: Depth to use, one of `DEPTHS`.
+            stage: Function that shows a line of progress, before each view.
+        """
+        self._render = lambda camera: surface_view(gaussians, camera, options, depth)
+        self._cameras, self._stage = cameras, stage
+        self._keeps = sum(c.width * c.height for c in cameras) <= KEPT_PIXELS
+        self._kept: dict[int, SurfaceView] = {}
+
+    def __call__(self, purpose: str) -> Iterator[SurfaceView]:
+        """Yield what each camera sees of the surface.
+
+        Args:
+            purpose: Text for the line of progress.
+
+        Raises:
+            UsageError: A camera has no pinhole of the same K, or the depth is unknown.
+        """
+        for i, camera in enumerate(self._cameras):
+            self._stage(f"{purpose}: view {i + 1} of {len(self._cameras)}")
+            view = self._kept.get(i) or self._render(camera)
+            if self._keeps:
+                self._kept[i] = view
+            yield view
+
+
+def sample_surface(view: SurfaceView, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return points of the surface that a view sees, on an even grid of its pixels.
+
+    Args:
+        view: The view.
+        count: Approximate number of pixels to sample.
+
+    Returns:
+        Positions [u], shape [N, 3], and the width of a pixel there [u], shape [N].
+    """
+    depth, camera = view.depth.cpu().numpy().astype(np.float64), view.camera
+    step = max(1, round((depth.size / count) ** 0.5))
+    row, column = np.mgrid[step // 2 : depth.shape[0] : step, step // 2 : depth.shape[1] : step].reshape(2, -1)
+    z = depth[row, column]
+    seen = (z > 0) & np.isfinite(z)
+    pixels = np.stack([column, row], 1)[seen] + 0.5
+    focal = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    return back_project(camera, pixels, z[seen]), z[seen] / focal
+
+
+# Agreement of views on depth: a mesh omits a point if other views see surfaces there, but none at the point's depth.
+#
+# A fit of few views constrains depth only where two views look. If only one view sees a surface, such as beside an
+# occluding edge, the surface's depth is unconstrained.
+
+TOLERANCE = 0.02
+"""Largest difference of two depths of one surface, as a fraction of the depth; scores of coverage use the same limit (decision
+019)."""
+NEIGHBOURS = 16
+"""Largest number of views that each view is compared with: the nearest that see the same surface from another angle."""
+MAX_PIXELS = 2**26
+"""Largest number of depths in all maps together, 256 MiB; if images have more pixels, maps store every ``step``-th pixel."""
+BOUNDS = (0.02, 0.98)
+"""Quantiles of a view's depths that are used as the depths of the nearest and farthest surface."""
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """Depth of one view, kept to compare other views with."""
+
+    camera: Camera
+    """Pinhole camera of the whole image, arrays of numpy."""
+    depth: torch.Tensor
+    """z-depth [u] of every ``step``-th pixel of every ``step``-th row, 0 without a surface, shape [h, w]."""
+    step: int
+    """Pixels from one stored depth to the next."""
+    bounds: tuple[float, float]
+    """Smallest and largest depth [u] of the surface, without outliers (`BOUNDS`)."""
+
+
+def depth_map(view: SurfaceView, views: int) -> DepthMap:
+    """Return the depth of a view for comparisons.
+
+    Args:
+        view: The view.
+        views: Number of views with a depth map.
+    """
+    step = max(1, int(np.ceil((view.depth.numel() * views / MAX_PIXELS) ** 0.5)))
+    depth = view.depth[step // 2 :: step, step // 2 :: step]
+    depth = torch.where(torch.isfinite(depth), depth, 0).contiguous()
+    known = depth[depth > 0].cpu().numpy()
+    near, far = np.quantile(known, BOUNDS) if len(known) else (1.0, 1.0)
+    return DepthMap(view.camera, depth, step, (float(near), max(float(far), float(near) * 1.01)))
+
+
+def neighbours(maps: Sequence[DepthMap]) -> list[list[int]]:
+    """Return the views that each view is compared with, by index, nearest first."""
+    cameras = [m.camera for m in maps]
+    sight = shared_sight(cameras, [m.bounds for m in maps])
+    return [matching_views(sight, cameras, i, NEIGHBOURS, range(len(maps))) for i in range(len(maps))]
+
+
+def agreed(view: SurfaceView, others: Sequence[DepthMap]) -> SurfaceView:
+    """Return a view without the depths that no other view confirms.
+
+    A depth is kept if at least one other view has a surface within `TOLERANCE` of the depth's point. A depth is also kept if
+    its point projects onto no surface in any other view, such as outside of all other images. So a single view keeps all its
+    depths.
+
+    Args:
+        view: The view.
+        others: Depth maps of the views to compare with.
+    """
+    shown = torch.isfinite(view.depth) & (view.depth > 0)
+    confirmed, questioned = torch.zeros_like(shown), torch.zeros_like(shown)
+    for other in others:
+        difference = _difference(torch.where(shown, view.depth, 0), view.camera, other)
+        confirmed |= difference <= TOLERANCE
+        questioned |= torch.isfinite(difference)
+    kept = confirmed | ~questioned | ~shown
+    return replace(view, depth=torch.where(kept, view.depth, 0), weights=torch.where(kept, view.weights, 0))
+
+
+def _difference(depth: torch.Tensor, camera: Camera, other: DepthMap) -> torch.Tensor:
+    """Return how far one view's points are from another view's surface in depth, as a fraction of depth, shape [H, W].
+
+    A point is compared with the nearest of the four depths around its projection, since depth varies within a pixel on a
+    slanted surface. The result is infinite where the pixel has no depth, outside of the other image, and where all four depths
+    are missing. No product of matrices is used: its bits would depend on the processor.
+    """
+    rotation, translation = relative_pose(camera, other.camera)
+    height, width = depth.shape
+    rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (height, width))
+    x = (columns - float(camera.K[0, 2])) / float(camera.K[0, 0])
+    y = (rows - float(camera.K[1, 2])) / float(camera.K[1, 1])
+    px, py, z = (
+        depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
+        for r, t in zip(rotation, translation)
+    )
+    ahead = (depth > 0) & (z > NEAR)
+    K, safe = other.camera.K, torch.where(ahead, z, torch.inf)
+    u, v = (p / safe * float(K[i, i]) + float(K[i, 2]) for i, p in enumerate((px, py)))
+    inside = ahead & (u >= 0) & (v >= 0) & (u < other.camera.width) & (v < other.camera.height)
+    left, top = (torch.floor((a - (other.step // 2 + 0.5)) / other.step) for a in (u, v))
+    h, w = other.depth.shape
+    least = torch.full_like(depth, torch.inf)
+    for down in (0, 1):
+        row = (top + down).clamp(0, h - 1).long()
+        for right in (0, 1):
+            found = other.depth[row, (left + right).clamp(0, w - 1).long()]
+            least = torch.minimum(least, torch.where(found > 0, (found - z).abs(), torch.inf))
+    return torch.where(inside, least / safe, torch.inf)

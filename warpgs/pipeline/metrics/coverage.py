@@ -1,0 +1,490 @@
+"""Scores by coverage: how many training views saw the surface of each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.functional import interpolate
+
+from warpgs.constants import NEAR
+from warpgs.files import make_folder, read_file, write_bytes
+from warpgs.geometry import check_pinhole, pinhole_of, relative_pose
+from warpgs.io.images import decode
+from warpgs.kernels.ssim import ssim
+from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
+from warpgs.priors.given_depth import pinhole_view
+from warpgs.process import counted
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.report.images import COVERAGE_LEGEND, coverage_image, png, webp
+from warpgs.report.page import CoverageReport
+from warpgs.scene import Camera, Gaussians, View
+
+TOLERANCE = 0.02
+"""Largest difference of two depths of one surface, as a fraction of the depth. Measured on training photographs alone: at this
+difference, the squared colour difference of two photographs is twice (3 dB) the value at the best agreement of depths (decision
+019)."""
+MIN_ALPHA = 0.5
+"""Least opacity of a pixel that shows a surface; other pixels have no depth."""
+MAX_COUNT = 255
+"""Largest number of views that is stored for a pixel; higher counts are clamped."""
+GRID = 32
+"""Number of points along the longer side of an image that `fraction_outside` checks."""
+MAX_PIXELS = 2**26
+"""Largest total number of pixels of all depth maps, 256 MiB; above it, maps are rendered at a smaller size."""
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """Depth of the model at the pixels of one training view."""
+
+    camera: Camera
+    """Camera, arrays of numpy, at the size of ``depth``."""
+    depth: torch.Tensor
+    """Expected z-depth [u], float32, shape [H, W]; 0 where the model shows no surface, or the mask of the view hides it."""
+
+
+@dataclass(frozen=True)
+class Match:
+    """The points of one view's pixels as another view sees them; tensors of the shape of the pixels, [H, W]."""
+
+    u: torch.Tensor
+    """Column in the other view [px], pixel centres at +0.5; undefined where ``difference`` is infinite."""
+    v: torch.Tensor
+    """Row in the other view [px]."""
+    difference: torch.Tensor
+    """Smallest difference between the point's depth in the other view and the depths seen at the four pixels around the point,
+    as a fraction of the depth. Four pixels are compared because depth varies within a pixel on a slanted surface. Infinite
+    outside the other image, where the other view sees no surface, and where the pixel itself shows none."""
+
+
+@torch.no_grad()
+def depth_of(gaussians: Gaussians, camera: Camera, options: RasterizeOptions) -> torch.Tensor:
+    """Render the expected z-depth [u] of a view, shape [H, W]; 0 where less than `MIN_ALPHA` of a pixel is covered."""
+    r = rasterize(gaussians, camera, options)
+    return torch.where(r.alpha >= MIN_ALPHA, r.depth, 0)
+
+
+def depth_views(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    options: RasterizeOptions,
+    masks: Sequence[np.ndarray | None] | None = None,
+    max_pixels: int = MAX_PIXELS,
+) -> list[DepthView]:
+    """Render the depth of every training view once.
+
+    Args:
+        gaussians: N Gaussians in the units of the cameras.
+        cameras: Cameras of the training views, arrays of numpy.
+        options: Options of the rasterizer.
+        masks: True for pixels of a view that are used, bool, shape [H, W] each; None for a view without a mask, or for no
+            masks.
+        max_pixels: Largest total number of pixels of all maps; above it, both sides of every map are reduced by the same
+            factor.
+
+    Returns:
+        The views in the order of the cameras, on the device of the Gaussians.
+
+    Raises:
+        UsageError: A camera has no pinhole of the same K, such as an orthographic one.
+    """
+    pixels = sum(c.width * c.height for c in cameras)
+    factor = min(1.0, (max_pixels / max(1, pixels)) ** 0.5)
+    views = []
+    for i, camera in enumerate(cameras):
+        small = _resized(pinhole_of(camera), factor)
+        depth = depth_of(gaussians, small, options)
+        mask = None if masks is None else masks[i]
+        if mask is not None:
+            counts = torch.as_tensor(mask, dtype=torch.float32, device=depth.device)[None, None]
+            counts = torch.nn.functional.interpolate(counts, depth.shape, mode="area")[0, 0]
+            depth = torch.where(counts > 0.5, depth, 0)
+        views.append(DepthView(small, depth))
+    return views
+
+
+def _resized(camera: Camera, factor: float) -> Camera:
+    """Return the camera of the image at another size, at least one pixel on each side."""
+    if factor == 1:
+        return camera
+    width, height = (max(1, int(factor * n)) for n in (camera.width, camera.height))
+    scale = np.array([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, K=scale * camera.K, width=width, height=height)
+
+
+def match(depth: torch.Tensor, camera: Camera, other: DepthView) -> Match:
+    """Compare the points that a view's pixels show with the surface that another view sees.
+
+    Args:
+        depth: z-depth of the pixels [u], 0 where there is no surface, shape [H, W].
+        camera: Their camera, arrays of numpy.
+        other: The other view.
+
+    Raises:
+        UsageError: ``camera`` is not a pinhole.
+    """
+    check_pinhole(camera)
+    u, v, z = _seen_from(depth, camera, other.camera)
+    height, width = other.depth.shape
+    inside = (depth > 0) & (z > NEAR) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    left, top = torch.floor(u - 0.5), torch.floor(v - 0.5)
+    columns = [(left + i).clamp(0, width - 1).long() for i in (0, 1)]
+    rows = [(top + i).clamp(0, height - 1).long() * width for i in (0, 1)]
+    flat = other.depth.flatten()
+    around = torch.stack([flat[r + c] for r in rows for c in columns])
+    distance = torch.where(around > 0, (around - z).abs(), torch.inf).amin(0)
+    return Match(u, v, torch.where(inside, distance / z, torch.inf))
+
+
+def _seen_from(depth: torch.Tensor, camera: Camera, other: Camera) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return column and row [px] and z-depth [u] in another view of the points at a view's pixels, shape [H, W] each.
+
+    No product of matrices is used, because its bits would depend on the processor. For points behind the other view, columns
+    and rows are undefined.
+    """
+    rotation, translation = relative_pose(camera, other)
+    K, other_K = camera.K, other.K
+    height, width = depth.shape
+    x = (torch.arange(width, dtype=depth.dtype, device=depth.device) + 0.5 - float(K[0, 2])) / float(K[0, 0])
+    y = (torch.arange(height, dtype=depth.dtype, device=depth.device) + 0.5 - float(K[1, 2])) / float(K[1, 1])
+    px, py, z = (
+        depth * (x[None] * float(r[0]) + (y[:, None] * float(r[1]) + float(r[2]))) + float(t)
+        for r, t in zip(rotation, translation)
+    )
+    safe = torch.where(z > NEAR, z, torch.inf)
+    u, v = (p / safe * float(other_K[i, i]) + float(other_K[i, 2]) for i, p in enumerate((px, py)))
+    return u, v, z
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Coverage of the pixels of one render; tensors of shape [H, W]."""
+
+    counts: torch.Tensor
+    """Number of training views that saw the point, at most `MAX_COUNT`, uint8; 0 where the render shows no surface."""
+    difference: torch.Tensor
+    """Least difference of depths to a training view, as in `Match`; infinite where the point is in no training image."""
+    empty: torch.Tensor
+    """True where the render shows no surface, bool."""
+
+
+def coverage_map(depth: torch.Tensor, camera: Camera, training: Sequence[DepthView], tolerance: float = TOLERANCE) -> Coverage:
+    """Count, for each pixel of a render, the training views that saw the point at this pixel.
+
+    A view saw a point that is in its image, inside its mask, and on its rendered surface: neither behind the surface (occluded)
+    nor in front of it (the view looks through). Counts use the model's depth, so they are as accurate as the model's geometry.
+
+    Args:
+        depth: z-depth of the render [u], 0 where there is no surface, shape [H, W], as `depth_of` gives it.
+        camera: Camera of the render, arrays of numpy.
+        training: Training views, from `depth_views`.
+        tolerance: Largest difference of depths of one surface, as a fraction of the depth.
+
+    Returns:
+        The coverage, on the device of ``depth``.
+
+    Raises:
+        UsageError: ``camera`` is not a pinhole.
+    """
+    counts = torch.zeros(depth.shape, dtype=torch.int32, device=depth.device)
+    least = torch.full_like(depth, torch.inf)
+    for view in training:
+        difference = match(depth, camera, view).difference
+        counts += difference <= tolerance
+        least = torch.minimum(least, difference)
+    return Coverage(counts.clamp_max(MAX_COUNT).to(torch.uint8), least, depth <= 0)
+
+
+def fraction_outside(depth: torch.Tensor, camera: Camera, photographs: Sequence[Camera], empty: bool = True) -> float:
+    """Return the fraction of a render's pixels that show a point outside the images of all photographs, sampled on a grid.
+
+    Unlike `coverage_map`, this function renders nothing, and counts occluded points as seen.
+
+    Args:
+        depth: z-depth of the render [u], 0 where there is no surface, shape [H, W].
+        camera: Camera of the render, a pinhole; arrays of numpy.
+        photographs: Cameras of the photographs; a lens is replaced by the pinhole of the same K.
+        empty: Whether pixels without a surface are included, at the median depth of the other pixels.
+
+    Raises:
+        UsageError: A photograph has no pinhole of the same K, such as an orthographic one.
+    """
+    small = _resized(camera, min(1.0, GRID / max(camera.width, camera.height)))
+    rows, columns = (
+        ((torch.arange(few, device=depth.device) + 0.5) * (many / few)).long()
+        for few, many in ((small.height, camera.height), (small.width, camera.width))
+    )
+    points = depth[rows][:, columns].cpu()
+    shown = points > 0
+    if not shown.any():
+        return 0.0
+    outside = torch.ones_like(shown) if empty else shown
+    points = torch.where(shown, points, points[shown].median())
+    for other in sorted(photographs, key=lambda c: float(np.linalg.norm(c.center - camera.center))):
+        u, v, z = _seen_from(points, small, pinhole_of(other))
+        outside = outside & ~((z > NEAR) & (u >= 0) & (u < other.width) & (v >= 0) & (v < other.height))
+        if not outside.any():  # mostly after the nearest few
+            break
+    return float(outside.float().mean())
+
+
+CLASSES = {
+    "0": "seen by no training view", "1": "seen by one", "2+": "seen by two or more", "background": "transparent, empty",
+}  # fmt: skip
+"""Classes of pixels, with a description of each for the user. If no view of a scene has an alpha channel, no pixel is
+background."""
+BINS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, np.inf)
+"""Upper bounds of the classes of depth difference, each with its expected error; the last class has no bound."""
+PROBED = 6
+"""Largest number of training views that are compared with each other, evenly spaced: 6 give 30 ordered pairs."""
+
+
+@torch.no_grad()
+def photo_errors(train: Sequence[View], training: Sequence[DepthView]) -> np.ndarray | None:
+    """Measure how much two training photographs of the same point differ in colour, as a function of the difference in depth.
+
+    Each photograph is warped to another view by the model's depth and compared with the photograph there, pixel by pixel. The
+    result estimates the error of a pixel from its least depth difference to a training view. The estimate uses the data that
+    the model was fitted to. It includes differences between the photographs, such as reflections and exposure.
+
+    Args:
+        train: Training views.
+        training: Their depths, from `depth_views`.
+
+    Returns:
+        Mean squared errors of colours in [0, 1] by class of `BINS`, float64, shape [8]; a class without pixels has the value of
+        the class before it. None if no pixel of a photograph can be compared.
+    """
+    chosen = np.unique(np.linspace(0, len(train) - 1, min(PROBED, len(train))).round().astype(int))
+    photos = {i: _photo(train[i], training[i]) for i in chosen}
+    total, count = np.zeros(len(BINS)), np.zeros(len(BINS))
+    for i in chosen:
+        for j in chosen:
+            if i == j:
+                continue
+            m = match(training[i].depth, training[i].camera, training[j])
+            inside = torch.isfinite(m.difference)
+            error = (_sampled(photos[j], m.u[inside], m.v[inside]) - photos[i][inside]).double().square().mean(1)
+            index = _bin(m.difference[inside].cpu().numpy())
+            total += np.bincount(index, error.cpu().numpy(), len(BINS))
+            count += np.bincount(index, minlength=len(BINS))
+    if not count.any():
+        return None
+    found = np.divide(total, count, out=np.full(len(BINS), np.nan), where=count > 0)
+    known = np.flatnonzero(count)
+    filled: np.ndarray = found[known[np.maximum(np.searchsorted(known, np.arange(len(BINS)), "right") - 1, 0)]]
+    return filled
+
+
+def _bin(difference: np.ndarray) -> np.ndarray:
+    """Return the class of `BINS` of each difference."""
+    return np.searchsorted(np.asarray(BINS, np.float32), difference)
+
+
+def _photo(view: View, at: DepthView) -> torch.Tensor:
+    """Return the image of a view at the size of its depth, on the device of the depth, shape [H, W, 3]."""
+    image = torch.as_tensor(view.image, dtype=torch.float32, device=at.depth.device)
+    if image.shape[:2] == at.depth.shape:
+        return image
+    return interpolate(image.permute(2, 0, 1)[None], at.depth.shape, mode="area")[0].permute(1, 2, 0)
+
+
+def _sampled(image: torch.Tensor, u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Return the colours [S, 3] of an image [H, W, 3] at columns and rows [S] [px], linear between pixels."""
+    height, width = image.shape[:2]
+    x, y = (u - 0.5).clamp(0, width - 1), (v - 0.5).clamp(0, height - 1)
+    left, top = x.long(), y.long()
+    right, bottom = (left + 1).clamp(max=width - 1), (top + 1).clamp(max=height - 1)
+    a, b = (x - left)[:, None], (y - top)[:, None]
+    above = (1 - a) * image[top, left] + a * image[top, right]
+    below = (1 - a) * image[bottom, left] + a * image[bottom, right]
+    return (1 - b) * above + b * below
+
+
+def classes_of(coverage: Coverage, transparent: bool) -> dict[str, np.ndarray]:
+    """Return the pixels of each class of `CLASSES`, bool [H, W], every pixel in one.
+
+    Args:
+        coverage: Coverage of the render.
+        transparent: True if the scene has an alpha channel: a pixel without a surface is then background, else unseen.
+    """
+    counts, empty = coverage.counts.cpu().numpy(), coverage.empty.cpu().numpy() & transparent
+    return {"0": (counts == 0) & ~empty, "1": counts == 1, "2+": counts >= 2, "background": empty}
+
+
+def _sums(view: View, image: np.ndarray, classes: dict[str, np.ndarray], expected: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Return for each class the number of scored pixels and the sums over them of squared error, SSIM and expected error."""
+    region, kind = scored_region(view)
+    image, target = to_8_bit(image), to_8_bit(view.image)
+    error = np.square(image.astype(np.float64) - target).mean(-1)
+    if region is not None and kind != "foreground":
+        image, target = over_white(image, region), over_white(target, region)
+    similarity = ssim(torch.from_numpy(image), torch.from_numpy(target)).numpy().astype(np.float64).mean(-1)
+    maps = [np.ones_like(error), error, similarity, np.zeros_like(error) if expected is None else expected]
+    inside = {c: m if region is None else m & region for c, m in classes.items()}
+    return {c: np.array([values[m].sum() for values in maps]) for c, m in inside.items()}
+
+
+def _row(sums: dict[str, np.ndarray], expected: bool) -> dict[str, dict[str, Any]]:
+    """Return the figures of each class that has pixels."""
+    pixels, error = (sum(s[i] for s in sums.values()) for i in (0, 1))
+    rows = {}
+    for name, (count, squares, similarity, foretold) in sums.items():
+        if count:
+            rows[name] = {
+                "pixels": int(count), "share_of_pixels": float(count / pixels),
+                "share_of_error": float(squares / error) if error else 0.0,
+                "psnr": psnr_of(float(squares / count)), "ssim": float(similarity / count),
+                "expected_psnr": psnr_of(float(foretold / count)) if expected else None,
+            }  # fmt: skip
+    return rows
+
+
+def score_by_coverage(
+    gaussians: Gaussians,
+    train: Sequence[View],
+    test: Sequence[View],
+    options: RasterizeOptions,
+    show: Callable[[View, np.ndarray, dict[str, np.ndarray]], object] = lambda *_: None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> dict[str, Any]:
+    """Split the scores of held-out views by the number of training views that see the point at each pixel.
+
+    Views with a lens model are scored as a pinhole would show them.
+
+    Args:
+        gaussians: N Gaussians in the units of the views' cameras.
+        train: Training views, at least one.
+        test: Held-out views, at least one.
+        options: Options of the rasterizer.
+        show: Called for each held-out view with its render [H, W, 3] and the pixels of each class, bool [H, W].
+        tell: Called with a line before each view is rendered.
+
+    Returns:
+        ``classes``: over all held-out views together, by class, the number of scored ``pixels``, their ``share_of_pixels`` and
+        ``share_of_error`` (squared), and their ``psnr`` [dB], ``ssim`` and ``expected_psnr`` [dB] (by `photo_errors`; None with
+        a single training view); ``views``: the same values for each view by ``name``;
+        ``depth_differences`` and ``photo_psnr``: the table of `photo_errors`; ``tolerance``; ``summary``, a sentence.
+
+    Raises:
+        UsageError: A camera has no pinhole of the same K, such as an orthographic one.
+    """
+    tell("checking coverage")
+    train, test = ([pinhole_view(v) for v in views] for views in (train, test))
+    training = depth_views(gaussians, [v.camera for v in train], options, [v.mask for v in train])
+    errors = photo_errors(train, training)
+    transparent = any(v.alpha is not None for v in (*train, *test))
+    views, total = [], {c: np.zeros(4) for c in CLASSES}
+    for view in counted(test, tell, "checking coverage", "views"):
+        image, depth, alpha = render_view(gaussians, view, options)
+        surface = torch.from_numpy(np.where(alpha >= MIN_ALPHA, depth, 0)).to(gaussians.means.device)
+        found = coverage_map(surface, view.camera, training)
+        classes = classes_of(found, transparent)
+        expected = None if errors is None else errors[_bin(found.difference.cpu().numpy())]
+        sums = _sums(view, image, classes, expected)
+        show(view, image, classes)
+        views.append({"name": view.name, "classes": _row(sums, errors is not None)})
+        total = {c: total[c] + sums[c] for c in CLASSES}
+    pooled = _row(total, errors is not None)
+    return {
+        "classes": pooled, "views": views, "tolerance": TOLERANCE, "depth_differences": list(BINS[:-1]),
+        "photo_psnr": None if errors is None else [psnr_of(e) for e in errors.tolist()], "summary": _summary(pooled),
+    }  # fmt: skip
+
+
+def _summary(rows: dict[str, dict[str, Any]]) -> str:
+    """Return a sentence for the user: the fraction of pixels that no training view saw, and the fraction of the error there."""
+    unseen = rows.get("0")
+    if unseen is None:
+        return "every held-out pixel was seen by a training view"
+    pixels, error = (f"{100 * unseen[f'share_of_{what}']:.3g} %" for what in ("pixels", "error"))
+    return f"{pixels} of the held-out pixels were seen by no training view; they account for {error} of the squared error"
+
+
+FOLDER = "coverage"
+"""Folder in a run folder with an image of each held-out view."""
+EXPECTED = (
+    "The expected PSNR is an estimate from training data, not a bound. It is the PSNR between training photographs where the "
+    "depths of two views differ as much as at the scored pixels."
+)
+"""Meaning of the expected PSNR, as text for the user."""
+
+
+def coverage_of_run(
+    out: Path | None,
+    gaussians: Gaussians,
+    train: list[View],
+    test: list[View],
+    options: RasterizeOptions,
+    *,
+    names: Mapping[str, str],
+    tell: Callable[[str], object] = lambda line: None,
+) -> dict[str, Any]:
+    """Split the scores of held-out views by coverage, and save an image of each view.
+
+    Args:
+        out: The run folder; None to write nothing.
+        gaussians: N Gaussians in scene units [u].
+        train: Training views.
+        test: Held-out views, at least one.
+        options: Options of the rasterizer.
+        names: Names of image files by view, from `image_names` for the whole scene.
+        tell: Called with a line for each view before it is rendered.
+
+    Returns:
+        The result of `score_by_coverage`.
+
+    Raises:
+        ResourceError: An image cannot be written.
+    """
+    if out is not None:
+        make_folder(out / FOLDER)
+
+    def show(view: View, image: np.ndarray, classes: dict[str, np.ndarray]) -> None:
+        if out is not None:
+            write_bytes(out / FOLDER / f"{names[view.name]}.png", png(coverage_image(image, classes["0"], classes["1"])))
+
+    return score_by_coverage(gaussians, train, test, options, show, tell)
+
+
+def coverage_table(coverage: dict[str, Any]) -> list[list[str]]:
+    """Return a header row and a row for each class of pixels of each view, then of all views together, as texts."""
+    rows = [["view", "pixels", "share", "squared error", "PSNR [dB]", "SSIM", "expected PSNR [dB]"]]
+    for name, classes in [*((v["name"], v["classes"]) for v in coverage["views"]), ("all views", coverage["classes"])]:
+        for key, r in classes.items():
+            expected = "-" if r["expected_psnr"] is None else f"{r['expected_psnr']:.2f}"
+            shares = (f"{100 * r[f'share_of_{what}']:.1f} %" for what in ("pixels", "error"))
+            rows.append([name, CLASSES[key], *shares, f"{r['psnr']:.2f}", f"{r['ssim']:.3f}", expected])
+    return rows
+
+
+def coverage_lines(coverage: dict[str, Any]) -> list[str]:
+    """Return the table as lines for the user, then a summary, and a legend of the images."""
+    rows = coverage_table(coverage)
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = ["  ".join(c.ljust(w) if i < 2 else c.rjust(w) for i, (c, w) in enumerate(zip(r, widths))) for r in rows]
+    return [*lines, coverage["summary"], EXPECTED, f"images in {FOLDER}/: {COVERAGE_LEGEND}"]
+
+
+def coverage_section(out: Path, coverage: dict[str, Any], shown: list[str], names: Mapping[str, str]) -> CoverageReport:
+    """Return the section of the report page.
+
+    Args:
+        out: The run folder, with the images.
+        coverage: Result of `coverage_of_run`.
+        shown: Names of the views whose images are shown.
+        names: Names of image files by view.
+    """
+    files = {n: out / FOLDER / f"{names[n]}.png" for n in shown}
+    head, *rows = coverage_table(coverage)
+    return CoverageReport(
+        f"{coverage['summary'][0].upper()}{coverage['summary'][1:]}. {EXPECTED}", COVERAGE_LEGEND,
+        [(n, webp(decode(f, data=read_file(f, out))[0], 640)) for n, f in files.items() if f.is_file()],
+        [head[1:], *(r[1:] for r in rows if r[0] == "all views")],
+    )  # fmt: skip

@@ -1,0 +1,447 @@
+"""Scores of rendered views: PSNR, SSIM and LPIPS within the scored region, after matching of colours, and moved cameras."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from warpgs.geometry import back_project, inverse, matmul, project_points
+from warpgs.io.images import dark_pixels
+from warpgs.kernels.ssim import ssim
+from warpgs.kernels.update import squared_error
+from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.priors.flow import nearest_views, pixel_grid
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Gaussians, View, checked_views
+
+
+def quantiles(values: torch.Tensor, *fractions: float) -> list[torch.Tensor]:
+    """Return quantiles of numbers [N], N at least 1, for fractions in [0, 1], linear between neighbours; a NaN ranks last.
+
+    torch.quantile rejects more than 2^24 numbers, and photographs may have more pixels.
+    """
+    ordered = values.sort().values
+    found = []
+    for fraction in fractions:
+        rank = fraction * (len(ordered) - 1)
+        below = int(rank)
+        found.append(torch.lerp(ordered[below], ordered[min(below + 1, len(ordered) - 1)], rank - below))
+    return found
+
+
+OPAQUE = 0.5
+"""Opacity above which a pixel of a cut-out object shows it."""
+
+
+def scored_region(view: View) -> tuple[np.ndarray | None, str]:
+    """Return the pixels that a render is scored on, bool [H, W], and their name; None for all.
+
+    These are the pixels of the view's score mask, if any (DTU's protocol), else the region of `counted_region`.
+    """
+    if view.score_mask is not None:
+        return view.score_mask, "score mask"
+    return counted_region(view)
+
+
+def counted_region(view: View) -> tuple[np.ndarray | None, str]:
+    """Return the pixels of a view that a fit compares with the render, bool [H, W], and their name; None for all.
+
+    These are the pixels of the view's mask, if any. Without a mask, they are the bright pixels of a view of an object on black,
+    because a black frame around a small object would dominate the score.
+    """
+    if view.mask is not None and not view.mask.all():
+        return view.mask, "mask"
+    dark = dark_pixels(view.image)
+    return (None, "all") if dark is None else (~dark, "foreground")
+
+
+def fitted_region(view: View) -> tuple[np.ndarray | None, str]:
+    """Return the pixels behind which a fit may start Gaussians, bool [H, W], and their name; None for all.
+
+    These are the opaque pixels within the mask if the view has an alpha channel, else the region of `counted_region`.
+    """
+    if view.alpha is None:
+        return counted_region(view)
+    opaque = view.alpha > OPAQUE
+    return opaque if view.mask is None else opaque & view.mask, "object"
+
+
+def masked_mse(rgb: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None) -> torch.Tensor:
+    """Return the mean squared error of a rendered image, clamped to [0, 1], over the unmasked pixels.
+
+    Args:
+        rgb: Rendered colours, shape [H, W, 3].
+        target: Colours in [0, 1], shape [H, W, 3].
+        mask: 1 for unmasked pixels, 0 for masked ones, shape [H, W]; None without a mask.
+    """
+    if mask is None:
+        return squared_error(rgb, target) / rgb.numel()
+    return ((rgb.clamp(0, 1) - target) ** 2 * mask[..., None]).sum() / (3 * mask.sum().clamp_min(1))
+
+
+def psnr_of(mse: float) -> float:
+    """Return the PSNR [dB] of a mean squared error of images in [0, 1]; infinite for 0."""
+    return float("inf") if mse == 0 else -10 * math.log10(mse)
+
+
+def psnr(image: np.ndarray, target: np.ndarray, region: np.ndarray | None = None) -> float:
+    """Return the PSNR [dB] of two images in [0, 1], over all channels of the pixels in ``region`` [H, W]; infinite if equal.
+
+    Raises:
+        TypeError: The region is not bool: integers would select rows.
+        ValueError: A shape disagrees.
+    """
+    if image.shape != target.shape:
+        raise ValueError(f"psnr: both images must have one shape, not {list(image.shape)} and {list(target.shape)}; resize one")
+    if region is not None and region.dtype != bool:
+        raise TypeError(f"psnr: region must be bool, not {region.dtype}; give region > 0")
+    if region is not None and region.shape != image.shape[:2]:
+        raise ValueError(f"psnr: region must have shape {list(image.shape[:2])}, not {list(region.shape)}; resize it")
+    difference = image.astype(np.float64) - target
+    if region is not None:
+        difference = difference[region]
+    mse = float((difference**2).mean())
+    # numpy's logarithm, which sometimes rounds differently from math.log10: published figures stay the same
+    return float("inf") if mse == 0 else -10 * float(np.log10(mse))
+
+
+VARIANTS = {
+    "psnr": "of images rounded to 8 bits, over the scored pixels alone; mean over images",
+    "ssim": "as in 3DGS papers: 11 x 11 Gaussian window, sigma 1.5, zero padding, all pixels and channels",
+    "ssim_skimage": "scikit-image, as in NeRF papers: the same window, without the border; about 0.005 lower",
+}
+"""Definition of PSNR and SSIM, for result files and reports. Scores by other definitions are not comparable."""
+ALPHA_VARIANTS = {
+    "psnr_whole": "of views with an alpha channel: over all unmasked pixels, with the background of the fit behind both images",
+    "psnr_foreground": "as psnr_whole, but only over the pixels with an opacity above 0.5",
+    "alpha_empty": "mean rendered alpha over the pixels with an opacity below 0.02: 0 is ideal",
+    "alpha_object": "mean rendered alpha over the pixels with an opacity above 0.98: 1 is ideal",
+}
+"""Definition of each score of views with an alpha channel. A mean covers only the views with pixels for the score."""
+EMPTY, HALF, OBJECT = 0.02, 0.5, 0.98
+"""Opacity below which a pixel is empty, above which it shows the object, and above which it shows only the object."""
+MASKED = "where a view has a mask, SSIM and LPIPS compare both images with white outside of it"
+NO_LPIPS = "not measured: no --lpips-weights were given"
+SSIM_WINDOW = 11
+"""Side of the window of SSIM [px]."""
+
+
+@dataclass(frozen=True)
+class ViewMetrics:
+    """Scores of one view."""
+
+    name: str
+    """Name of the view."""
+    psnr: float
+    """Peak signal-to-noise ratio [dB] after rounding to 8 bits, over the scored pixels."""
+    ssim: float
+    """Mean structural similarity, 3DGS variant (zero padding, every pixel)."""
+    ssim_skimage: float
+    """Mean structural similarity, scikit-image variant (Gaussian weights, border cropped)."""
+    region: str
+    """Scored pixels: all, mask, score mask, or foreground (the object on a black background)."""
+    lpips: dict[str, float] = field(default_factory=dict)
+    """LPIPS by variant (`lpips_vgg_legacy`); empty without weights, NaN if the image is too small."""
+    opacity: dict[str, float] = field(default_factory=dict)
+    """Scores by the names of `ALPHA_VARIANTS`, NaN if the view has no such pixels; empty if the view is opaque."""
+
+    def row(self) -> dict[str, Any]:
+        """Return all scores by name, flat, as in result files."""
+        plain: dict[str, Any] = asdict(self)
+        return {k: v for k, v in plain.items() if k not in ("lpips", "opacity")} | self.opacity | self.lpips
+
+
+def to_8_bit(image: np.ndarray) -> np.ndarray:
+    """Round an image in [0, 1] to the values that an 8-bit file can hold, float32."""
+    levels: np.ndarray = np.round(np.clip(image, 0, 1) * 255).astype(np.float32)
+    return levels / 255
+
+
+def over_white(image: np.ndarray, region: np.ndarray) -> np.ndarray:
+    """Return the image [H, W, 3] with white where ``region`` [H, W] is False."""
+    return np.where(region[..., None], image, np.float32(1))
+
+
+def _opacity_scores(
+    image: np.ndarray, target: np.ndarray, alpha: np.ndarray, true: np.ndarray, mask: np.ndarray | None
+) -> dict[str, float]:
+    """Return the scores of `ALPHA_VARIANTS` for images of 8 bits [H, W, 3], a rendered and a true alpha and a mask [H, W]."""
+    counted = np.ones(true.shape, bool) if mask is None else mask
+    regions = {"psnr_whole": counted, "psnr_foreground": counted & (true > HALF)}
+    scores = {k: psnr(image, target, r) if r.any() else float("nan") for k, r in regions.items()}
+    for name, r in (("alpha_empty", counted & (true < EMPTY)), ("alpha_object", counted & (true > OBJECT))):
+        scores[name] = float(alpha[r].mean(dtype=np.float64)) if r.any() else float("nan")
+    return scores
+
+
+def score(view: View, image: np.ndarray, lpips: Lpips | None = None, alpha: np.ndarray | None = None) -> ViewMetrics:
+    """Compare a rendered image [H, W, 3], and its alpha [H, W] if the view has an alpha channel, with the image of its view.
+
+    Masks are used as in DTU's protocol (Niemeyer et al. 2022 and later papers): PSNR over the mask's pixels alone, SSIM and
+    LPIPS on both images with white outside the mask.
+    """
+    from skimage.metrics import structural_similarity
+
+    region, name = scored_region(view)
+    image, target = to_8_bit(image), to_8_bit(view.image)
+    decibels = psnr(image, target, region)
+    opacity = {} if alpha is None or view.alpha is None else _opacity_scores(image, target, alpha, view.alpha, view.mask)
+    if region is not None and name != "foreground":
+        image, target = over_white(image, region), over_white(target, region)
+    similarity = float(ssim(torch.from_numpy(image), torch.from_numpy(target)).mean())
+    if min(image.shape[:2]) >= SSIM_WINDOW:
+        cropped = structural_similarity(  # type: ignore[no-untyped-call]
+            image, target, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1
+        )
+    else:
+        cropped = float("nan")  # the window does not fit
+    distances = {} if lpips is None else lpips.measure(image, target)
+    return ViewMetrics(view.name, decibels, similarity, float(cropped), name, distances, opacity)
+
+
+def options_for(
+    rule: str, background: tuple[float, float, float], gaussians: Gaussians, antialiased: bool = False
+) -> RasterizeOptions:
+    """Return the rasterizer's options for a model: its cut-offs, its background, and whether it is antialiased."""
+    return RasterizeOptions(rule=rule, background=gaussians.means.new_tensor(background), antialiased=antialiased)
+
+
+@torch.no_grad()
+def render_view(gaussians: Gaussians, view: View, options: RasterizeOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Render a view; returns colours [H, W, 3], depth [u] [H, W] and alpha [H, W] as numpy arrays."""
+    r = rasterize(gaussians, view.camera, options)
+    return r.rgb.cpu().numpy(), r.depth.cpu().numpy(), r.alpha.cpu().numpy()
+
+
+def evaluate(
+    gaussians: Gaussians, views: Sequence[View], options: RasterizeOptions | None = None, lpips: Lpips | None = None
+) -> list[ViewMetrics]:
+    """Render views and score each against its image, as a fit does.
+
+    Args:
+        gaussians: N Gaussians in the units of the views' cameras: scene units for the views of a `Scene`.
+        views: Views with images; use held-out views for a meaningful score.
+        options: Options of the rasterizer, such as `FitResult.options`; None for the defaults.
+        lpips: Network for LPIPS (`load_lpips`); None to skip LPIPS.
+
+    Returns:
+        The scores of each view, in order; `summarize` gives their means.
+
+    Raises:
+        DataError: A field of a view is invalid; the message names the view, the field and the fix.
+    """
+    views = checked_views(views)
+    options = RasterizeOptions() if options is None else options
+    rendered = ((v, render_view(gaussians, v, options)) for v in views)
+    return [score(v, image, lpips, alpha) for v, (image, _, alpha) in rendered]
+
+
+def baselines(train: list[View], test: list[View]) -> dict[str, float]:
+    """Return the mean PSNR [dB] over the test views of two predictions without 3D, which any useful fit beats.
+
+    ``mean_photo``: the mean of the training images; ``nearest_photo``: the image of the nearest training camera. Training
+    images whose size differs from the test view's are left out, and so is a baseline without any score.
+    """
+    scores: dict[str, list[float]] = {"mean_photo": [], "nearest_photo": []}
+    for view in test:
+        same = [v for v in train if v.image.shape == view.image.shape]
+        if not same:
+            continue
+        region, _ = scored_region(view)
+        nearest = min(same, key=lambda v: float(np.linalg.norm(v.camera.center - view.camera.center)))
+        scores["mean_photo"].append(psnr(to_8_bit(np.mean([v.image for v in same], axis=0)), view.image, region))
+        scores["nearest_photo"].append(psnr(nearest.image, view.image, region))
+    return {name: float(np.mean(values)) for name, values in scores.items() if values}
+
+
+def summarize(metrics: list[ViewMetrics]) -> dict[str, float]:
+    """Return the means over views of every numeric score; empty without views.
+
+    Means of opacity scores are over the views that have such a score.
+    """
+    if not metrics:
+        return {}
+    rows = [m.row() for m in metrics]
+    means = {key: float(np.mean([r[key] for r in rows])) for key in ("psnr", "ssim", "ssim_skimage", *metrics[0].lpips)}
+    for key in ALPHA_VARIANTS:
+        known = [r[key] for r in rows if not np.isnan(r.get(key, np.nan))]
+        means |= {key: float(np.mean(known))} if known else {}
+    return means
+
+
+def variants(lpips: Lpips | None) -> dict[str, str]:
+    """Return the definition of each score but those of `ALPHA_VARIANTS`, and how masks are used."""
+    return VARIANTS | {"masks": MASKED} | ({"lpips": NO_LPIPS} if lpips is None else lpips.variants())
+
+
+MATCHED_RULE = "over the right half of each view, after an affine colour map fitted to its left half"
+"""Definition of the score, as text for the user."""
+RIDGE = 1e-6
+"""Added to the variances of the colours, so that an image of one colour has a map, too: a deviation of 0.001 of full range."""
+
+
+def affine_map(rendered: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least-squares matrix [3, 3] and offset [3] that map rendered colours to target colours, [N, 3] each."""
+    a, b = rendered.astype(np.float64), target.astype(np.float64)
+    of_a, of_b = a.mean(0), b.mean(0)
+    a, b = a - of_a, b - of_b
+    matrix = matmul(matmul(b.T, a) / len(a), inverse(matmul(a.T, a) / len(a) + RIDGE * np.eye(3)))
+    return matrix, of_b - matmul(matrix, of_a)
+
+
+def matched_psnr(view: View, image: np.ndarray) -> float:
+    """Return the PSNR [dB] of a render [H, W, 3] of a view by `MATCHED_RULE`; NaN if a half has no scored pixel."""
+    region, _ = scored_region(view)
+    counted = np.ones(view.image.shape[:2], bool) if region is None else region
+    left, right = counted.copy(), counted.copy()
+    middle = counted.shape[1] // 2
+    left[:, middle:], right[:, :middle] = False, False
+    if not (left.any() and right.any()):
+        return float("nan")
+    matrix, offset = affine_map(image[left], view.image[left])
+    mapped = matmul(image[right].astype(np.float64), matrix.T) + offset
+    return psnr(to_8_bit(mapped), to_8_bit(view.image[right]))
+
+
+MAX_PIXELS = 20_000
+"""Largest number of pixels of the reduced views that are compared."""
+MIN_RESIDUAL = 0.05
+"""Least residual, in [0, 1], of a pixel that differs from the model."""
+MIN_FACTOR = 3.0
+"""Least ratio of a differing pixel's residual to the residual of other views at the same point."""
+FLOOR = 0.005
+"""Lower bound, in [0, 1], of the residual of other views in the ratio for `MIN_FACTOR`."""
+MIN_VIEWS = 2
+"""Fewest other views that must show a point."""
+MIN_TRAINING = 6
+"""Fewest training views for this check: with fewer, the model can fit objects that only one view shows."""
+NEIGHBORS = 8
+"""Number of nearest views in which a point is looked up."""
+MAX_DEPTH_ERROR = 0.1
+"""Largest relative difference between the depths at which two views show the same point."""
+MIN_AREA = 0.004
+"""Least area of a reported region, as a fraction of the image; in static scenes regions reach 0.002 (decision 019)."""
+MAX_MISFIT = 5.0
+"""A view fits badly as a whole if its median residual exceeds the median over views by this factor; no region of it is
+reported."""
+HIGH_MISFIT = 0.002
+"""The fit is too early for this check if the median over views of their median residuals exceeds this; finished fits reach
+0.001."""
+LOW_MISFIT = 0.0005
+"""Lower bound, in [0, 1], of the median over views to which `MAX_MISFIT` is applied."""
+SMOOTHING = 32
+"""Image width divided by the side of the square in which residuals are averaged."""
+
+
+class Rendered(NamedTuple):
+    """Render of a training view."""
+
+    rgb: np.ndarray
+    """Colours, shape [H, W, 3]."""
+    depth: np.ndarray
+    """z-depth [u], 0 for empty pixels; shape [H, W]."""
+    alpha: np.ndarray
+    """Opacity in [0, 1], shape [H, W]."""
+
+
+class _Small(NamedTuple):
+    """A view reduced to `MAX_PIXELS`."""
+
+    camera: Camera
+    residual: np.ndarray
+    depth: np.ndarray
+    counts: np.ndarray
+
+
+def _reduced(view: View, render: Rendered) -> _Small:
+    """Return the residuals of a view beyond what a shift by one pixel explains, shape [H, W], at a small size."""
+    import cv2
+
+    c = view.camera
+    shrink = min(1.0, (MAX_PIXELS / (c.width * c.height)) ** 0.5)
+    width, height = max(1, int(c.width * shrink)), max(1, int(c.height * shrink))
+    image, rgb = (
+        cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        for a in (view.image, np.clip(render.rgb, 0, 1))
+    )
+    depth, alpha = (
+        cv2.resize(a.astype(np.float32), (width, height), interpolation=cv2.INTER_NEAREST) for a in (render.depth, render.alpha)
+    )
+    around = np.ones((3, 3), np.uint8)
+    beyond = np.maximum(np.maximum(cv2.erode(image, around) - rgb, rgb - cv2.dilate(image, around)), 0).mean(-1)
+    side = max(3, round(width / SMOOTHING) | 1)
+    counts = (alpha > 0.5) & (depth > 0)
+    if view.mask is not None:
+        counts &= cv2.resize(view.mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    K = np.diag([width / c.width, height / c.height, 1]) @ c.K
+    return _Small(replace(c, K=K, width=width, height=height), cv2.blur(beyond, (side, side)), depth, counts)
+
+
+def _residuals_elsewhere(small: Sequence[_Small], index: int, others: Sequence[int]) -> np.ndarray:
+    """Return the residuals of other views at the points of one view, NaN where they do not show it, shape [others, H * W]."""
+    own = small[index]
+    depths = np.where(own.counts, own.depth, 1).ravel().astype(float)
+    points = back_project(own.camera, pixel_grid(own.camera), depths)
+    found = np.full((len(others), len(points)), np.nan)
+    for row, j in enumerate(others):
+        other = small[j]
+        pixels, z = project_points(other.camera, points)
+        size = np.array([other.camera.width, other.camera.height])
+        inside = np.flatnonzero((z > 0) & (pixels >= 1).all(1) & (pixels < size - 1).all(1))
+        x, y = pixels[inside].astype(int).T
+        shown = np.abs(other.depth[y, x] - z[inside]) < MAX_DEPTH_ERROR * z[inside]
+        found[row, inside[shown]] = other.residual[y[shown], x[shown]]
+    return found
+
+
+def moved_fractions(views: Sequence[View], renders: Iterable[Rendered]) -> list[float]:
+    """Return for each training view the fraction of its pixels, in [0, 1], in regions that other views show differently.
+
+    A pixel is included if the view's residual is much larger than the residuals of other views at the same point, and at least
+    two other views show this point. All fractions are 0 for fewer than `MIN_TRAINING` views, and for an unconverged fit.
+
+    Args:
+        views: The training views, at least one.
+        renders: Render of each by the finished model, in the same order.
+    """
+    import cv2
+
+    if len(views) < MIN_TRAINING:
+        return [0.0] * len(views)
+    small = [_reduced(v, r) for v, r in zip(views, renders, strict=True)]
+    misfits = [float(np.median(s.residual)) for s in small]
+    usual = float(np.median(misfits))
+    fractions = []
+    for i, s in enumerate(small):
+        others = nearest_views(views, i, NEIGHBORS)
+        if usual > HIGH_MISFIT or misfits[i] > MAX_MISFIT * max(usual, LOW_MISFIT):
+            fractions.append(0.0)
+            continue
+        elsewhere = _residuals_elsewhere(small, i, others)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # points that no other view shows
+            typical = np.nanmedian(elsewhere, axis=0).reshape(s.residual.shape)
+        shown = (np.isfinite(elsewhere).sum(0) >= MIN_VIEWS).reshape(s.residual.shape)
+        differs = s.counts & shown & (s.residual > MIN_RESIDUAL)
+        differs &= s.residual > MIN_FACTOR * np.maximum(np.nan_to_num(typical), FLOOR)
+        _, _, statistics, _ = cv2.connectedComponentsWithStats(differs.astype(np.uint8))
+        areas = statistics[1:, cv2.CC_STAT_AREA] / s.residual.size
+        fractions.append(round(float(areas[areas >= MIN_AREA].sum()), 4))
+    return fractions
+
+
+def moved_notes(fractions: dict[str, float]) -> list[str]:
+    """Return a note that names the views with moved regions, the largest fraction of moved pixels first; empty without any."""
+    named = sorted(((f, name) for name, f in fractions.items() if f > 0), reverse=True)
+    if not named:
+        return []
+    words = ", ".join(f"{name} ({f:.1%} of its pixels)" for f, name in named[:6])
+    more = f" and {len(named) - 6} more" if len(named) > 6 else ""
+    return [f"moving or changing objects in {words}{more}; mask them out"]

@@ -1,0 +1,443 @@
+"""The first Gaussians of a fit: from points, depth or random places."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from warpgs import geometry
+from warpgs.errors import DataError, UsageError
+from warpgs.kernels.neighbours import mean_square_distances
+from warpgs.kernels.sh import coefficient_count
+from warpgs.pipeline.metrics.scores import fitted_region
+from warpgs.pipeline.model.depth_points import (
+    EXTRAPOLATED_OPACITY,
+    NOTHING,
+    all_count,
+    coarse_points,
+    depth_bounds,
+    extrapolated_points,
+    hull_points,
+    in_empty_region,
+    joined,
+    silhouettes,
+)
+from warpgs.priors.flow import RANGES, EpipolarConfig, flow_between, flow_depth, triangulate_matches
+from warpgs.priors.given_depth import any_given, with_given_depth
+from warpgs.priors.sweep import CPU, SweepConfig, sweep_depths
+from warpgs.scene import Camera, Gaussians, PointCloud, View, ViewDepth, base_coefficients
+
+OBJECTS = ("foreground", "object")
+"""Names of the regions of an object (`fitted_region`): object on black, and object that an alpha channel cuts out."""
+MIN_MATCHES = 10
+"""Fewest matched points of a view that give depths to its random points."""
+NEIGHBORS = 5
+"""Number of nearest matched points from which a random pixel takes its depth."""
+PAIRS = 2**20
+"""Largest number of distances in memory at a time while neighbours are searched."""
+DEPTH_SPREAD = 0.1
+"""Standard deviation of the logarithm of depth around a matched point."""
+
+
+def camera_depths(views: list[View]) -> tuple[float, float]:
+    """Return the default near and far depth [u]: 0.1 and 10 times the distance to the cameras' focus point.
+
+    Cameras in one place with one direction have no focus point; then the distance is 1 u.
+    """
+    focus = geometry.focus_point([v.camera for v in views])
+    distance = float(np.median([np.linalg.norm(v.camera.center - focus) for v in views]))
+    distance = distance if distance > 1e-3 else 1.0
+    return 0.1 * distance, 10 * distance
+
+
+def nearest(points: np.ndarray, queries: np.ndarray, count: int) -> np.ndarray:
+    """Return the rows of the ``count`` points [P, 2] nearest to each query [Q, 2], the nearest first, int64 [Q, count]."""
+    known, asked = torch.from_numpy(points), torch.from_numpy(queries)
+    found = []
+    # every pair, some rows at a time: a few hundred points take less time than importing a library of search trees
+    for rows in asked.split(max(1, PAIRS // max(1, len(known)))):
+        squares = sum((rows[:, i, None] - known[None, :, i]) ** 2 for i in range(2))
+        found.append(squares.topk(count, largest=False).indices)
+    return torch.cat(found).numpy()
+
+
+class _Depths:
+    """Random depths for pixels of one view: near the depths of nearby matched points, else between the default bounds."""
+
+    def __init__(self, view: View, matched: PointCloud, bounds: tuple[float, float]):
+        seen = geometry.in_image(view.camera, matched.points)
+        pixels, self.known = geometry.project_points(view.camera, matched.points)
+        self.pixels, self.known, self.bounds = pixels[seen], self.known[seen], bounds
+        self.has_matches = len(self.known) >= MIN_MATCHES
+
+    def sample(self, pixels: np.ndarray, wanted: int, generator: np.random.Generator) -> np.ndarray:
+        """Return depths [u] of the first ``wanted`` pixels, shape [wanted].
+
+        Random numbers are sampled for all pixels [N, 2], so that a depth does not depend on how many are wanted.
+        """
+        count = len(pixels)
+        if not self.has_matches:
+            near, far = self.bounds
+            return 1 / generator.uniform(1 / far, 1 / near, size=count)[:wanted]
+        which, spread = generator.integers(NEIGHBORS, size=count), generator.normal(0, DEPTH_SPREAD, count)
+        ids = nearest(self.pixels, pixels[:wanted], NEIGHBORS)
+        return self.known[ids[np.arange(wanted), which[:wanted]]] * np.exp(spread[:wanted])
+
+
+def empty_votes(views: list[View], regions: list[tuple[np.ndarray | None, str]], points: np.ndarray) -> np.ndarray:
+    """Count the views in which each point [N, 3] falls on the empty background, int [N]: 0 within the visual hull."""
+    votes = np.zeros(len(points), int)
+    for view, (region, name) in zip(views, regions):
+        if name not in OBJECTS:
+            continue
+        seen, rows, columns, _ = geometry.seen_pixels(view.camera, points)
+        votes[seen] += ~region[rows, columns]
+    return votes
+
+
+def random_points(views: list[View], count: int, generator: np.random.Generator) -> tuple[PointCloud, str]:
+    """Return points behind random pixels of the training views with the pixels' colours, and a sentence on how they were made.
+
+    A view with at least 10 triangulated SIFT matches takes each depth from one of the 5 matches nearest to the pixel, spread by
+    a tenth (docs/decisions/003-random-start.md). Any other view samples inverse depths uniformly, and prefers points that a
+    second view sees. If views show an object on black, or have an alpha channel, points start on the object. Several candidates
+    are made, and those that fall on empty pixels in the fewest views are taken, to avoid empty space.
+
+    Raises:
+        DataError: Masks leave no pixel of any training view.
+    """
+    regions = [fitted_region(v) for v in views]
+    matched = triangulate_matches(views)
+    bounds = camera_depths(views)
+    sources = [_Depths(v, matched, bounds) for v in views]
+    points, colors = [], []
+    for i, (view, source) in enumerate(zip(views, sources)):
+        wanted = (i + 1) * count // len(views) - i * count // len(views)
+        free = np.ones(view.image.shape[:2], bool) if regions[i][0] is None else regions[i][0]
+        rows, columns = np.nonzero(free)
+        if len(rows) == 0:
+            continue
+        chosen = generator.integers(len(rows), size=8 * wanted)
+        rows, columns = rows[chosen], columns[chosen]
+        pixels = np.stack([columns, rows], 1) + 0.5
+        elsewhere = not source.has_matches and len(views) > 1
+        # where all are equally good, the first are taken, and the others need no depth
+        useful = len(pixels) if elsewhere or any(name in OBJECTS for _, name in regions) else wanted
+        candidates = geometry.back_project(view.camera, pixels[:useful], source.sample(pixels, useful, generator))
+        worse = empty_votes(views, regions, candidates)
+        if elsewhere:
+            worse += sum(geometry.in_image(v.camera, candidates).astype(int) for v in views) < 2
+        order = np.argsort(worse, kind="stable")
+        candidates, rows, columns = candidates[order], rows[order], columns[order]
+        points.append(candidates[:wanted])
+        colors.append(view.image[rows[:wanted], columns[:wanted]])
+    if not points:
+        raise DataError(
+            "no random start: all pixels of the training views are masked out or transparent; check --mask-keeps and the alpha "
+            "channel of the images"
+        )
+    with_matches = sum(s.has_matches for s in sources)
+    how = f"{count:,} random points, {with_matches} of {len(views)} views with depths from {len(matched):,} matched points"
+    objects, cut_out = (sum(name == of for _, name in regions) for of in OBJECTS)
+    if objects:
+        how += f", on the object ({objects} views show it on black)"
+    if cut_out:
+        how += f", in the opaque areas of {cut_out} views"
+    return PointCloud(np.concatenate(points), np.concatenate(colors)), how
+
+
+SOURCES = ("auto", "sweep", "flow", "points", "hull", "random")
+MIN_POINTS = 100
+"""Fewest sparse points to start from: with fewer, most of the image is empty, and a random start is better."""
+
+
+@dataclass(frozen=True)
+class InitConfig:
+    """Source and initial values of the Gaussians."""
+
+    source: str = "auto"
+    """Source of the first points: sweep or flow (one for each pixel with depth that other views confirm), points (those of the
+    reconstruction), random, hull (surface of the visual hull of views with an alpha channel), or auto. auto is sweep if depth
+    is given, or for at most --init.sweep-up-to views; else points if the training views saw at least 100 points; else random.
+    If views have an alpha channel, points in an empty area of a view are left out."""
+    sweep_up_to: int = 0
+    """auto: largest number of training views for a start by sweep, which takes about a second per view on two cores."""
+    random_count: int = 20_000
+    """Number of random points."""
+    opacity: float = 0.1
+    """Initial opacity, in (0, 1)."""
+    scale_factor: float = 1.0
+    """Initial standard deviation of a Gaussian, as a multiple of the distance to its neighbours, in [0.001, 10]."""
+    near_views: int = 4
+    """sweep, flow: number of other views with which each view is matched."""
+    merge_px: float = 4.0
+    """sweep, flow: width of the cells in which points of confirmed depth are merged [px]; 0 keeps a point for every pixel."""
+    fill_px: float = 16.0
+    """sweep, flow: cell width [px] for filling in points where other views do not confirm depth; 0 fills in none."""
+    extrapolate: bool | None = False
+    """sweep, flow: add extrapolated points where no view looks, beyond the images and behind depth edges
+    (docs/decisions/026-extrapolated-points.md). In a fit with such points, opacity decay spares Gaussians that a step does not
+    use. No points are added if a view has a mask, an alpha channel or a black background. None: chosen by the number of
+    views."""
+    flow: str = "dis"
+    """flow: source of optical flow: dis, deepflow, sparse, a folder of .flo files or an ONNX file (images in, flow out)."""
+    flow_range: str = "255"
+    """flow: range of input colours of an ONNX file: 255 (0 to 255), unit (0 to 1) or signed (-1 to 1)."""
+    max_residual: float = 1.0
+    """flow: largest distance of a match from its epipolar line [px]."""
+    blend: str = "least_sensitive"
+    """flow: rule to combine depths from several views: least_sensitive, nearest_first, mean_valid or inverse_sensitivity."""
+
+    def __post_init__(self):
+        if self.source not in SOURCES:
+            raise UsageError(f"init: `source` {self.source!r} is not one of {', '.join(SOURCES)}")
+        for name in ("merge_px", "fill_px", "sweep_up_to"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise UsageError(f"init: `{name.replace('_', '-')}` must be 0 or more, not {getattr(self, name)}")
+        if self.flow_range not in RANGES:
+            raise UsageError(f"init: `flow-range` {self.flow_range!r} is not one of {', '.join(RANGES)}")
+        self.epipolar()  # its own checks
+        if not 1e-3 <= self.scale_factor <= 10:
+            raise UsageError(f"init: `scale-factor` must be between 0.001 and 10, not {self.scale_factor}")
+        if not 0 < self.opacity < 1:
+            raise UsageError(f"init: `opacity` must be in (0, 1), not {self.opacity}")
+        if self.random_count < 1:
+            raise UsageError(f"init: `random-count` must be at least 1, not {self.random_count}")
+
+    def epipolar(self) -> EpipolarConfig:
+        """Return the settings of depth from flow.
+
+        Raises:
+            UsageError: A setting is out of range.
+        """
+        return EpipolarConfig(max_residual=self.max_residual, near_count=self.near_views, blend=self.blend)
+
+
+class Start(NamedTuple):
+    """The points that a fit starts from."""
+
+    cloud: PointCloud
+    """Positions and colours."""
+    how: str
+    """Description of the points and their source, for the user."""
+    depths: list[ViewDepth] | None = None
+    """Geometrically consistent depth of each view; None if not computed."""
+    extrapolated: int = 0
+    """Number of extrapolated points, where no view looks; they are the last points of the cloud."""
+
+
+def consistent_depths(
+    views: list[View], known: PointCloud, config: InitConfig, device: Callable[[], torch.device] = lambda: CPU,
+    progress: Callable[[str], object] = lambda line: None,
+) -> list[ViewDepth]:  # fmt: skip
+    """Return the geometrically consistent depth of each of at least two views, by flow or by sweeping planes.
+
+    Args:
+        views: Training views.
+        known: Points that bound the planes.
+        config: Source and its settings.
+        device: Function that waits until the device to sweep on may be used, and returns it.
+        progress: Called with a line for the user about the current work.
+    """
+    if config.source == "flow":
+        between = flow_between(views, config.flow, config.flow_range)
+        return [flow_depth(views, i, between, config.epipolar()) for i in range(len(views))]
+    points = np.concatenate([known.points, triangulate_matches(views).points])
+    bounds = [depth_bounds(v, points, camera_depths(views)) for v in views]
+    return sweep_depths(
+        views, bounds, SweepConfig(near_count=config.near_views), device(),
+        lambda done, total: progress(f"finding depth: {done} of {total} views"),
+    )  # fmt: skip
+
+
+def consistent_points(
+    views: list[View], points: PointCloud, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device], progress: Callable[[str], object],
+) -> Start:  # fmt: skip
+    """Return points behind pixels whose depth other views confirm, and a line on each view.
+
+    If fewer than `MIN_POINTS` points are found, the start is random, with a note.
+    """
+    reason, depths, given, source = "depth needs at least two views", None, [], config.source
+    if len(views) > 1:
+        depths = consistent_depths(views, points, config, device, progress)
+    if any_given(views):
+        source, (depths, given) = f"given depth and {source}", with_given_depth(views, depths, points)
+    if depths is not None:
+        cloud, notes = coarse_points(
+            views, depths, merge_px=config.merge_px, fill_px=config.fill_px, source=source, known=points
+        )
+        if len(cloud) >= MIN_POINTS:
+            extrapolated = extrapolated_points(views, depths) if config.extrapolate else NOTHING
+            if config.extrapolate:
+                notes[-1] += f", {_number_extrapolated(views, len(extrapolated))}"
+            how = "\n".join((notes[-1], *given, *(f"    {n}" for n in notes[:-1])))
+            return Start(joined((cloud, extrapolated)), how, depths, len(extrapolated))
+        reason = f"only {len(cloud)} points survived the checks ({' | '.join(notes[:-1])}); do the views overlap?"
+    cloud, how = random_points(views, config.random_count, generator)
+    return Start(cloud, f"{how}, instead of --init.source {config.source}: {reason}", depths)
+
+
+def _number_extrapolated(views: list[View], count: int) -> str:
+    """Describe, for the user, how many points are extrapolated, or why there are none."""
+    if count:
+        return f"{count:,} extrapolated where no view looks"
+    hidden = "" if all_count(views) else ", because masks, an alpha channel or a black background hide parts of the views"
+    return f"none extrapolated{hidden}"
+
+
+def seen_points(views: list[View], points: PointCloud | None) -> PointCloud:
+    """Return the reconstruction's points that at least two views saw, or that the only view saw; none without a reconstruction.
+
+    A point that only one of several views saw was triangulated with held-out views.
+    """
+    return NOTHING if points is None else points.seen_by({v.name for v in views}, min(2, len(views)))
+
+
+def sweeps(config: InitConfig, views: int) -> bool:
+    """Return whether a fit of that many views starts from a sweep."""
+    return config.source == "sweep" or (config.source == "auto" and 2 <= views <= config.sweep_up_to)
+
+
+def extrapolates(config: InitConfig, views: list[View]) -> bool:
+    """Return whether the start of a fit of these views has extrapolated points, if it finds depth."""
+    if not config.extrapolate or len(views) < 2:
+        return False
+    searches = config.source == "flow" or sweeps(config, len(views)) or (config.source == "auto" and any_given(views))
+    return searches and all_count(views)
+
+
+def check_points(views: list[View], points: PointCloud | None, config: InitConfig) -> None:
+    """Check that a start from points has points that the training views saw.
+
+    Raises:
+        DataError: The training views saw no points, and ``config`` needs them.
+    """
+    if config.source == "points" and len(seen_points(views, points)) == 0:
+        raise DataError(
+            "--init.source points needs 3D points that the training views saw, but the scene has none; use --init.source "
+            "random, or give a reconstruction with points"
+        )
+
+
+def on_object(start: Start, views: list[View]) -> Start:
+    """Return the start without points in empty areas of views with an alpha channel.
+
+    If fewer than `MIN_POINTS` points would be left, the start is unchanged.
+    """
+    shapes = silhouettes(views)
+    if not shapes:
+        return start
+    cloud = start.cloud
+    keep = ~in_empty_region(shapes, cloud.points)
+    if keep.all():
+        return start
+    count = int(keep.sum())
+    if count < MIN_POINTS:
+        few = f"only {count} of these points are outside the empty areas of all views; check the poses"
+        return start._replace(how=f"{start.how}\n{few}")
+    how = f"{start.how}\n{len(keep) - count:,} of these points left out: they are in an empty area of a view"
+    return start._replace(cloud=PointCloud(cloud.points[keep], cloud.colors[keep]), how=how)
+
+
+def initial_points(
+    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device] = lambda: CPU, progress: Callable[[str], object] = lambda line: None,
+) -> Start:  # fmt: skip
+    """Return the points to start from.
+
+    ``device`` waits until the device to sweep on may be used, and returns it; ``progress`` is called with lines about the
+    current work.
+
+    Raises:
+        DataError: The training views saw no points, and ``config`` needs them; or masks leave no pixel for a random start.
+    """
+    check_points(views, points, config)
+    if config.source == "hull":
+        cloud, how = hull_points(views, config.merge_px)
+        if len(cloud) >= MIN_POINTS:
+            return Start(cloud, how)
+        cloud, made = random_points(views, config.random_count, generator)
+        return Start(cloud, f"{made}, instead of --init.source hull: {how}")
+    found = on_object(_found_points(views, points, config, generator, device, progress), views)
+    if config.extrapolate and found.depths is None:
+        return found._replace(how=f"{found.how}\nno extrapolated points: they need --init.source sweep or flow")
+    return found
+
+
+def _found_points(
+    views: list[View], points: PointCloud | None, config: InitConfig, generator: np.random.Generator,
+    device: Callable[[], torch.device], progress: Callable[[str], object],
+) -> Start:  # fmt: skip
+    """Return the points of a source other than the hull."""
+    usable = seen_points(views, points)
+    if config.source == "auto" and (sweeps(config, len(views)) or any_given(views)):
+        return consistent_points(views, usable, dataclasses.replace(config, source="sweep"), generator, device, progress)
+    if config.source in ("sweep", "flow"):
+        return consistent_points(views, usable, config, generator, device, progress)
+    if config.source == "points" or (config.source == "auto" and len(usable) >= MIN_POINTS):
+        return Start(usable, f"{len(usable):,} points of the reconstruction that the training views saw")
+    cloud, how = random_points(views, config.random_count, generator)
+    if config.source == "auto" and points is not None:
+        how += f" (the reconstruction has only {len(usable)} points that the training views saw)"
+    return Start(cloud, how)
+
+
+def subsample(start: Start, most: int, generator: np.random.Generator) -> Start:
+    """Return the start with at most ``most`` points, sampled at random; sparser points get wider Gaussians."""
+    count = len(start.cloud)
+    if count <= most:
+        return start
+    keep = np.sort(generator.permutation(count)[:most])
+    how = f"{start.how}\nused {most:,} of these {count:,} points, sampled at random, because --max-gaussians is {most:,}"
+    cloud = PointCloud(start.cloud.points[keep], start.cloud.colors[keep])
+    return start._replace(cloud=cloud, how=how, extrapolated=int((keep >= count - start.extrapolated).sum()))
+
+
+def scene_extent(cameras: list[Camera], cloud: PointCloud) -> float:
+    """Return the size of the scene [u]: the extent of the cameras, or a tenth of the cloud's spread if all cameras coincide."""
+    extent = geometry.camera_extent(cameras)
+    spread = float(np.linalg.norm(np.std(cloud.points, axis=0)))
+    return max(extent, 0.1 * spread if extent < 1e-3 * spread else 0.0, 1e-6)
+
+
+def initial_gaussians(
+    cloud: PointCloud, config: InitConfig, sh_degree: int, extent: float, device: torch.device, extrapolated: int = 0
+) -> Gaussians:
+    """Return one isotropic Gaussian per point; widths follow the root mean square distance to the three nearest points.
+
+    Args:
+        cloud: At least one point.
+        config: Opacity, and the factor from distances to widths.
+        sh_degree: Degree of the spherical harmonics, 0 to 4.
+        extent: Size of the scene [u]; the distances are limited to 1e-6 to 0.1 of the size, also for coincident or lone points.
+        device: Device of the tensors, float32.
+        extrapolated: Number of extrapolated points, which are the last of the cloud and start with `EXTRAPOLATED_OPACITY`.
+
+    Returns:
+        The Gaussians.
+    """
+    points = torch.as_tensor(cloud.points, dtype=torch.float32, device=device)
+    colors = torch.as_tensor(cloud.colors, dtype=torch.float32, device=device)
+    count = len(points)
+    # in float64, since the rounding of float32's roots and logarithms depends on the processor (MKL)
+    distances = mean_square_distances(points).double().sqrt()
+    scales = config.scale_factor * distances.clamp(1e-6 * extent, 0.1 * extent)
+    sh = points.new_zeros(count, coefficient_count(sh_degree), 3)
+    sh[:, 0] = base_coefficients(colors)
+    quats = points.new_zeros(count, 4)
+    quats[:, 0] = 1
+    logits = points.new_full((count,), geometry.logit(config.opacity))
+    logits[count - extrapolated :] = geometry.logit(EXTRAPOLATED_OPACITY)
+    return Gaussians(
+        means=points,
+        quats=quats,
+        log_scales=scales.log().to(points.dtype)[:, None].repeat(1, 3),
+        logit_opacities=logits,
+        sh=sh,
+    )

@@ -1,0 +1,348 @@
+"""Files from a run: filtered Gaussians, cameras, meshes."""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from warpgs.device import format_bytes
+from warpgs.errors import DataError, UsageError
+from warpgs.export.base import Format, find_format, format_of, read_with_antialiasing, write_gaussians
+from warpgs.export.meshes_and_cameras import check_suffix, holds_cameras, write_cameras, write_mesh
+from warpgs.geometry import convert_gaussians, convert_mesh, matmul
+from warpgs.io.transforms import read_cameras
+from warpgs.kernels.neighbours import morton_codes
+from warpgs.locks import hold_file
+from warpgs.mesh.fuse import FusedMesh, GridPlan, MeshOptions, fuse
+from warpgs.pipeline.films.paths import common_up
+from warpgs.pipeline.model.edit import (
+    box_of,
+    coverage,
+    disturbing,
+    drop_unused_sh,
+    inside,
+    levelling,
+    limit_degree,
+    rotate,
+    rotation_about,
+    select,
+)
+from warpgs.pipeline.run.folder import CONFIG, StoredRun, open_run
+from warpgs.pipeline.run.request import choose_device
+from warpgs.scene import Camera, Gaussians
+
+
+@dataclass(frozen=True)
+class Filters:
+    """Filters of a model before it is written, in this order: crop and clean, rotate, sh_degree."""
+
+    crop: str | None = None
+    """Box to keep, as `box_of` takes it; None for everything."""
+    clean: bool | None = None
+    """True to remove floaters and needles; None for the format's default (`Format.cleaned`)."""
+    sh_degree: int | None = None
+    """Highest degree of harmonics; None for all that the format can store."""
+    rotate: str | None = None
+    """Axis and angle as x,y,z,degrees; or level, to rotate the upward direction of a run's cameras to -y; None for no
+    rotation."""
+
+
+NO_FILTERS = Filters()
+"""The default filters: the format determines cleaning."""
+
+
+def filtered(
+    gaussians: Gaussians, stored: StoredRun | None, filters: Filters, cleaned: bool
+) -> tuple[Gaussians, np.ndarray | None, list[str]]:
+    """Filter Gaussians in file units.
+
+    Args:
+        gaussians: N Gaussians in file units.
+        stored: The run of the Gaussians; None without cameras.
+        filters: The filters.
+        cleaned: Default for cleaning.
+
+    Returns:
+        The remaining Gaussians, their rotation [3, 3] (None for no rotation), and lines for the user.
+
+    Raises:
+        UsageError: A filter is invalid, or needs the cameras of a run.
+    """
+    rotation = rotation_of(filters.rotate, None if stored is None else training_cameras(stored))
+    keep, lines = torch.ones(len(gaussians), dtype=torch.bool, device="cpu"), []
+    if filters.crop is not None:
+        keep = inside(gaussians, box_of(filters.crop))
+        lines.append(f"{int((~keep).sum()):,} Gaussians outside the box are left out")
+    if cleaned if filters.clean is None else filters.clean:
+        removed = disturbing(gaussians, None if stored is None else _maxima(stored))
+        counts = {reason: int((where & keep).sum()) for reason, where in removed.items()}
+        if words := [f"{count:,} {reason}" for reason, count in counts.items() if count]:
+            lines.append(f"removed Gaussians: {', '.join(words)} (--no-clean keeps them)")
+        for where in removed.values():
+            keep &= ~where
+    gaussians = select(gaussians, keep)
+    if rotation is not None:
+        gaussians = rotate(gaussians, rotation)
+        lines.append(turned_line(rotation))
+    if filters.sh_degree is not None and filters.sh_degree < gaussians.sh_degree:
+        lines.append(f"harmonics above degree {filters.sh_degree} are left out (--sh-degree)")
+    if filters.sh_degree is not None:
+        gaussians = limit_degree(gaussians, filters.sh_degree)
+    return gaussians, rotation, lines
+
+
+def file_gaussians(stored: StoredRun) -> Gaussians:
+    """Return the Gaussians of a run in file units, without harmonics that are all zero."""
+    return convert_gaussians(drop_unused_sh(stored.gaussians()), stored.normalization, "scene", "file")
+
+
+def training_cameras(stored: StoredRun) -> list[Camera]:
+    """Return the training cameras of a run in scene units, numpy arrays."""
+    return [stored.scene_cameras[name] for name in stored.train]
+
+
+def _maxima(stored: StoredRun) -> torch.Tensor:
+    """Return the largest blending weight of each Gaussian of a run over its training views, shape [N]."""
+    gaussians = stored.gaussians()
+    like = gaussians.means.new_tensor
+    tensors = [replace(c, viewmat=like(c.viewmat), K=like(c.K)) for c in training_cameras(stored)]
+    return coverage(gaussians, tensors, stored.options()).maxima
+
+
+def rotation_of(wish: str | None, cameras: list[Camera] | None) -> np.ndarray | None:
+    """Return the rotation [3, 3] that a user's text specifies; None for no rotation.
+
+    Args:
+        wish: Axis and angle as x,y,z,degrees; level; or None.
+        cameras: Cameras that define the upward direction for `level`; None if unknown.
+
+    Raises:
+        UsageError: The text is not a rotation, or there are no cameras for `level`.
+    """
+    if wish is None:
+        return None
+    if wish == "level":
+        if cameras is None:
+            raise UsageError("--rotate level needs the cameras of a run: use warpgs export RUN, or give x,y,z,degrees")
+        up = common_up(cameras)
+        if up is None:
+            raise UsageError("--rotate level: the cameras do not agree on an upward direction; give x,y,z,degrees")
+        return levelling(up)
+    try:
+        x, y, z, degrees = map(float, wish.split(","))
+    except ValueError as e:
+        raise UsageError(f"--rotate {wish[:60]}: give x,y,z,degrees, or level") from e
+    return rotation_about(np.array([x, y, z]), math.radians(degrees))
+
+
+def turned_line(rotation: np.ndarray) -> str:
+    """Return a line for the user on a rotation [3, 3]."""
+    degrees = math.degrees(math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))))
+    return f"rotated by {degrees:.1f} degrees about the origin; use the same --rotate for Gaussians and cameras"
+
+
+def rotate_camera(camera: Camera, rotation: np.ndarray) -> Camera:
+    """Return a camera after a rotation [3, 3] of the scene about the origin; numpy arrays."""
+    viewmat = np.array(camera.viewmat, np.float64)
+    viewmat[:3, :3] = matmul(viewmat[:3, :3], rotation.T)
+    return replace(camera, viewmat=viewmat)
+
+
+ROUNDING = 1e-4
+"""Smallest change of a log scale that is reported: a hundredth of a percent."""
+
+
+def convert(
+    source: Path, target: Path, filters: Filters = NO_FILTERS, formats: Sequence[str | type[Format] | Format] = ()
+) -> list[str]:
+    """Write a file of Gaussians, or of cameras, in another format; returns lines for the user.
+
+    Args:
+        source: The file to read; for cameras also a folder with a COLMAP reconstruction.
+        target: The file to write; its suffix selects the format.
+        filters: Filters; cameras are only rotated.
+        formats: Formats that have priority for files with their suffix, as in `write_gaussians`.
+
+    Raises:
+        DataError: The file cannot be read or is malformed, or no Gaussian is left.
+        ResourceError: Another process writes into the target's folder, or the target cannot be written.
+        UsageError: A suffix is unknown, ``source`` is a run folder, a given format fits neither file, a filter is invalid, or a
+            filter needs the cameras of a run.
+    """
+    if holds_cameras(target):
+        _check_for_cameras(filters, formats)
+        found, notes = read_cameras(source)
+        return [*notes, *_cameras_written(list(found.values()), list(found.values()), target, filters)]
+    given = [find_format(f) for f in formats]
+    for unused in (f for f in given if not (f.fits(source) or f.fits(target))):
+        format_of(target, unused)  # says that its name is another
+    if (source / CONFIG).is_file():
+        raise UsageError(
+            f"{source}: is a run folder; use `warpgs export {shlex.quote(str(source))} --to {shlex.quote(str(target))}`"
+        )
+    read, kind = (format_of(p, next((f for f in given if f.fits(p)), None)) for p in (source, target))
+    rotation_of(filters.rotate, None)  # before anything is read
+    gaussians, antialiased = read_with_antialiasing(source, None, "file", read)
+    lines = _written(gaussians, None, target, kind, filters, antialiased)
+    return [read.note, *lines] if read.note and not kind.note else lines
+
+
+def export(
+    folder: Path, target: Path, filters: Filters = NO_FILTERS, format: str | type[Format] | Format | None = None
+) -> list[str]:
+    """Write a run's Gaussians, or its cameras, to a file, in the units of the scene's files; returns lines for the user.
+
+    Args:
+        folder: The run folder.
+        target: The file to write; its suffix selects the format.
+        filters: Filters; cameras are only rotated.
+        format: Format to write, as in `write_gaussians`; None for the format of the suffix.
+
+    Raises:
+        DataError: The folder is not a run, or no Gaussian is left.
+        ResourceError: Another process writes into the target's folder, or the target cannot be written.
+        UsageError: No format has the suffix, ``format`` has another suffix, or a filter is invalid.
+    """
+    if holds_cameras(target):
+        _check_for_cameras(filters, () if format is None else (format,))
+        stored = open_run(folder, torch.device("cpu"))
+        return _cameras_written(list(stored.cameras("file").values()), training_cameras(stored), target, filters)
+    kind = format_of(target, format)
+    stored = open_run(folder, torch.device("cpu"))
+    return _written(file_gaussians(stored), stored, target, kind, filters, stored.antialiased)
+
+
+def _written(
+    gaussians: Gaussians, stored: StoredRun | None, target: Path, kind: Format, filters: Filters, antialiased: bool
+) -> list[str]:
+    """Filter Gaussians in file units, and write them; returns lines for the user."""
+    gaussians, _, lines = filtered(gaussians, stored, filters, kind.cleaned)
+    if not len(gaussians):
+        raise DataError(f"{target}: not written, because no Gaussian is left; give a larger --crop, or --no-clean")
+    if kind.max_degree < gaussians.sh_degree:
+        lines.append(f"harmonics above degree {kind.max_degree} are dropped, because {kind.suffix} files cannot store them")
+        gaussians = limit_degree(gaussians, kind.max_degree)
+    if stored is not None:
+        lines = [*stored.notes(), *lines]
+    if stored is not None and any(stored.background):
+        color = "".join(f"{round(255 * v):02x}" for v in stored.background)
+        lines.append(f"the file does not store the background colour of the fit, #{color}; set it in your viewer")
+    if antialiased and not kind.declares:
+        lines.append(
+            f"{kind.suffix} files cannot declare that the model is antialiased; choose the antialiased mode in your viewer"
+        )
+    if kind.sorted:
+        gaussians = select(gaussians, torch.argsort(morton_codes(gaussians.means), stable=True))
+    with hold_file(target) as notes:
+        write_gaussians(target, gaussians, units="file", format=kind, antialiased=antialiased)
+    lines += _changes(target, gaussians, kind) if type(kind).decode is not Format.decode else []
+    lines += [kind.note] if kind.note else []
+    return [*notes, *lines, f"{len(gaussians):,} Gaussians in {target}, {format_bytes(target.stat().st_size)}"]
+
+
+def _changes(target: Path, gaussians: Gaussians, kind: Format) -> list[str]:
+    """Return a line on the rounding errors of the format, measured on the file; none for a format in float32."""
+    back, _ = read_with_antialiasing(target, None, "file", kind)
+    moved = float((back.means.double() - gaussians.means.double()).abs().max())
+    scales = (back.log_scales.double() - gaussians.log_scales.double()).abs().amax(1)
+    if moved == 0 and float(scales.max()) < ROUNDING:
+        return []
+    other = int((scales > 0.1).sum())
+    text = f"the format rounds positions, by at most {moved:.2g} units of the scene's files"
+    return [text + (f"; axis lengths of {other:,} Gaussians change by more than 10 %" if other else "")]
+
+
+def _check_for_cameras(filters: Filters, formats: Sequence[object]) -> None:
+    """Check that only a rotation is requested.
+
+    Raises:
+        UsageError: A filter other than a rotation, or a format of Gaussians, is requested.
+    """
+    if formats:
+        raise UsageError("--format does not apply to cameras; leave it out")
+    if any(v is not None for v in (filters.crop, filters.clean, filters.sh_degree)):
+        raise UsageError("--crop, --clean and --sh-degree do not apply to cameras; use --rotate only")
+
+
+def _cameras_written(cameras: list[Camera], level: list[Camera], target: Path, filters: Filters) -> list[str]:
+    """Rotate cameras in file units, and write them; ``level`` are the cameras that define up. Returns lines for the user."""
+    rotation, lines = rotation_of(filters.rotate, level), []
+    if rotation is not None:
+        cameras = [rotate_camera(c, rotation) for c in cameras]
+        lines.append(turned_line(rotation))
+    with hold_file(target) as notes:
+        lines += write_cameras(target, cameras)
+    sizes = sorted({(c.width, c.height) for c in cameras})
+    some = ", ".join(f"{w} x {h}" for w, h in sizes[:3]) + (" ..." if len(sizes) > 3 else "")
+    return [*notes, *lines, f"{len(cameras):,} cameras for images of {some} px in {target}; their names are numbers"]
+
+
+def mesh(
+    folder: Path, target: Path, options: MeshOptions, device_name: str, *, stage: Callable[[str], object],
+    say: Callable[[str], object],
+) -> list[str]:  # fmt: skip
+    """Write the mesh of the surfaces that a run's training views see, in the units of the scene's files.
+
+    Args:
+        folder: The run folder.
+        target: .ply or .glb file to write.
+        options: Options; ``voxel`` is in units of the scene's files.
+        device_name: auto, cpu or cuda.
+        stage: Function that shows a line of progress.
+        say: Called with the automatic choices before the work starts.
+
+    Returns:
+        Lines for the user.
+
+    Raises:
+        DataError: The folder is not a run, or its training views see no surface.
+        ResourceError: Memory does not suffice, the device is missing, or the file cannot be written.
+        UsageError: The suffix is not supported, or an option is out of range.
+    """
+    check_suffix(target)
+    device, _ = choose_device(device_name)
+    run = open_run(folder, device)
+    if not run.train:
+        raise DataError(f"{folder}: the run has no training views, so coverage is unknown; fit again")
+    cameras, scale = [run.scene_cameras[n] for n in run.train], run.normalization.scale
+    if options.voxel is not None:
+        options = replace(options, voxel=options.voxel * scale)
+
+    def planned(plan: GridPlan, memory: str) -> None:
+        lost = f"{100 * (1 - plan.inside):.1f} %"
+        say(
+            f"grid: {' x '.join(map(str, plan.shape))} points, {memory}, voxel {plan.voxel / scale:.4g} in units of the "
+            "scene's files" + (f"; {lost} of the observed surface is outside the grid and left out" if lost != "0.0 %" else "")
+        )
+
+    with hold_file(target) as notes:
+        found = fuse(run.scene_gaussians, cameras, run.options(), options, stage=stage, planned=planned)
+        made = convert_mesh(found.mesh, run.normalization, "scene", "file")
+        up = common_up(cameras)
+        write_mesh(target, made, up)
+    if up is None and target.suffix.lower() == ".glb":
+        notes = [*notes, "the cameras have no common upward direction, so the mesh may be tilted in a viewer"]
+    return [*run.notes(), *notes, *_lines(found, len(cameras)), f"{target}: {format_bytes(os.path.getsize(target))}"]
+
+
+def _lines(found: FusedMesh, views: int) -> list[str]:
+    """Return lines for the user on the size and the coverage of a mesh."""
+    mesh, lines = found.mesh, []
+    lines.append(
+        f"{found.extracted:,} triangles extracted, {found.removed:,} small parts removed; "
+        f"the mesh has {len(mesh.faces):,} triangles and {len(mesh.vertices):,} vertices"
+    )
+    lines.append(
+        f"{100 * found.unseen:.1f} % of the volume, such as backs and insides, was not observed by the {views} training views; "
+        "the mesh is open there"
+    )
+    if found.uncolored:
+        lines.append(f"{found.uncolored:,} vertices without an observed colour take the colour of the nearest coloured vertex")
+    return lines

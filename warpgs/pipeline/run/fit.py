@@ -1,0 +1,683 @@
+"""`fit`: a scene becomes a run."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from warpgs.errors import DataError, NotFiniteError, UsageError
+from warpgs.export.ply import write_ply
+from warpgs.files import write_json
+from warpgs.geometry import CENTRAL
+from warpgs.io.load import Split, check_spec
+from warpgs.kernels.native import told_of_compiling
+from warpgs.pipeline.metrics.coverage import coverage_of_run
+from warpgs.pipeline.metrics.lpips import Lpips, load_lpips
+from warpgs.pipeline.metrics.scores import Rendered, moved_fractions, moved_notes, render_view
+from warpgs.pipeline.model.edit import drop_unused_sh
+from warpgs.pipeline.model.limits import shape_figures, shape_summary
+from warpgs.pipeline.model.table import FittedModel
+from warpgs.pipeline.run.failed_step import FILE as FAILED
+from warpgs.pipeline.run.failed_step import broken_terms, failed_step, save_failed_step
+from warpgs.pipeline.run.folder import (
+    CONFIG,
+    METRICS_FILE,
+    POSED_SCENE,
+    TENSORS,
+    camera_values,
+    cameras_of,
+    check_checkpoint,
+    check_same,
+    learned_cameras,
+    learned_figures,
+    load_checkpoint,
+    read_record,
+    record_of,
+    run_folder,
+    save_checkpoint,
+    with_cameras,
+)
+from warpgs.pipeline.run.request import FitRequest, SceneRequest, check_overrides, choose_device, choose_split, read_scene
+from warpgs.pipeline.run.results import (
+    evaluate_run,
+    event_figures,
+    given_figures,
+    images_kept,
+    overview_of,
+    protocol_of,
+    result_lines,
+    rule_report_of,
+    sampling_report_of,
+    write_report,
+)
+from warpgs.pipeline.train.batch import check_ranks, check_renders, own_slots
+from warpgs.pipeline.train.presets import chosen_settings
+from warpgs.pipeline.train.schedule import StepReport, choose_background, over_background
+from warpgs.pipeline.train.settings import FitConfig, settings_by_views, within_budget
+from warpgs.pipeline.train.trainer import Trainer, background_warmup, complexity_figures, complexity_summary, run, train_views
+from warpgs.plugins import is_ours
+from warpgs.poses.find import JSON, TEXT, find_poses, needs_poses, read_poses_record, source_digest
+from warpgs.priors.photo_checks import PhotoCheck, check_photos, photo_notes
+from warpgs.process import Detail, counted, noted_signals, say
+from warpgs.ranks import ALONE, Ranks
+from warpgs.report.page import image_names, renaming_notes
+from warpgs.report.progress import EventLog, Progress, Stages
+from warpgs.scene import Camera, Gaussians, Normalization, Scene, View, checked_scene
+
+
+@dataclass
+class FitJob:
+    """One fit in progress: its inputs and its state."""
+
+    scene: Scene
+    request: SceneRequest
+    split: Split
+    config: FitConfig
+    device: torch.device
+    where: str
+    out: Path | None
+    lpips: Lpips | None
+    notes: list[str]
+    verbose: bool | Literal["progress"]
+    on_step: Callable[[StepReport], object] | None
+    began: float
+    progress: Callable[[str], object]
+    on_model: Callable[[FittedModel], object] | None
+    ranks: Ranks
+    compiled: list[float]
+    photographs: list[PhotoCheck] = field(default_factory=list)
+
+    @property
+    def train(self) -> list[View]:
+        """Views to fit."""
+        return train_views(self.scene, self.split.train)
+
+    @property
+    def test(self) -> list[View]:
+        """Views held out."""
+        return train_views(self.scene, self.split.test)
+
+    @property
+    def other_models(self) -> list[str]:
+        """Camera models that have no pinhole of the same K; views with these models cannot be compared."""
+        return sorted({v.camera.model for v in self.scene.views} - {*CENTRAL})
+
+    def say(self, line: str) -> None:
+        """Print a line for the user, unless the fit is silent or prints only progress."""
+        if self.verbose is True:
+            say(line)
+
+    def note(self, line: str) -> None:
+        """Keep a line for the report, and print it unless it is a detail."""
+        self.notes.append(line)
+        if not isinstance(line, Detail):
+            self.say(f"  {line}")
+
+    def announce(self, notes: list[str]) -> None:
+        """Print the scene and all automatic choices so far, ``notes`` last."""
+        before, self.notes = self.notes, []
+        camera = self.train[0].camera
+        size = f"{camera.width} x {camera.height} px"
+        counts = f"{len(self.train)} views to fit, {len(self.test)} held out"
+        self.say(f"{self.scene.path}: {self.scene.format}, {counts}, {size}, {self.where}")
+        for note in [*before, *notes]:
+            self.note(note)
+
+
+Names = tuple[str, ...]
+
+
+class RunRecorder:
+    """Log and checkpoints of a fit in its run folder; nothing is written without a folder."""
+
+    def __init__(self, job: FitJob, step: int, images_written: Callable[[], None]):
+        """Open the log after ``step``; ``images_written`` waits for the images before a checkpoint is written."""
+        self.job, self.images_written = job, images_written
+        self.log = None if job.out is None else EventLog(job.out / "metrics.jsonl", step)
+
+    def write(self, r: StepReport) -> None:
+        """Write a step to the log."""
+        if self.log is not None:
+            self.log.write(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=round(r.seconds, 6))
+
+    def save(self, trainer: Trainer) -> None:
+        """Save the state as a checkpoint, after the log and the images of earlier steps are written."""
+        job = self.job
+        if job.out is None or self.log is None:
+            return
+        self.log.flush()
+        self.images_written()
+        tensors, state = trainer.state()
+        if trainer.config.view_modules:  # by which a run is opened without their code
+            cameras = learned_cameras(job.scene, job.split, trainer.learned.views)
+            state["cameras"] = {n: camera_values(c) for n, c in cameras.items()}
+        save_checkpoint(job.out, tensors, state | {"fingerprint": job.scene.fingerprint, "train": job.split.train})
+
+    def restore(self, trainer: Trainer) -> bool:
+        """Load the last checkpoint, and truncate the log to it; returns False without a checkpoint."""
+        out = self.job.out
+        if out is None or self.log is None or not (out / TENSORS).is_file():
+            return False
+        trainer.load(*load_checkpoint(out))
+        self.log.rewind(trainer.step)
+        return True
+
+    def close(self) -> None:
+        """Close the log."""
+        if self.log is not None:
+            self.log.close()
+
+
+class StepTeller:
+    """Receiver of each step's report, for the terminal, the log and the caller."""
+
+    def __init__(self, job: FitJob, trainer: Trainer, recorder: RunRecorder, progress: Progress | None):
+        """Start before the first step; ``progress`` is None for a fit without a display of progress."""
+        self.job, self.trainer, self.recorder, self.progress = job, trainer, recorder, progress
+        self.slow, self.compiled = -1, -1
+        """The last step that was slow because it compiled kernels; the number of kernels compiled by then."""
+
+    def __call__(self, r: StepReport) -> None:
+        """Take one report."""
+        job, trainer = self.job, self.trainer
+        if len(job.compiled) > self.compiled:
+            self.slow, self.compiled = trainer.step, len(job.compiled)
+        if self.progress is not None:
+            self.progress.total = trainer.steps  # fewer, once the fit is known to end earlier
+            seconds = None if r.step <= self.slow else r.seconds
+            self.progress.update(step=r.step, loss=r.loss, psnr=r.psnr, count=r.count, seconds=seconds)
+        self.recorder.write(r)
+        tell(job, trainer)
+        if job.on_step is not None:
+            job.on_step(r)
+        if job.on_model is not None:
+            model = FittedModel(
+                *model_fields(job, trainer), transparent=job.scene.transparent, antialiased=job.config.antialiased
+            )
+            job.on_model(model)
+
+
+def take_steps(job: FitJob, trainer: Trainer, images_written: Callable[[], None]) -> None:
+    """Take all remaining steps, with a log and checkpoints if there is a run folder; images are written before a checkpoint.
+
+    Raises:
+        NotFiniteError: A loss or the state is not finite; with a run folder, the state before the step is saved.
+        KeyboardInterrupt: A signal ended the fit; the state is saved.
+    """
+    recorder = RunRecorder(job, trainer.step, images_written)
+    shown = Progress(trainer.steps, trainer.step) if job.verbose else contextlib.nullcontext()
+    with shown as progress, contextlib.closing(recorder):
+        try:
+            with noted_signals() as stopped:
+                run(trainer, StepTeller(job, trainer, recorder, progress), recorder.save, stopped, recorder.restore)
+        except NotFiniteError as e:
+            if e.view is None:
+                raise
+            if job.out is None:
+                job.ranks.leave()  # all ranks have this loss; the first reports it
+                raise
+            failed = _saved_failure(job.out, job, trainer, e)
+            recorder.save(trainer)
+            raise failed from e
+
+
+def _saved_failure(out: Path, job: FitJob, trainer: Trainer, error: NotFiniteError) -> NotFiniteError:
+    """Save the inputs of a step with a non-finite loss; returns the error for the user."""
+    assert error.view is not None
+    name = job.split.train[error.view]
+    bundle = failed_step(trainer, error.view, name, error.slot)
+    save_failed_step(out / FAILED, bundle)
+    broken = broken_terms(bundle)
+    own = [t.name for t in trainer.terms if t.name in broken and not is_ours(type(t))]
+    where = f", in the loss term {' and '.join(broken)}" if broken else ""
+    mend = f"correct {' and '.join(own)}, and fit again" if own else "fit again with lower learning rates"
+    names = "names the non-finite values of the other terms" if own else "names the non-finite values"
+    return NotFiniteError(
+        f"{error}, on {name}{where}. The state before the step and its inputs are saved; `warpgs doctor --repeat "
+        f"{out / FAILED}` {names}. --resume would fail at the same step; {mend} into a new --out"
+    )
+
+
+def model_fields(
+    job: FitJob, trainer: Trainer
+) -> tuple[Gaussians, Normalization, dict[str, Camera], Names, Names, str, tuple[float, float, float], int]:
+    """Return the fields of the current `FittedModel` of a fit."""
+    cameras = cameras_of(job.scene)
+    names, rule = (job.split.train, job.split.test), job.config.rule
+    return trainer.gaussians, job.scene.normalization, cameras, *names, rule, job.scene.background, trainer.step
+
+
+def tell(job: FitJob, trainer: Trainer) -> None:
+    """Print the messages of the fit, and keep them for the report."""
+    while trainer.messages:
+        trainer.notes.append(trainer.messages.pop(0))  # a continued run has them in its report, too
+        job.note(trainer.notes[-1])
+
+
+def check_batched(
+    scene: Scene | SceneRequest | str | Path, config: FitConfig, ranks: Ranks, time_budget: float | None, resume: bool
+) -> None:
+    """Check that the processes can share a fit.
+
+    Args:
+        scene: The scene, as in `warpgs.fit`.
+        config: Settings.
+        ranks: The processes.
+        time_budget: Time that the fit may take [s]; None for no limit.
+        resume: Whether a run is continued.
+
+    Raises:
+        UsageError: A step has fewer views than processes, or each process would choose its own settings or find its own poses.
+    """
+    check_ranks(config.batch, ranks)
+    if ranks.count == 1:
+        return
+    path = None if isinstance(scene, Scene) else Path(scene.path if isinstance(scene, SceneRequest) else scene)
+    if path is not None and not resume and needs_poses(path):
+        raise UsageError(
+            f"{path}: has no cameras, and each of {ranks.count} ranks would find its own poses; run `warpgs poses {path} --out "
+            "SCENE` first, and fit SCENE"
+        )
+    if time_budget is not None:
+        raise UsageError(
+            f"--time-budget: each of {ranks.count} ranks would measure its own speed and choose other steps; give --steps"
+        )
+
+
+def check_equal(record: dict[str, Any], step: int | None, ranks: Ranks) -> None:
+    """Check that all processes fit the same scene with the same settings, because each takes a part of the same steps.
+
+    Args:
+        record: Record of the run, as this process has it.
+        step: Step of the checkpoint to continue from; None without one.
+        ranks: The processes.
+
+    Raises:
+        UsageError: A process differs from the first one; raised in every process.
+    """
+    if ranks.count == 1:
+        return
+    parts = {
+        "a different version of warpgs": (record["versions"]["warpgs"], "install the same version everywhere"),
+        "a different scene": (record["fingerprint"], "give all ranks the same files and options for reading"),
+        "a different split": ([record["train"], record["test"]], "give all ranks the same --split"),
+        "different settings": ([record["config"], record["own_code"]], "start all ranks with the same flags and the same code"),
+        "a different checkpoint": (step, "give all ranks the same --out, on a file system that all machines share"),
+    }
+    own = {name: hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest() for name, (value, _) in parts.items()}
+    first, *others = map(json.loads, ranks.texts(json.dumps(own)))
+    for rank, other in enumerate(others, 1):
+        for name, (_, fix) in parts.items():
+            if other.get(name) != first.get(name):
+                raise UsageError(f"rank {rank} has {name} than rank 0: {fix}")
+
+
+def batched_notes(config: FitConfig, ranks: Ranks) -> list[str]:
+    """Return sentences on views and processes of a step; empty if a step has one view."""
+    if config.batch == 1:
+        return []
+    notes = [
+        f"batch: each of the {config.steps:,} steps renders {config.batch} views and averages their gradients; "
+        f"learning rates are {config.batch**0.5:.3g} times those for one view"
+    ]
+    if ranks.count > 1:
+        counts = sorted({len(own_slots(config.batch, ranks.count, rank)) for rank in range(ranks.count)})
+        notes.append(
+            f"ranks: {ranks.count} processes ({ranks.backend}); each renders {' or '.join(map(str, counts))} views of a step; "
+            "the model has the same bits for any number of ranks"
+        )
+    return notes
+
+
+def with_poses(request: SceneRequest, out: Path | None, progress: Callable[[str], object]) -> tuple[SceneRequest, list[str]]:
+    """Find the poses of photographs if a request names photographs without cameras; other requests are returned unchanged.
+
+    Args:
+        request: The request; its path may be a folder of images or a video.
+        out: Run folder, whose subfolder `scene` stores the poses; a run that is continued or restarted reads them from there.
+        progress: Called with lines for the user.
+
+    Returns:
+        The request for the scene with poses, and notes for the user.
+
+    Raises:
+        DataError: The photographs cannot be registered, or are too few.
+        UsageError: There is no run folder for the poses, pycolmap is not installed, a continued run has other photographs, or a
+            matcher is given for a scene with cameras.
+    """
+    source = Path(request.path)
+    if request.reader is not None or not request.path or not needs_poses(source):
+        if request.matcher is not None:
+            raise UsageError(f"--matcher requires a folder of photographs without cameras; leave it out for {source}")
+        return request, []
+    if out is None:
+        raise UsageError(f"{source}: has no cameras, and finding poses needs a run folder; give out=")
+    scene = out / POSED_SCENE
+    if (scene / JSON).is_file():
+        record = read_poses_record(scene)
+        if record["source_sha256"] != source_digest(source, request.allow_outside):
+            raise UsageError(f"{scene} holds poses of other photographs than {source}; give another --out")
+    else:
+        progress(f"{source} has no cameras: finding the poses of its photographs, to store them in {scene}")
+        threads = torch.get_num_threads()
+        record = find_poses(
+            source, scene, threads=threads, max_pixels=request.max_pixels, allow_outside=request.allow_outside,
+            matcher=request.matcher, progress=progress,
+        )  # fmt: skip
+    return replace(request, path=str(scene), matcher=None), _notes(record)
+
+
+def lost_lines(out: Path | None) -> list[str]:
+    """Return a line on the photographs without a pose, which a run leaves out; an empty list if all have one.
+
+    Raises:
+        DataError: The record of the run's poses is incomplete.
+    """
+    if out is None or not (out / POSED_SCENE / JSON).is_file():
+        return []
+    rows = read_poses_record(out / POSED_SCENE)["photographs"]
+    lost = sum(not p["registered"] for p in rows)
+    why = out / POSED_SCENE / TEXT
+    return (
+        [f"{lost} of {len(rows)} photographs have no pose and were not used: {why} lists reasons and remedies"] if lost else []
+    )
+
+
+def _notes(record: dict[str, Any]) -> list[str]:
+    """Return the report's notes on found poses: the method, and photographs without a pose."""
+    lost = [f"no pose: {p['name']} {p['reason']}" for p in record["photographs"] if not p["registered"]]
+    where = [f"{POSED_SCENE}/{TEXT} in the run folder lists what to photograph next"] if record["advice"] else []
+    return [*record["notes"], *lost[:5], *([f"and {len(lost) - 5} more without a pose"] if len(lost) > 5 else []), *where]
+
+
+COMPILING = "compiling kernels, once on this machine, for a minute or two"
+"""Message while kernels are compiled."""
+State = tuple[dict[str, torch.Tensor], dict[str, Any]]
+"""Tensors and plain values of a checkpoint."""
+
+
+@dataclass(frozen=True, repr=False)
+class FitResult(FittedModel):
+    """A finished fit."""
+
+    config: FitConfig
+    """All settings, including those that were chosen automatically."""
+    metrics: dict[str, Any]
+    """Scores, sizes and times, as in metrics.json."""
+    notes: tuple[str, ...]
+    """Automatic choices, assumptions and missing parts."""
+    folder: Path | None
+    """The run folder; None without ``out``."""
+
+
+def fit(
+    scene: Scene | SceneRequest | str | Path,
+    preset: FitConfig | Mapping[str, Any] | str | Path | None = None,
+    *,
+    split: str | None = None,
+    out: str | Path | None = None,
+    device: str | torch.device = "auto",
+    on_step: Callable[[StepReport], object] | None = None,
+    resume: bool = False,
+    lpips_weights: str | Path | None = None,
+    time_budget: float | None = None,
+    notes: tuple[str, ...] = (),
+    verbose: bool | Literal["progress"] = True,
+    on_model: Callable[[FittedModel], object] | None = None,
+    ranks: Ranks = ALONE,
+    **overrides: object,
+) -> FitResult:
+    """Fit Gaussians to a scene, as `warpgs fit` does.
+
+    Prints automatic choices, progress and the location of the results, unless ``verbose`` is False.
+
+    Args:
+        scene: A scene, its folder, or a folder with options for reading.
+        preset: Settings to start from: the name of a preset; the path of a .toml file; a `FitConfig` or a mapping, as an
+            object, ``module:NAME`` or ``file.py:NAME`` (this runs the code of the module); None for the default preset.
+        split: Views to fit and to hold out, as in `warpgs fit --split`; None to fit all.
+        out: Run folder to fill with configuration, log, checkpoints, PLY, images, scores and report; None to write nothing.
+        device: auto, cpu, cuda, or a torch device.
+        on_step: Called after every step with its number, loss, PSNR, number of Gaussians and time.
+        resume: Continue the run in ``out`` from its last checkpoint.
+        lpips_weights: File of `warpgs convert-lpips`; None to leave LPIPS out.
+        time_budget: Time that the fit may take [s], which determines the number of steps; None to use the number in the
+            settings.
+        notes: Earlier choices, which are printed and recorded with the choices of the fit.
+        verbose: True to print everything, False to print nothing, "progress" to print progress only.
+        on_model: Called after every step with the current model, for viewers: the next step overwrites its tensors.
+        ranks: Processes that fit together, from `warpgs.train.join_ranks`, all with the same arguments. Only the first
+            prints, writes and scores; the others return a result without metrics.
+        **overrides: Settings that replace those of the preset, by the names of their flags with underscores, such as
+            ``steps=300`` or ``init_opacity=0.2``; or a group as a mapping, ``init={"opacity": 0.2}``. `FitConfig` and `warpgs
+            fit --help-all` list them.
+
+    Raises:
+        DataError: The file of a preset cannot be read, or a field of the scene is invalid; the message names view and field.
+        UsageError: A setting is unknown, of the wrong type or out of range, a preset or a split is invalid, ``out`` is not
+            empty, or ``resume`` is given without ``out``.
+        WarpgsError: Any other error that a user can fix, before the first step if possible.
+    """
+    out = None if out is None else Path(out)
+    if resume and out is None:
+        raise UsageError("resume requires out, the run folder to continue")
+    check_overrides(overrides)
+    if isinstance(scene, Scene):
+        scene = checked_scene(scene)
+    elif not isinstance(scene, (SceneRequest, str, Path)):
+        raise UsageError(
+            f"scene must be a warpgs.Scene or a folder, not {type(scene).__name__}; give Scene(path, format, views)"
+        )
+    config, origin = chosen_settings(preset, overrides)
+    spec = scene.split if split is None and isinstance(scene, SceneRequest) else split
+    if spec is not None:
+        check_spec(spec)
+    check_batched(scene, config, ranks, time_budget, resume)
+    verbose, own = ranks.first and verbose, out if ranks.first else None
+    with _opened(own, resume, verbose) as (held, progress, compiled):
+        resume = resume and out is not None and (out / CONFIG).is_file()  # else the folder holds only found poses
+        if out is not None and resume:
+            read_record(out)  # a run of another version is refused before anything takes time
+        where = choose_device(device)
+        began = time.perf_counter()
+        lpips = None if lpips_weights is None else load_lpips(Path(lpips_weights), where[0])
+        request, read, parts, found = _scene_of(scene, split, out, where[0].type, progress)
+        renamed = [] if out is None else renaming_notes(image_names(v.name for v in read.views))
+        own_notes = [*notes, *origin, *held, *found, *renamed]
+        job = FitJob(
+            read, request, parts, config, *where, own, lpips, own_notes, verbose, on_step, began, progress, on_model, ranks,
+            compiled,
+        )  # fmt: skip
+        _settle(job, time_budget)
+        trainer, state, record = _prepare(job, out if resume else None)
+        result = _finish(job, trainer, state, record, resume)
+    ranks.leave()
+    return result
+
+
+@contextlib.contextmanager
+def _opened(
+    out: Path | None, resume: bool, verbose: bool | Literal["progress"]
+) -> Iterator[tuple[list[str], Callable[[str], object], list[float]]]:
+    """Lock the run folder; yields notes on it, the function that shows progress, and the time spent on compiling [s]."""
+    nothing: contextlib.AbstractContextManager[list[str]] = contextlib.nullcontext([])
+    folder = nothing if out is None else run_folder(out, resume)
+    stages = Stages() if verbose else Stages(lambda line: None)
+    with folder as held, stages as progress, told_of_compiling(lambda name: progress(COMPILING)) as compiled:
+        yield held, progress, compiled
+
+
+def _settle(job: FitJob, time_budget: float | None) -> None:
+    """Composite the scene over its background, and choose the automatic settings."""
+    if time_budget is not None:
+        job.config, note = within_budget(job.config, time_budget, job.train, job.device)
+        job.notes.append(note)
+    color, background = choose_background(job.config.background, job.scene, job.train)
+    job.scene = over_background(job.scene, color)
+    job.config, chosen = settings_by_views(job.config, job.train, job.device.type)
+    job.notes += [*([background] if background else []), *chosen]
+    if job.config.antialiased:
+        job.notes.append("antialiased: other programs must use their antialiased mode to show exported files correctly")
+    check_renders(job.config.batch, job.config.steps or 0)
+
+
+def fit_request(request: FitRequest, **others: Any) -> FitResult:
+    """Run `fit` for the command line, a study or a farm; ``others`` are on_model, on_step and ranks of `fit`.
+
+    Raises:
+        KeyboardInterrupt: A signal ended the fit; the message explains how to continue.
+    """
+    r = request
+    try:
+        return fit(
+            r.scene, r.config, out=r.out, device=r.device, resume=r.resume, lpips_weights=r.lpips_weights,
+            time_budget=r.time_budget, notes=r.notes, **others,
+        )  # fmt: skip
+    except KeyboardInterrupt as e:
+        saved = r.out is not None and (r.out / TENSORS).is_file()
+        again = "--resume continues from the last checkpoint" if saved else "no step was saved: run the same command again"
+        raise KeyboardInterrupt(again) from e
+
+
+def _scene_of(
+    scene: Scene | SceneRequest | str | Path,
+    spec: str | None,
+    out: Path | None,
+    device: str,
+    progress: Callable[[str], object],
+) -> tuple[SceneRequest, Scene, Split, list[str]]:
+    """Read and split a scene that is given in one of four ways; returns request, scene, split and notes."""
+    if isinstance(scene, Scene):
+        split, notes = choose_split(scene, spec)
+        return SceneRequest("", spec, 1).with_scale(device), scene, split, [*scene.notes, *notes]
+    request = (scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))).with_scale(device)
+    if spec is not None:
+        request = replace(request, split=spec)
+    request, found = with_poses(request, out, progress)
+    progress(f"reading {request.path}")
+    read, parts, notes = read_scene(request, progress)
+    return request, read, parts, [*found, *notes]
+
+
+def _prepare(job: FitJob, resumed: Path | None) -> tuple[Trainer, State | None, dict[str, Any]]:
+    """Set up the trainer; returns it, the state to continue the run ``resumed`` from, if any, and the record of the run."""
+    record, state = record_of(job.request, job.config, job.scene, job.split, job.notes, job.device), None
+    if resumed is not None:
+        stored = read_record(resumed)
+        check_same(record, stored, resumed)
+        if (resumed / TENSORS).is_file():
+            state = load_checkpoint(resumed)
+            check_checkpoint(state[1], stored, resumed)
+            if state[1]["step"] == state[1].get("steps"):
+                job.say(f"  all {state[1]['step']:,} steps are taken; only the images, scores and report are made again")
+    check_equal(record, None if state is None else state[1].get("step"), job.ranks)
+    c = job.config
+    with background_warmup(c, job.device) as ready:
+        if job.other_models:
+            models = " and ".join(job.other_models)
+            job.notes.append(f"camera model {models}: views cannot be compared, so blur, exposure and coverage are not checked")
+        else:
+            job.photographs = check_photos([*job.train, *job.test], job.progress)
+        of = job.train, job.scene.points, c, job.device, job.scene.background
+        trainer = Trainer(*of, ready=ready, progress=job.progress, ranks=job.ranks)
+    if job.device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(job.device)  # report the steps' memory, not that of the start or of an earlier fit
+    return trainer, state, record
+
+
+def _finish(job: FitJob, trainer: Trainer, state: State | None, record: dict[str, Any], resume: bool) -> FitResult:
+    """Take the steps, score the model, and write the run folder, if any."""
+    if job.out is not None and not resume:
+        write_json(job.out / CONFIG, record)
+    if state is not None:
+        try:
+            trainer.load(*state)
+        except DataError as e:
+            raise DataError(f"{job.out}/{TENSORS}: {e}") from e
+        job.notes.append(f"continued from step {trainer.step}; this run's times count from there")
+    shared = batched_notes(job.config, job.ranks)
+    job.announce([*photo_notes(job.photographs), *trainer.notes, *shared, trainer.memory.summary()])
+    setup = time.perf_counter() - job.began
+    nothing = contextlib.nullcontext(lambda: None)
+    with nothing if job.out is None else images_kept(trainer, list(job.split.train), job.out) as images_written:
+        take_steps(job, trainer, images_written)
+    tell(job, trainer)  # of images that were written last
+    training = time.perf_counter() - job.began - setup
+    job.ranks.part()
+    if not job.ranks.first:
+        return FitResult(*model_fields(job, trainer), job.config, {}, tuple(job.notes), None)
+    given = cameras_of(job.scene)
+    job.scene = with_cameras(job.scene, learned_cameras(job.scene, job.split, trainer.learned.views))
+    if job.out is not None:
+        write_ply(
+            job.out / "point_cloud.ply",
+            drop_unused_sh(trainer.gaussians),
+            job.scene.normalization,
+            antialiased=job.config.antialiased,
+        )
+    with ThreadPoolExecutor(1) as beside:
+        # its process takes seconds; views are scored here meanwhile
+        overview = beside.submit(overview_of(trainer.gaussians, job.train, job.test)) if job.out is not None else None
+        metrics = _score(job, trainer, {"setup": setup, "training": training}, given)
+        if job.out is not None and overview is not None:
+            job.progress("making the report")
+            write_json(job.out / METRICS_FILE, metrics)
+            record["notes"] = job.notes
+            write_report(
+                job.out, job.scene, job.split, trainer.gaussians, trainer.context.render_options(), metrics, record,
+                sampling=sampling_report_of(trainer, job.out), overview=overview.result(), tell=job.progress,
+            )  # fmt: skip
+    for line in [*lost_lines(job.out), *result_lines(metrics, job.out)]:
+        job.say(line)
+    return FitResult(
+        *model_fields(job, trainer), job.config, metrics, tuple(job.notes), job.out,
+        transparent=job.scene.transparent, antialiased=job.config.antialiased,
+    )  # fmt: skip
+
+
+def _score(job: FitJob, trainer: Trainer, seconds: dict[str, float], given: dict[str, Camera]) -> dict[str, Any]:
+    """Score the finished fit, with the ``given`` cameras from before it; returns the contents of metrics.json."""
+    c, scene, train, test, gaussians = job.config, job.scene, job.train, job.test, trainer.gaussians
+    on_cuda = job.device.type == "cuda"
+    peak = {"peak_torch_bytes": torch.cuda.max_memory_allocated(job.device)} if on_cuda else {}
+    names = image_names(v.name for v in scene.views)
+    options, tell = trainer.context.render_options(), job.progress
+    scored = (job.out, gaussians, train, test, options)
+    metrics = evaluate_run(*scored, job.lpips, names=names, tell=tell)
+    if test and not job.other_models:
+        metrics["coverage"] = coverage_of_run(*scored, names=names, tell=tell)
+    tell("checking float32 accuracy")
+    rule = rule_report_of(gaussians, train, options, seed=c.seed, half_resolution=trainer.half_resolution)
+    shape = shape_figures(gaussians, c.limits, trainer.radius, trainer.context.extent, [v.camera for v in train])
+    moved = {}
+    if not job.other_models:
+        shown = counted(train, job.progress, "checking for moving objects", "views")
+        fractions = moved_fractions(train, (Rendered(*render_view(gaussians, v, options)) for v in shown))
+        moved = {v.name: f for v, f in zip(train, fractions, strict=True)}
+    complexity = complexity_figures(trainer)
+    learned = learned_figures(trainer.learned.views, scene, job.split, given, test, gaussians, options)
+    details = [rule["summary"], shape_summary(shape), complexity_summary(complexity)]
+    mapped = given_figures(train, trainer.views, gaussians, options)
+    summaries = [e["summary"] for of in (learned, mapped) for e in of.values()]
+    for note in [*map(Detail, details), *moved_notes(moved), *summaries]:
+        job.note(note)
+    compiling = {"compiling": sum(job.compiled)} if job.compiled else {}
+    return metrics | {
+        "protocol": protocol_of(scene, job.request.split, job.request.downscale or 1, train, test),
+        "steps": trainer.step, "batch": c.batch, "ranks": job.ranks.count,
+        "gaussians": len(gaussians), "preset": c.preset, "seed": c.seed,
+        "config_hash": c.fingerprint(), "fingerprint": scene.fingerprint, "device": job.where.removeprefix("on "),
+        "seconds": {**seconds, **compiling, "total": time.perf_counter() - job.began}, **peak,
+        "memory": trainer.memory.to_json(), "rule": rule, "shape": shape,
+        **event_figures(trainer), **complexity, "view_modules": learned, "given": mapped,
+        "photographs": [p.to_json() | {"moved": moved.get(p.name)} for p in job.photographs],
+    }  # fmt: skip

@@ -1,0 +1,146 @@
+"""Compile the kernels that a fit uses before it needs them, several modules at a time, into Warp's cache."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import warp as wp
+
+from warpgs.constants import TILE_SIZE
+from warpgs.device import format_bytes
+from warpgs.kernels import (
+    blend,
+    blend_cpu,
+    blend_cuda,
+    launch,
+    neighbours,
+    project_cpu,
+    project_cuda,
+    sh,
+    ssim,
+    sweep,
+    tiles,
+    update,
+)
+from warpgs.kernels.falloff import COLORS, VALUES
+from warpgs.kernels.native import BLOCK, load_module
+from warpgs.pipeline.train.strategies import mcmc
+from warpgs.process import say
+
+THREADS = 256
+"""Default number of threads of a block."""
+CAMERA_MODEL = "pinhole"
+"""Camera model whose kernels are compiled: the model of scenes read without native lenses."""
+
+
+def fit_kernels(cuda: bool) -> list[tuple[wp.Kernel, int]]:
+    """Return a kernel of each module that a fit on CUDA or on the CPU launches, with the block size of the launches.
+
+    On CUDA a module is compiled once for each block size. Scores are computed on the CPU for fits on any device.
+    """
+    real = wp.float32
+    common = [
+        (tiles.make_kernels(real, cuda).pack_counts, THREADS),
+        *(((tiles.make_emit if cuda else tiles.make_emit_cpu)(real, slotted), THREADS) for slotted in (True, False)),
+        *((tiles.make_find_ranges(slotted, cuda), THREADS) for slotted in (True, False)),
+        (neighbours.make_knn_kernels(real).search, THREADS), (update.make_dropout_kernel(), THREADS),
+        (neighbours.make_reach_kernel(), THREADS), (update.make_decay_kernel(), THREADS),
+        (update.make_step_kernels().end_step, THREADS), (mcmc.make_kernel(), THREADS),
+    ]  # fmt: skip
+    if not cuda:
+        blending, scoring = (
+            blend_cpu.make_kernels(real, TILE_SIZE),
+            [ssim.make_cpu_kernels(real, summed) for summed in (True, False)],
+        )
+        without_depth = blend_cpu.make_kernels(real, TILE_SIZE, deep=False)
+        updates = [update.make_adam_kernel(real, split, update.LANES) for split in (True, False)]
+        variant = CAMERA_MODEL, "stored", False, sh.BASES
+        own = [
+            project_cpu.make_forward(real, *variant), project_cpu.make_backward(real, *variant, False),
+            blending.forward, blending.backward, without_depth.backward, blending.contributions,
+            blend.make_segments(real, VALUES, 9 + COLORS).sum_gradients, blend.make_segments(real).gather_weights,
+            update.make_errors(),
+            sweep.make_costs_kernel(), sweep.make_depth_kernels().best, sweep.make_scanline_kernel_cpu(),
+            *(k for s in scoring for k in (s.forward, s.backward)), *updates,
+        ]  # fmt: skip
+        return [(kernel, 1) for kernel in [*(k for k, _ in common), *own]]
+    blending, warps = blend_cuda.make_kernels(TILE_SIZE), 32 * blend_cuda.WARPS
+    own = [
+        (project_cuda.make_forward(wp.float32, CAMERA_MODEL), BLOCK),
+        (project_cuda.make_backward(wp.float32, CAMERA_MODEL), BLOCK),
+    ]
+    own += [(blend_cuda.make_forward(TILE_SIZE, save, per), warps) for save in (True, False) for per in (1, 2)]
+    own += [(launch.make_fetch(), THREADS), (blending.order_tiles, blend_cuda.ORDER_THREADS)]
+    own += [(blending.contributions, TILE_SIZE * TILE_SIZE)]
+    own += [(blend.make_segments(real).gather_weights, THREADS), (sweep.make_scanline_kernel(), sweep.BLOCK)]
+    for depth, chunk in itertools.product((False, True), blend_cuda.CHUNKS):  # with a loss term that reads depth, and without
+        passes = blend_cuda.make_backward(TILE_SIZE, depth, chunk, False)
+        own += [(passes.backward, warps), (passes.gather, THREADS)]
+    own += [(ssim.make_cuda_kernels().forward, ssim.THREADS), (update.make_scheduled_kernel(), THREADS)]
+    return common + own
+
+
+@dataclass(frozen=True)
+class Precompiled:
+    """One module of kernels, loaded on one device."""
+
+    device: str
+    """cpu, or the name of the CUDA device."""
+    kernel: str
+    """File and name of one kernel of the module."""
+    block: int
+    """Threads of a block that the module was compiled for."""
+    compiled: bool
+    """False if the cache already had the module."""
+    seconds: float
+    """Time to compile and load the module [s]."""
+
+
+def _load(device: torch.device, kernel: wp.Kernel, block: int) -> Precompiled:
+    began, name = time.time(), f"{kernel.func.__module__.rpartition('.')[2]}.{kernel.func.__name__}"
+    path = Path(load_module(kernel.module, launch.warp_device(device), block).binary_path)
+    return Precompiled(str(device), name, block, path.stat().st_mtime >= began, time.time() - began)
+
+
+def precompile_kernels(devices: list[torch.device] | None = None) -> Iterator[Precompiled]:
+    """Compile the modules that are not cached, and yield each when it is done.
+
+    Args:
+        devices: Devices to compile for; None for the CPU and every CUDA device that torch sees.
+
+    Raises:
+        RuntimeError: A kernel does not compile.
+    """
+    if devices is None:
+        devices = [torch.device("cpu"), *(torch.device("cuda", i) for i in range(torch.cuda.device_count()))]
+    jobs = {}
+    for device in devices:
+        for kernel, block in fit_kernels(device.type == "cuda"):
+            jobs[device, kernel.module, block] = device, kernel, block
+    # Warp's own force_load also uses threads, but does not report the time of each module
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        for done in as_completed([pool.submit(_load, *job) for job in jobs.values()]):
+            yield done.result()
+
+
+def print_warming(devices: list[torch.device] | None = None) -> None:
+    """Warm the cache; print a line for each compiled module, and a summary."""
+    began, results = time.perf_counter(), []
+    for w in precompile_kernels(devices):
+        results.append(w)
+        if w.compiled:
+            blocks = "" if w.device == "cpu" else f" in blocks of {w.block}"
+            say(f"{w.device}: {w.kernel}{blocks}, {w.seconds:.1f} s")
+    compiled, folder = [w for w in results if w.compiled], Path(wp.config.kernel_cache_dir)
+    size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
+    say(
+        f"{len(results)} modules: {len(compiled)} compiled, {len(results) - len(compiled)} were in the cache, "
+        f"{time.perf_counter() - began:.1f} s; {folder} holds {format_bytes(size)}"
+    )

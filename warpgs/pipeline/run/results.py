@@ -1,0 +1,681 @@
+"""Results of a fit: figures, images and notes, for metrics.json and the report."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import shlex
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from warpgs.constants import TILE_SIZE
+from warpgs.device import format_bytes
+from warpgs.errors import ResourceError
+from warpgs.files import make_folder, read_file, write_bytes
+from warpgs.geometry import MODELS, depth_normals
+from warpgs.io.images import decode
+from warpgs.io.load import Split
+from warpgs.pipeline.films.paths import up_of
+from warpgs.pipeline.metrics.coverage import coverage_section
+from warpgs.pipeline.metrics.lpips import Lpips
+from warpgs.pipeline.metrics.scores import (
+    ALPHA_VARIANTS,
+    ViewMetrics,
+    baselines,
+    psnr_of,
+    render_view,
+    score,
+    summarize,
+    variants,
+)
+from warpgs.pipeline.train.loss import GIVEN_MIN_ALPHA
+from warpgs.pipeline.train.sampling import SUPPORT
+from warpgs.pipeline.train.schedule import Phases
+from warpgs.pipeline.train.strategies.importance_sampling import Event, ImportanceSampling, MethodConfig, SampledView
+from warpgs.pipeline.train.trainer import Trainer
+from warpgs.pipeline.train.views import TrainingView
+from warpgs.process import counted
+from warpgs.render.options import RasterizeOptions
+from warpgs.render.rasterize import rasterize
+from warpgs.render.reference import reference_image
+from warpgs.report.images import Tile, contact_sheet, depth_map, error_map, png, side_by_side, webp
+from warpgs.report.overview import render_overview
+from warpgs.report.page import Page, SamplingReport, ViewImages, curve, image_names, write_page
+from warpgs.report.progress import duration, read_events
+from warpgs.scene import Camera, Gaussians, Scene, View, base_colors
+
+DEPTH, NORMALS = "given_depth", "given_normals"
+"""Names of the maps of the loss terms."""
+
+
+def given_figures(
+    train: Sequence[View], views: Sequence[TrainingView], gaussians: Gaussians, options: RasterizeOptions
+) -> dict[str, Any]:
+    """Return the comparison of the model with each kind of given map: a row for each view with such a map, and a summary.
+
+    Args:
+        train: The views to fit.
+        views: The same views, with the maps of the loss terms.
+        gaussians: The fitted model.
+        options: Options for rendering the model.
+
+    Returns:
+        For ``depth`` and ``normals``, each only if a loss term compared it: ``views`` with name, fraction of the pixels with a
+        given value, and median difference (relative for depth, in degrees for normals; NaN without rendered pixels); and
+        ``summary``.
+    """
+    rows: dict[str, list[dict[str, Any]]] = {"depth": [], "normals": []}
+    for view, mapped in zip(train, views, strict=True):
+        maps = {n: t.cpu().numpy() for n, t in mapped.maps.items() if n in (DEPTH, NORMALS) and bool(t.any())}
+        if not maps:
+            continue
+        _, depth, alpha = render_view(gaussians, view, options)
+        shown = alpha > GIVEN_MIN_ALPHA
+        if DEPTH in maps:
+            scaled, weight, unit = np.moveaxis(maps[DEPTH], -1, 0)
+            at = weight > 0
+            both = at & shown
+            off = np.abs(depth[both] * scaled[both] / unit[both] - 1)
+            rows["depth"].append(_row(view.name, at, off))
+        if NORMALS in maps:
+            given = maps[NORMALS]
+            K = torch.from_numpy(view.camera.K).float()
+            camera = replace(view.camera, viewmat=torch.eye(4, dtype=torch.float32, device="cpu"), K=K)
+            found = depth_normals(camera, torch.as_tensor(np.where(shown, depth, 0), dtype=torch.float32)).numpy()
+            at = given.any(-1)
+            both = at & found.any(-1)
+            cosine = (given[both] * found[both]).sum(-1).clip(-1, 1)
+            rows["normals"].append(_row(view.name, at, np.degrees(np.arccos(cosine))))
+    words = {
+        "depth": "given depth: median difference of rendered depth {:.2%} (worst view {:.2%})",
+        "normals": "given normals: median difference of the normals of rendered depth {:.1f} degrees (worst view {:.1f})",
+    }
+    found = {}
+    for name, own in rows.items():
+        if not own:
+            continue
+        off = [r["difference"] for r in own if np.isfinite(r["difference"])] or [float("nan")]
+        share = float(np.mean([r["coverage"] for r in own]))
+        summary = f"{words[name].format(float(np.median(off)), max(off))}, over {share:.1%} of the pixels of {len(own)} views"
+        found[name] = {"views": own, "summary": summary}
+    return found
+
+
+def _row(name: str, at: np.ndarray, off: np.ndarray) -> dict[str, Any]:
+    difference = float(np.median(off)) if len(off) else float("nan")
+    return {"name": name, "coverage": float(at.mean()), "difference": difference}
+
+
+VIEWS = 3
+"""Number of training views that are compared, sampled at random."""
+SIDE = 64
+"""Side of the part of each view that is compared [px], a multiple of the tile size."""
+
+
+def _window(camera: Camera, generator: np.random.Generator) -> tuple[int, int, int, int]:
+    """Sample a part of an image, [left, top, width, height], with edges at tile edges or image edges."""
+    sides = []
+    for length in (camera.width, camera.height):
+        first = TILE_SIZE * int(generator.integers(max(0, length - SIDE) // TILE_SIZE + 1))
+        sides.append((first, min(SIDE, length - first)))
+    (x, width), (y, height) = sides
+    return x, y, width, height
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one thread in the block: for many small tensors, threads wait for each other longer than they compute."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)
+
+
+def _seconds(render: Callable[[], object], device: torch.device) -> float:
+    """Return the wall time of the second of two calls [s]: the first loads kernels and allocates."""
+    for _ in range(2):
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        began = time.perf_counter()
+        render()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+    return time.perf_counter() - began
+
+
+@torch.no_grad()
+def rule_report_of(
+    gaussians: Gaussians, views: list[View], options: RasterizeOptions, *, seed: int, half_resolution: float = 0.0
+) -> dict[str, Any]:
+    """Measure error and saved time of a rule on a scene; takes some tenths of a second.
+
+    Three random views are rendered with the rule, as in the fit. 64 x 64 px of each are compared with the image of rule `exact`
+    in float64. That image is computed by `warpgs.render.reference` without the kernels, or by the kernels if `warpgs.geometry`
+    does not have the camera model.
+
+    Args:
+        gaussians: Gaussians of the finished fit, float32.
+        views: Training views, at least one.
+        options: Options of the rasterizer, with the name of the fit's cut-offs and a background.
+        seed: Seed of the choice of views and parts.
+        half_resolution: Fraction of the steps with views of half size.
+
+    Returns:
+        ``max``, ``mean`` and ``psnr`` [dB] (None if infinite) of the error of colours in [0, 1] over all parts; ``views`` by
+        name with their compared parts; ``render_ms`` and, unless the rule is `exact`, ``exact_ms`` of one whole view; ``rule``;
+        and ``summary``, the same figures as a sentence.
+    """
+    generator = np.random.default_rng(seed)
+    chosen = [views[i] for i in sorted(generator.permutation(len(views))[:VIEWS])]
+    device = gaussians.means.device
+    assert options.background is not None
+    options = dataclasses.replace(options, background=options.background.to(gaussians.means))
+    rule, exact = options.rule, dataclasses.replace(options, rule="exact")
+    errors, windows = [], {}
+    for view in chosen:
+        window = windows[view.name] = _window(view.camera, generator)
+        found = rasterize(gaussians, view.camera, dataclasses.replace(options, window=window)).rgb
+        # what reaches the part under `exact`; tiles are listed with a margin
+        near = rasterize(gaussians, view.camera, dataclasses.replace(exact, window=window)).visible[0]
+        part = Gaussians(**{n: t[near] for n, t in gaussians.tensors().items()})
+        wanted = _wanted(part, view.camera, window, exact)
+        errors.append((found.double() - wanted).abs().flatten())
+    error = torch.cat(errors)
+    whole = chosen[0].camera
+    result = {
+        "rule": rule, "max": float(error.max()), "mean": float(error.mean()), "psnr": psnr_of(float((error**2).mean())),
+        "views": {n: list(w) for n, w in windows.items()}, "half_resolution": half_resolution,
+        "render_ms": 1000 * _seconds(lambda: rasterize(gaussians, whole, options), device),
+    }  # fmt: skip
+    if rule != "exact":
+        result["exact_ms"] = 1000 * _seconds(lambda: rasterize(gaussians, whole, exact), device)
+    return result | {"summary": _summary(result)}
+
+
+def _wanted(part: Gaussians, camera: Camera, window: tuple[int, int, int, int], exact: RasterizeOptions) -> torch.Tensor:
+    """Return a part of an image under `exact` in float64; by the kernels for camera models that the reference lacks."""
+    if camera.model in MODELS:
+        with _one_thread():
+            return reference_image(part, camera, window, exact.background, part.sh_degree, exact.antialiased)
+    doubled = Gaussians(**{n: t.double() for n, t in part.tensors().items()})
+    return rasterize(doubled, camera, dataclasses.replace(exact, background=exact.background.double(), window=window)).rgb
+
+
+def _summary(r: dict[str, Any]) -> str:
+    """Return the figures as one sentence for the user."""
+    sizes = {f"{w} x {h} px" for _, _, w, h in r["views"].values()}
+    where = f"on {' or '.join(sorted(sizes))} of {len(r['views'])} random training view{'s' if len(r['views']) > 1 else ''}"
+    error = f"{r['mean']:.1e} on average and {r['max']:.1e} at most, {r['psnr']:.0f} dB, {where}"
+    if r["rule"] == "exact":
+        words = f"rule exact has no cut-offs; float32 differs from float64 by {error}"
+    else:
+        ratio = r["render_ms"] / r["exact_ms"]
+        words = (
+            f"images by rule {r['rule']} differ from images by rule exact in float64 by {error}; a view took "
+            f"{r['render_ms']:.1f} ms, {abs(1 - ratio):.0%} {'less' if ratio <= 1 else 'more'} than with rule exact "
+            f"({r['exact_ms']:.1f} ms)"
+        )
+    if r["half_resolution"] > 0:
+        words += f"; {r['half_resolution']:.0%} of the steps used views of half size, with a quarter of the pixels"
+    return words
+
+
+FOLDER = "sampling"
+"""Subfolder of a run with the images, ``STEP.png``."""
+SHOWN = 3
+"""Number of views in an image."""
+SHEET_WIDTH = 1600
+"""Largest width of an image on the report page [px]."""
+OPEN, CLOSED = (0.97, 0.97, 0.95), (0.17, 0.19, 0.22)
+"""Colours of pixels that pass the gate, and of all others."""
+FADED = 0.45
+"""Contrast of the view's image behind the dots."""
+
+
+def shown_steps(phases: Phases) -> set[int]:
+    """Return the steps of the events that get an image: the first event, and the first event in the second half of phase 2."""
+    middle = 0.5 * (phases.refine + phases.stable_start)
+    late = [e for e in phases.events if e >= middle]
+    return {*phases.events[:1], *late[:1]}
+
+
+def _open_pixels(consistent: bool, quantile: float) -> str:
+    """Describe the pixels that pass a gate."""
+    parts = ["with a depth that other views confirm"] * consistent
+    parts += [f"with S_geometry above its {quantile:g} quantile"] * (quantile > 0)
+    return f"pixels {' and '.join(parts)}" if parts else "all pixels that Gaussians cover"
+
+
+def view_sheet(
+    name: str, step: int, view: TrainingView, disparity: np.ndarray | None, sampled: SampledView, config: MethodConfig
+) -> np.ndarray:
+    """Return a sheet of one view at one event, colours [rows, columns, 3] in [0, 1]: images, gate, sampled pixels, scores.
+
+    Scores are shown if one of them has a weight above 0, the disparity if the view has a prior.
+
+    Args:
+        name: Name of the view.
+        step: Steps done.
+        view: The view.
+        disparity: Relative inverse depth of the view, shape [H, W]; None without a prior.
+        sampled: Maps and sampled pixels of the event.
+        config: Switches and settings of the fit.
+    """
+    image, rendered, score = (t.cpu().numpy() for t in (view.image, sampled.rendered, sampled.score))
+    at, gate = sampled.at.cpu().numpy(), sampled.gate.cpu().numpy()
+    weights = config.weights(view.semantic is not None)
+    # each score is shown below its inputs
+    tiles = [
+        Tile("render before", rendered),
+        Tile("image", image),
+        *([] if disparity is None else [Tile("disparity, near is 1", disparity, "TURBO")]),
+        Tile("gate", np.where(gate[..., None], OPEN, CLOSED).astype(np.float32)),
+        Tile("sampled pixels", 1 - FADED * (1 - image.mean(-1, keepdims=True).repeat(3, -1)), dots=at),
+    ]
+    scored = sum(weights) > 0
+    if scored:
+        names = ("S_render", "S_semantic", "S_geometry")
+        tiles += [Tile(f"{w:.2f} {n}", s.cpu().numpy()) for w, n, s in zip(weights, names, sampled.scores, strict=True)]
+        tiles.append(Tile("S_importance", score))
+    consistent = config.ra and config.sampler.depth == "consistent" and view.consistent is not None
+    widened = f"; too few passed at the {config.asked_quantile:g} quantile" if sampled.quantile < config.asked_quantile else ""
+    lines = [
+        f"{len(at):,} pixels sampled of the {gate.sum():,} that pass the gate, {gate.mean():.0%} of the view.",
+        f"Gate: {_open_pixels(consistent, sampled.quantile)}{widened}.",
+    ]
+    if scored:
+        mean = score[at[:, 0], at[:, 1]].mean() if len(at) else 0
+        lines.append(f"Mean importance: {mean:.2f} at the sampled pixels, {score.mean():.2f} over the view.")
+    return contact_sheet(f"{name}, step {step:,}", lines, tiles, columns=5, tile_width=320, text=1.25)
+
+
+def _shown(event: Event) -> list[SampledView]:
+    """Return up to three of an event's views, evenly spaced."""
+    count = len(event.views)
+    return [event.views[i] for i in np.unique(np.linspace(0, count - 1, min(SHOWN, count)).round().astype(int))]
+
+
+def _on_host(sampled: SampledView) -> SampledView:
+    """Return a copy with its maps in host memory."""
+    maps = {n: getattr(sampled, n).cpu() for n in ("rendered", "score", "gate", "at")}
+    render, semantic, geometry = (s.cpu() for s in sampled.scores)
+    return dataclasses.replace(sampled, scores=(render, semantic, geometry), **maps)
+
+
+@contextlib.contextmanager
+def images_kept(fit: Trainer, names: list[str], out: Path) -> Iterator[Callable[[], None]]:
+    """Have a fit write images of some of its events into its run folder, ``sampling/STEP.png``, while it continues.
+
+    A separate thread writes the images. The end of the block waits for the images, and so does the yielded function. Call this
+    function before a checkpoint, since a fit that continues from the checkpoint does not write earlier images. If an image
+    cannot be written, the fit continues, with one message in ``fit.messages``.
+
+    Args:
+        fit: The fit, before its first step.
+        names: Names of its training views.
+        out: Run folder.
+    """
+    config, steps, strategy = fit.config.method, shown_steps(fit.phases), fit.strategy
+    disparities = fit.disparities or [None] * len(names)
+    lost: list[int] = []
+    writing: list[Future[None]] = []
+
+    def written() -> None:
+        for sheet in writing:
+            sheet.result()  # or what went wrong
+
+    if not isinstance(strategy, ImportanceSampling) or not config.events:
+        yield written
+        return
+
+    def write(step: int, views: list[TrainingView], kept: list[SampledView]) -> None:
+        sheets = [view_sheet(names[d.view], step, v, disparities[d.view], d, config) for v, d in zip(views, kept)]
+        try:
+            make_folder(out / FOLDER)
+            write_bytes(out / FOLDER / f"{step:06d}.png", png(np.concatenate(sheets)))
+        except ResourceError as e:
+            if not lost:
+                fit.messages.append(f"images of sampling events are missing from the report: {e}")
+            lost.append(step)
+
+    with ThreadPoolExecutor(1) as thread:
+
+        def on_event(step: int, event: Event) -> None:
+            for sheet in writing:
+                if sheet.done():
+                    sheet.result()  # or what went wrong
+            if step in steps:
+                # the thread must not use the device, since steps may be captured at that time
+                kept = [_on_host(d) for d in _shown(event)]
+                views = [dataclasses.replace(fit.views[d.view], image=fit.views[d.view].image.cpu()) for d in kept]
+                writing.append(thread.submit(write, step, views, kept))
+
+        strategy.on_event = on_event
+        try:
+            yield written
+        finally:
+            strategy.on_event = None
+    written()
+
+
+def event_figures(fit: Trainer) -> dict[str, Any]:
+    """Return the sums over the events of a fit, and the sizes of its two layers, for metrics.json.
+
+    Returns:
+        ``events``: numbers of events, of Gaussians added and evicted, of samplings (one for each view of an event), and of
+        samplings with a widened gate; ``layers``: number of Gaussians in the coarse and in the fine layer.
+    """
+    asked = fit.config.method.asked_quantile
+    layered = isinstance(fit.strategy, ImportanceSampling)
+    events, fine = (fit.strategy.events, int(fit.strategy.fine.sum())) if layered else ([], 0)
+    quantiles = [q for e in events for q in e["quantiles"]]
+    return {
+        "events": {
+            "count": len(events), **{k: sum(e[k] for e in events) for k in ("added", "evicted")},
+            "samplings": len(quantiles), "widened": sum(q < asked for q in quantiles),
+        },
+        "layers": {"coarse": len(fit.gaussians) - fine, "fine": fine},
+    }  # fmt: skip
+
+
+def sampling_report_of(fit: Trainer, out: Path) -> SamplingReport | None:
+    """Return the report's part on the sampling events of a finished fit; None without events."""
+    method, figures = fit.config.method, event_figures(fit)
+    events, layers = figures["events"], figures["layers"]
+    if not events["count"]:
+        return None
+    how = "sampled at random in proportion to S_importance," if method.agp else "the highest in S_importance"
+    weighted = sum(method.weights()) > 0
+    if method.agp and not weighted:
+        how = "sampled uniformly at random,"
+    consistent = method.sampler.depth == "consistent"
+    gate = _open_pixels(consistent and method.ra, method.asked_quantile)
+    words = (
+        f"Each dot is a pixel behind which a fine Gaussian was added at the {method.sampler.depth} depth, while the layer had "
+        f"capacity. These pixels are {how} among {gate} (the gate). "
+        + ("S_importance is the weighted sum of the three scores; each score is shown below its source."
+           if weighted else "All scores have weight 0, so no score is shown.")
+    )  # fmt: skip
+    if events["widened"]:
+        words += (
+            f" In {events['widened']:,} of {events['samplings']:,} samplings the gate was widened, because fewer than "
+            f"{SUPPORT} candidates for each sample passed at the {method.asked_quantile:g} quantile."
+        )
+    table = [
+        ["sampling events", "Gaussians added", "evicted", "coarse at the end", "fine at the end"],
+        [f"{n:,}" for n in (events["count"], events["added"], events["evicted"], layers["coarse"], layers["fine"])],
+    ]
+    files = sorted(p for p in (out / FOLDER).glob("*.png") if p.stem.isdecimal())  # others are not ours
+    images = [
+        (f"sampling after step {int(p.stem):,}", webp(decode(p, data=read_file(p, out))[0], SHEET_WIDTH, 70)) for p in files
+    ]
+    return SamplingReport(words, images, table)
+
+
+Overview = tuple[bytes | None, str]
+"""PNG of the 3D overview and an empty text, or None and the reason."""
+LABELS = {
+    "psnr": "PSNR [dB]", "psnr_whole": "PSNR, whole image [dB]", "psnr_foreground": "PSNR, foreground [dB]",
+    "alpha_empty": "alpha where empty", "alpha_object": "alpha in the object",
+    "ssim": "SSIM", "ssim_skimage": "SSIM (scikit-image)",
+    "lpips_vgg_legacy": "LPIPS-VGG [0, 1]", "lpips_vgg_standard": "LPIPS-VGG [-1, 1]",
+    "lpips_alex_legacy": "LPIPS-Alex [0, 1]", "lpips_alex_standard": "LPIPS-Alex [-1, 1]", "lpips": "LPIPS",
+}  # fmt: skip
+"""Names of scores as shown to the user."""
+BASELINES = {"mean_photo": "the mean photograph", "nearest_photo": "the nearest photograph"}
+"""Images that are scored without a fit, as text for the user."""
+SHOWN_VIEWS = 6
+"""Held-out views with images in the report; all have files in the run folder."""
+RENDER_WORKERS = 4
+"""Threads that score and encode images while others are rendered."""
+OVERVIEW_POINTS = 60_000
+"""Gaussians shown in the 3D overview, sampled at random."""
+
+
+def score_keys(metrics: dict[str, Any]) -> list[str]:
+    """Return the names of the scores that result files hold for held-out views, in the order to show them."""
+    return [k for k in LABELS if k in metrics["test"]]
+
+
+def score_line(scores: dict[str, float]) -> str:
+    """Return mean scores as one line for the user."""
+    distances = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("lpips")]
+    opacity = [f", {LABELS[k]} {v:.3f}" for k, v in scores.items() if k.startswith("alpha")]
+    if "psnr_foreground" in scores:
+        opacity.insert(0, f", PSNR of the foreground {scores['psnr_foreground']:.2f} dB")
+    lpips = "".join(distances) or ", LPIPS not measured"
+    return f"PSNR {scores['psnr']:.2f} dB, SSIM {scores['ssim']:.3f}{''.join(opacity)}{lpips}"
+
+
+def summary_line(metrics: dict[str, Any]) -> str:
+    """Return scores, size and time of a run, from metrics.json, as one line for the user."""
+    size = f"{metrics['gaussians']:,} Gaussians, {metrics['steps']:,} steps"
+    return f"{score_line(metrics['test'])}; {size}, {duration(metrics['seconds']['total'])}"
+
+
+def result_lines(metrics: dict[str, Any], out: Path | None) -> list[str]:
+    """Return the final lines of a fit: scores, size, time, the path of the report, and the next steps.
+
+    Args:
+        metrics: Contents of metrics.json.
+        out: The run folder, or None.
+    """
+    if metrics["test"]:
+        best = ", ".join(f"{BASELINES.get(name, name)} {value:.2f} dB" for name, value in metrics["baselines"].items())
+        lines = [
+            f"held-out {score_line(metrics['test'])} ({len(metrics['views'])} views)",
+            *([f"  for comparison, without a fit: {best}"] if best else []),
+            *([f"  {metrics['coverage']['summary']}"] if "coverage" in metrics else []),
+        ]
+    else:
+        lines = [f"training PSNR {metrics['train']['psnr']:.2f} dB (no score of new views: no view is held out)"]
+    compiling = metrics["seconds"].get("compiling", 0.0)
+    once = f", of which {duration(compiling)} to compile kernels, once on this machine" if compiling >= 1 else ""
+    size = format_bytes(metrics["complexity"]["bytes"])
+    lines.append(f"{metrics['gaussians']:,} Gaussians, {size}, in {duration(metrics['seconds']['total'])}{once}")
+    if out is None:
+        return [*lines, "nothing was written to disk, because no run folder (out) was given"]
+    run = shlex.quote(str(out))
+    commands = {
+        f"warpgs view {run}": "to look around in a browser", f"warpgs render {run}": "for a film",
+        f"warpgs export {run} --to scene.html": "for one file that opens anywhere",
+    }  # fmt: skip
+    width = max(map(len, commands))
+    following = [f"  {command:<{width}}  {purpose}" for command, purpose in commands.items()]
+    return [*lines, f"report: {out / 'report.html'}", "next:", *following]
+
+
+def protocol_of(scene: Scene, spec: str | None, downscale: int, train: list[View], test: list[View]) -> dict[str, Any]:
+    """Return the conditions that must be equal for scores to be comparable, for result files and the page."""
+    sizes = sorted({(v.camera.width, v.camera.height) for v in test or train})
+    return {
+        "split": spec or "all (no --split given)", "training_views": len(train), "held_out_views": len(test),
+        "ground_truth": scene.pixels, "downscale": downscale, "resolution": [f"{w} x {h}" for w, h in sizes],
+        "score_masks": sum(v.score_mask is not None for v in test),
+    }  # fmt: skip
+
+
+def evaluate_run(
+    out: Path | None,
+    gaussians: Gaussians,
+    train: list[View],
+    test: list[View],
+    options: RasterizeOptions,
+    lpips: Lpips | None = None,
+    *,
+    names: dict[str, str] | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> dict[str, Any]:
+    """Score held-out and training views, and save a render and a depth map of each held-out view.
+
+    If no view is held out, the images show training views. LPIPS is measured only on held-out views.
+
+    Args:
+        out: The run folder; None to write nothing.
+        gaussians: N Gaussians in scene units [u].
+        train: Training views.
+        test: Held-out views.
+        options: Options of the rasterizer.
+        lpips: Network for LPIPS, or None.
+        names: Names of image files by view, from `image_names` of the whole scene; None to make names for these views only.
+        tell: Called with a line for each view before it is rendered.
+
+    Returns:
+        Means over held-out and over training views, a row per held-out view, scores of baselines, and definitions of scores.
+    """
+    for folder in () if out is None else ("renders", "depth"):
+        make_folder(out / folder)
+    files = names or image_names(v.name for v in [*train, *test])
+
+    def finish(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
+        if out is not None:
+            _write_images(out, f"{files[view.name]}.png", view, image, depth, alpha)
+        return score(view, image, lpips if test else None, alpha)
+
+    def compare(view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> ViewMetrics:
+        return score(view, image, alpha=alpha)
+
+    tasks, jobs = [(finish, v) for v in test or train] + [(compare, v) for v in train if test], []
+    with ThreadPoolExecutor(RENDER_WORKERS if lpips is None else 1) as render_workers:  # LPIPS needs much memory for each view
+        for work, view in counted(tasks, tell, "scoring", "views"):
+            jobs.append(render_workers.submit(work, view, *render_view(gaussians, view, options)))
+            if len(jobs) > RENDER_WORKERS:
+                jobs[-RENDER_WORKERS].result()  # not all images at once
+        found = [j.result() for j in jobs]
+    rows, train_rows = found[: len(test)], found[-len(train) :]
+    return {
+        "test": summarize(rows), "train": summarize(train_rows),
+        "views": [r.row() for r in rows],
+        "variants": variants(lpips) | (ALPHA_VARIANTS if any(r.opacity for r in found) else {}),
+        "baselines": baselines(train, test) if test else {},
+    }  # fmt: skip
+
+
+def _write_images(out: Path, name: str, view: View, image: np.ndarray, depth: np.ndarray, alpha: np.ndarray) -> None:
+    """Write the render [H, W, 3] of a view beside its photograph and the error, and the depth map [H, W]."""
+    row = side_by_side([np.clip(image, 0, 1), view.image, error_map(image, view.image)])
+    write_bytes(out / "renders" / name, png(row))
+    write_bytes(out / "depth" / name, png(depth_map(depth, alpha)))
+
+
+def _images(
+    views: list[View], gaussians: Gaussians, options: RasterizeOptions, rows: dict[str, Any], tell: Callable[[str], object]
+) -> list[ViewImages]:
+    """Render up to `SHOWN_VIEWS` of the views, evenly spaced, and encode their images for the page."""
+    chosen = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, min(SHOWN_VIEWS, len(views))).round().astype(int))]
+    result = []
+    with ThreadPoolExecutor(RENDER_WORKERS) as render_workers:
+        for view in counted(chosen, tell, "making the report", "views"):
+            image, depth, alpha = render_view(gaussians, view, options)
+            row = rows.get(view.name)
+            region = f", over {row['region']}" if row and row["region"] != "all" else ""
+            caption = f"PSNR {row['psnr']:.2f} dB{region}, SSIM {row['ssim']:.3f}" if row else "training view"
+            parts = (image, view.image, error_map(image, view.image), depth_map(depth, alpha))
+            result.append((view.name, caption, render_workers.map(webp, parts)))
+    return [ViewImages(name, caption, *parts) for name, caption, parts in result]
+
+
+def overview_of(gaussians: Gaussians, train: list[View], test: list[View]) -> Callable[[], Overview]:
+    """Return a function that plots the 3D overview in a separate process; the function may be called from another thread."""
+    means = gaussians.means.detach().cpu().numpy()
+    colors = np.clip(base_colors(gaussians.sh[:, :1].detach().cpu().numpy()), 0, 1)
+    sample = np.random.default_rng(0).permutation(len(means))[:OVERVIEW_POINTS]
+    points, cameras = means[sample].astype(np.float64), ([v.camera for v in train], [v.camera for v in test])
+    up = up_of(cameras[0], points)
+    return lambda: render_overview(*cameras, points, colors[sample], up)
+
+
+def _figures(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return the main figures of the page as pairs of label and value."""
+    held_out = []
+    if metrics["test"]:
+        best = max(metrics["baselines"].values(), default=float("nan"))
+        held_out = [
+            ("held-out PSNR", f"{metrics['test']['psnr']:.2f} dB"), ("held-out SSIM", f"{metrics['test']['ssim']:.3f}"),
+            ("best baseline without a fit", f"{best:.2f} dB"),
+        ]  # fmt: skip
+        alphas = [k for k in ("alpha_empty", "alpha_object") if k in metrics["test"]]
+        held_out += [(LABELS[k], f"{metrics['test'][k]:.3f}") for k in alphas]
+    return [
+        *held_out,
+        ("training PSNR" if held_out else "training PSNR: no score of new views", f"{metrics['train']['psnr']:.2f} dB"),
+        ("Gaussians", f"{metrics['gaussians']:,}"),
+        ("model", format_bytes(metrics["complexity"]["bytes"])),
+        ("steps", f"{metrics['steps']:,}"), ("time", duration(metrics["seconds"]["total"])),
+    ]  # fmt: skip
+
+
+def _protocol(metrics: dict[str, Any]) -> dict[str, str]:
+    """Return the conditions and the definitions of the scores, as text of the page."""
+    words = {k.replace("_", " "): ", ".join(v) if isinstance(v, list) else str(v) for k, v in metrics["protocol"].items()}
+    words["configuration"] = f"{metrics['config_hash']}, step {metrics['steps']:,}"
+    return words | {LABELS.get(k, k): v for k, v in metrics["variants"].items()}
+
+
+def write_report(
+    out: Path,
+    scene: Scene,
+    split: Split,
+    gaussians: Gaussians,
+    options: RasterizeOptions,
+    metrics: dict[str, Any],
+    record: dict[str, Any],
+    *,
+    sampling: SamplingReport | None,
+    overview: Overview,
+    tell: Callable[[str], object] = lambda line: None,
+) -> None:
+    """Write report.html for a scored run.
+
+    Args:
+        out: The run folder, with the curves in metrics.jsonl.
+        scene: The scene.
+        split: Its views to fit and those held out.
+        gaussians: The fitted model, in scene units [u].
+        options: Options of the rasterizer.
+        metrics: Contents of metrics.json.
+        record: Contents of config.json.
+        sampling: The part on sampling events, or None.
+        overview: Result of the function of `overview_of`.
+        tell: Called with a line for each view before it is rendered.
+    """
+    train, test = [scene.view(n) for n in split.train], [scene.view(n) for n in split.test]
+    image, why = overview
+    notes = [*record["notes"], *([why] if why else [])]
+    events = read_events(out / "metrics.jsonl")
+    steps = [e["step"] for e in events]
+    curves = [
+        curve(title, steps, [e.get(name, math.nan) for e in events], unit)
+        for title, name, unit in (("Training loss", "loss", ""), ("Training PSNR", "psnr", "dB"), ("Gaussians", "count", ""))
+    ]
+    keys = score_keys(metrics)
+    table = [["view", *(LABELS.get(k, k) for k in keys), "pixels"]] + [
+        [r["name"], *(f"{r.get(k, math.nan):.{2 if k.startswith('psnr') else 4}f}" for k in keys), r["region"]]
+        for r in metrics["views"]
+    ]
+    images = _images(test or train, gaussians, options, {r["name"]: r for r in metrics["views"]}, tell)
+    covered = None
+    if "coverage" in metrics:
+        names = image_names(v.name for v in scene.views)
+        covered = coverage_section(out, metrics["coverage"], [v.name for v in images], names)
+    camera = train[0].camera
+    page = Page(
+        title=(out if Path(scene.path).parent == out else Path(scene.path)).resolve().name,  # not "scene" for found poses
+        subtitle=f"preset {metrics['preset']}, {len(train)} training views, {len(test)} held out, "
+        f"{camera.width} x {camera.height} px, {metrics['device']}",
+        figures=_figures(metrics), notes=notes, table=table, views=images, curves=curves, sampling=sampling,
+        overview=None if image is None else webp(image), held_out=bool(test),
+        details={k: v for k, v in record.items() if k != "cameras"}, protocol=_protocol(metrics),
+        coverage=covered,
+    )  # fmt: skip
+    write_page(out / "report.html", page)

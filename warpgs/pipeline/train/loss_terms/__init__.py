@@ -1,1 +1,0 @@
-"""Built-in loss terms, one purpose per module."""

@@ -1,0 +1,716 @@
+"""Settings of a fit: their classes, changes by name, and what views and time choose."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+import numbers
+import statistics
+import time
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from warpgs.constants import rule_named
+from warpgs.device import parse_bytes
+from warpgs.errors import UsageError, did_you_mean
+from warpgs.kernels.sh import MAX_DEGREE
+from warpgs.pipeline.model.limits import LimitConfig
+from warpgs.pipeline.model.start import InitConfig, extrapolates
+from warpgs.pipeline.train.loss import LOSS_TERMS, LossConfig, LossTerm, check_terms, photometric_loss
+from warpgs.pipeline.train.schedule import OptimizerConfig, PhaseConfig, color_of, plan_phases
+from warpgs.pipeline.train.stopping import StoppingConfig
+from warpgs.pipeline.train.strategies.base import STRATEGIES, Settings, find_strategy
+from warpgs.pipeline.train.strategies.clone_split import DensityConfig
+from warpgs.pipeline.train.strategies.importance_sampling import MethodConfig
+from warpgs.pipeline.train.view_modules import VIEW_MODULES, ViewModule, check_modules
+from warpgs.plugins import Registry, flag_group, own_code
+from warpgs.priors.views import PriorConfig
+from warpgs.process import Detail
+from warpgs.render.rasterize import rasterize
+from warpgs.scene import Camera, Gaussians, View
+from warpgs.schema import SchemaError, anything, mapping, of_type
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """All settings of a fit."""
+
+    preset: str = "3dgs"
+    """Preset that the other settings start from: a name, a .toml file of settings, or your own FitConfig or mapping as
+    module:NAME or path/to/file.py:NAME."""
+    steps: int | None = 7000
+    """Number of optimisation steps; early stopping may end the fit sooner. None: chosen by the number of views."""
+    max_steps: int = 30_000
+    """Largest number of steps that is chosen by the number of views."""
+    batch: int = 1
+    """Number of views that each step renders; their gradients are averaged. Learning rates are multiplied by the square root of
+    this number (docs/many-gpus.md). Several GPUs share the views of a step."""
+    cpu_limit: bool = True
+    """Limit the steps on a CPU, if --steps is None: at most as many as two cores finish in 1 to 20 minutes, depending on the
+    number of views."""
+    seed: int = 0
+    """Seed of all random numbers; the same seed, data and kind of device give the same bytes."""
+    rule: str = "exact"
+    """Cut-offs of the rasterizer: exact, balanced, fast, gsplat-1.6, gsplat-1.5 or inria."""
+    antialiased: bool = False
+    """Antialiased model, for renders at other sizes than the photos (Mip-Splatting, Yu et al. 2024). Gaussians smaller than a
+    pixel get a lower opacity, and no axis is smaller than the training cameras resolve (docs/rasterizer.md). Renders of the run
+    are antialiased, too; other programs need their antialiased mode."""
+    half_resolution: float | None = 0.0
+    """Fraction of the steps, from the first step on, that use views of half size (docs/trade.md). None: chosen by the number of
+    views."""
+    sh_degree: int | None = 3
+    """Highest spherical-harmonics degree of the colours, 0 to 4; only PLY files store degree 4. None: chosen by the number of
+    views."""
+    sh_every: int = 1000
+    """Number of steps after which the spherical-harmonics degree rises by one."""
+    dropout: float = 0.0
+    """Dropout: probability that a Gaussian is hidden in a step. It grows linearly from 0 to this value at the last step
+    (DropGaussian, Park et al. 2025)."""
+    dropout_views: int = 3
+    """Number of training views up to which dropout has its full probability; with more views it falls in proportion."""
+    checkpoint_every: int = 1000
+    """Number of steps between checkpoints; the last step always writes a checkpoint."""
+    checkpoint_seconds: float = 20.0
+    """Least time between checkpoints [s], because writing takes time. This setting does not affect results."""
+    memory_limit: int | None = None
+    """Memory limit for the tensors of the fit on its device during steps [bytes]; None for no limit. Densification stops before
+    a step would exceed the limit, and images are rendered in chunks if a whole image would exceed the limit."""
+    cuda_graph: bool = True
+    """CUDA graphs: steps are captured once and replayed, which is faster and gives the same bytes."""
+    max_gaussians: int = 1_000_000
+    """Largest number of Gaussians at any step, including the start."""
+    background: str = "scene"
+    """Background colour, behind all Gaussians: mean (mean colour of the training views), scene (colour of the files: white for
+    Blender, else black), auto (mean if the training views are opaque and show no object on black, else scene), black, white,
+    #rrggbb, or r,g,b in [0, 1]."""
+    strategy: str = "clone_split"
+    """Density strategy, which adds and removes Gaussians: a name, or your own as module:Class or path/to/file.py:Class."""
+    strategy_config: Any = None
+    """Settings of the strategy, an instance of its ``Config``; None for the defaults. Settings of clone_split and
+    importance_sampling are the groups ``density`` and ``method``."""
+    loss_terms: tuple[LossTerm, ...] = ()
+    """Additional loss terms, besides those of ``loss``; each class is registered by a name."""
+    view_modules: tuple[ViewModule, ...] = ()
+    """View modules, which learn parameters of each training view together with the Gaussians (docs/your-photos.md); each class
+    is registered by a name. A built-in module also has a flag of its name."""
+    stopping: StoppingConfig = dataclasses.field(default_factory=StoppingConfig)
+    """Early stopping by left-out blocks of the training views, with any strategy (docs/decisions/020)."""
+    init: InitConfig = dataclasses.field(default_factory=InitConfig)
+    """Source and initial values of the Gaussians."""
+    loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    """Weights of the built-in loss terms."""
+    optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
+    """Learning rates."""
+    density: DensityConfig = dataclasses.field(default_factory=DensityConfig)
+    """Settings of cloning, splitting and pruning (strategies clone_split and importance_sampling)."""
+    limits: LimitConfig = dataclasses.field(default_factory=LimitConfig)
+    """Limits of the size and the shape of every Gaussian."""
+    phases: PhaseConfig = dataclasses.field(default_factory=PhaseConfig)
+    """Lengths of the three phases, and times of sampling."""
+    method: MethodConfig = dataclasses.field(default_factory=MethodConfig)
+    """Settings of strategy importance_sampling."""
+    priors: PriorConfig = dataclasses.field(default_factory=PriorConfig)
+    """Networks that compute the priors of the views."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "max_steps", "batch", "sh_every", "checkpoint_every", "dropout_views", "max_gaussians"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
+                raise UsageError(f"{name.replace('_', '-')} must be at least 1, not {getattr(self, name)}")
+        if not 0 <= self.seed < 2**31:
+            raise UsageError(f"seed must be a whole number from 0 to 2^31 - 1, not {self.seed}")
+        if self.memory_limit is not None and not self.memory_limit >= 1:
+            raise UsageError(f"memory-limit must be at least one byte, not {self.memory_limit}")
+        if not self.checkpoint_seconds >= 0:
+            raise UsageError(f"checkpoint-seconds must be at least 0, not {self.checkpoint_seconds}")
+        if self.half_resolution is not None and not 0 <= self.half_resolution <= 1:
+            raise UsageError(f"half-resolution must be in [0, 1], not {self.half_resolution}")
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_DEGREE:
+            raise UsageError(f"sh-degree must be in [0, {MAX_DEGREE}], not {self.sh_degree}")
+        if not 0 <= self.dropout < 1:
+            raise UsageError(f"dropout must be in [0, 1), not {self.dropout}")
+        rule_named(self.rule)
+        color_of(self.background)
+        check_terms(self.loss_terms)
+        check_modules(self.view_modules)
+        if isinstance(self.strategy, type):
+            object.__setattr__(self, "strategy", STRATEGIES.name_of(self.strategy))
+        own = find_strategy(self.strategy).Config if STRATEGIES.knows(self.strategy) else None
+        if own is not None and self.strategy_config is None:
+            object.__setattr__(self, "strategy_config", own())
+        self.own_code()  # the file as it is now: the user may edit it while a study runs
+
+    def groups(self) -> Settings:
+        """Return the groups of settings by their class."""
+        return Settings(value for value in vars(self).values() if dataclasses.is_dataclass(value))
+
+    def own_code(self) -> dict[str, str]:
+        """Return the SHA-256 of each user-defined class's source file, by class name."""
+        return own_code(self.plugged_in())
+
+    def plugged_in(self) -> list[type]:
+        """Return the classes of the strategy (if this process has loaded it), loss terms and view modules."""
+        strategy = [find_strategy(self.strategy)] if STRATEGIES.knows(self.strategy) else []
+        return [*strategy, *(type(part) for name in _PARTS for part in getattr(self, name))]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return nested plain values, as stored in a run folder."""
+        parts = {n: [{"name": p.name, **dataclasses.asdict(p)} for p in getattr(self, n)] for n in _PARTS}
+        return dataclasses.asdict(dataclasses.replace(self, loss_terms=(), view_modules=())) | parts
+
+    @staticmethod
+    def from_json(values: dict[str, Any]) -> FitConfig:
+        """Return the configuration that `to_json` stored.
+
+        Raises:
+            SchemaError: A value has the wrong type for its field.
+            UsageError: A field is unknown, a value is out of range, or a user-defined class is not loaded.
+        """
+        mapping(anything)(values, "config")
+        try:
+            values = dict(values)
+            parts = {n: tuple(_part(registry, dict(p), n) for p in values.pop(n)) for n, registry in _PARTS.items()}
+            own = values.pop("strategy_config")
+            if isinstance(loss := values["loss"], dict):
+                values["loss"] = {n: v for n, v in loss.items() if n != "exposure_weight"}  # stored earlier, without effect
+            kind = find_strategy(values["strategy"]).Config
+            if own is not None and kind is None:
+                raise SchemaError(f"strategy_config must be null for strategy {values['strategy']}")
+            own = own if kind is None or own is None else _compose(kind, own, "strategy_config")
+            config: FitConfig = _compose(FitConfig, values | parts | {"strategy_config": own}, "config")
+            return config
+        except (TypeError, KeyError) as e:
+            raise UsageError(f"the configuration was stored by another version of warpgs ({e})") from e
+
+    def fingerprint(self) -> str:
+        """Return the first 12 hexadecimal digits of the SHA-256 of the settings."""
+        return hashlib.sha256(json.dumps(self.to_json(), sort_keys=True).encode()).hexdigest()[:12]
+
+
+_PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
+"""Fields of `FitConfig` that hold parts of a registry, each with its settings."""
+
+
+def _part(registry: Registry[Any], values: dict[str, Any], field: str) -> Any:
+    """Return a part of a registry from its stored name and settings."""
+    return _compose(registry.find(values.pop("name")), values, field)
+
+
+def _compose(kind: type, values: dict[str, Any], place: str) -> Any:
+    """Return a settings dataclass from nested plain values; its fields that are dataclasses are composed in turn.
+
+    Raises:
+        SchemaError: A value has the wrong type for its field.
+    """
+    mapping(anything)(values, place)
+    kinds, composed = typing.get_type_hints(kind), {}
+    for name, value in values.items():
+        where, of = f"{place}.{name}", kinds.get(name, Any)
+        if isinstance(of, type) and dataclasses.is_dataclass(of):
+            composed[name] = _compose(of, value, where)
+        elif name not in (*_PARTS, "strategy_config"):  # these are composed before
+            of_type(of)(list(value) if isinstance(value, tuple) else value, where)
+            listed = any(typing.get_origin(part) is tuple for part in (of, *typing.get_args(of)))
+            composed[name] = tuple(value) if listed and isinstance(value, list) else value
+        else:
+            composed[name] = value
+    return kind(**composed)
+
+
+Path = tuple[str, ...]
+"""Path from a `FitConfig` to a setting, as names of fields; a number is the index of a loss term or a view module."""
+WITHOUT_PREFIX = "priors"
+"""Group without a prefix in its flags."""
+PARTS: dict[str, Registry[Any]] = {"loss_terms": LOSS_TERMS, "view_modules": VIEW_MODULES}
+"""Fields that hold parts of a registry, each with settings of its own."""
+OTHERS = ("preset", "strategy", "strategy_config", *PARTS)
+"""Fields whose values are converted in their own way, such as by looking up a name."""
+
+
+def setting_names(config: FitConfig) -> list[str]:
+    """Return the names of all settings, such as ``init.opacity``, including those of strategy, loss terms and view modules."""
+    return ["strategy", *PARTS, *VIEW_MODULES.names(), *_leaves(config)]
+
+
+def keyword(name: str) -> str:
+    """Return the keyword of a setting: ``init_opacity`` for ``init.opacity``."""
+    return name.replace(".", "_")
+
+
+def flag(name: str) -> str:
+    """Return the flag of a setting without its leading dashes: ``init.random-count`` for ``init.random_count``."""
+    return name.replace("_", "-")
+
+
+def with_settings(config: FitConfig, values: Mapping[str, Any], place: str, *, keywords: bool = False) -> FitConfig:
+    """Return settings with some of them replaced.
+
+    Args:
+        config: Settings to start from.
+        values: New values by name of the flag (``init.opacity``), by names in nested mappings, or by keyword
+            (``init_opacity``).
+        place: Source of the values, for messages: a file, or the function that was called.
+        keywords: True for keywords of a call in Python. Only then may ``strategy``, ``loss_terms`` and ``view_modules`` name
+            ``module:Class`` or ``file.py:Class``, which is imported.
+
+    Raises:
+        UsageError: A name is unknown, or a value has the wrong type or is out of range; the message names the setting.
+    """
+    given = {name.replace("-", "_"): value for name, value in _flat(values, place)}
+    try:
+        config = _with_parts(config, given, keywords)
+    except (UsageError, SchemaError) as e:
+        raise UsageError(f"{place}: {e}") from e
+    leaves = _leaves(config)
+    names = {keyword(n): n for n in leaves} | {n: n for n in leaves}
+    changes: dict[str, Any] = {}
+    for name, value in given.items():
+        if name == "strategy" or name in PARTS or name in VIEW_MODULES.names():
+            continue
+        if name not in names:
+            raise UsageError(_unknown(name, place, config, keywords))
+        path, hint = leaves[names[name]]
+        try:
+            _put(changes, path, _typed(value, hint, name))
+        except (UsageError, SchemaError) as e:
+            raise UsageError(f"{place}: {e}") from e
+    try:
+        changed: FitConfig = _replaced(config, changes)
+    except UsageError as e:
+        raise UsageError(f"{place}: {e}") from e
+    return changed
+
+
+def changed_settings(before: FitConfig, after: FitConfig) -> list[str]:
+    """Return the names of the settings in which two configurations differ, in the form of flags."""
+    old, new = (dict(_values(c)) for c in (before, after))
+    return [flag(n) for n, value in new.items() if n not in old or old[n] != value]
+
+
+def _values(config: FitConfig) -> Iterator[tuple[str, Any]]:
+    yield "strategy", config.strategy
+    for field in PARTS:
+        yield field, [part.name for part in getattr(config, field)]
+    for name, (path, _) in _leaves(config).items():
+        yield name, _value(config, path)
+
+
+def _flat(values: Mapping[str, Any], place: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield values by their dotted names."""
+    for name, value in values.items():
+        if not isinstance(name, str):
+            raise UsageError(f"{place}: {name!r} is not a setting's name; write names as text")
+        if isinstance(value, Mapping):
+            yield from _flat(value, place, f"{prefix}{name}.")
+        elif dataclasses.is_dataclass(value) and not isinstance(value, (type, LossTerm, ViewModule)):
+            yield from _flat({f.name: getattr(value, f.name) for f in dataclasses.fields(value)}, place, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value
+
+
+def _with_parts(config: FitConfig, given: Mapping[str, Any], own_code: bool) -> FitConfig:
+    """Return settings with the named strategy, loss terms and view modules, which have their default settings."""
+    strategy = given.get("strategy")
+    if strategy is not None and strategy != config.strategy:
+        kind = _found(STRATEGIES, strategy, own_code)
+        config = dataclasses.replace(
+            config, strategy=STRATEGIES.name_of(kind), strategy_config=None if kind.Config is None else kind.Config()
+        )
+    for field, registry in PARTS.items():
+        if field in given:
+            changes: dict[str, Any] = {field: _parts(registry, field, given[field], own_code)}
+            config = dataclasses.replace(config, **changes)
+    for name in VIEW_MODULES.names():
+        if name in given:
+            of_type(bool)(given[name], name)
+            others = tuple(m for m in config.view_modules if m.name != name)
+            own = tuple(m for m in config.view_modules if m.name == name) or (VIEW_MODULES.find(name)(),)
+            config = dataclasses.replace(config, view_modules=(*others, *own) if given[name] else others)
+    return config
+
+
+def _parts(registry: Registry[Any], field: str, names: Any, own_code: bool) -> tuple[Any, ...]:
+    """Return the given parts: objects unchanged, names as parts with default settings."""
+    if isinstance(names, str):
+        names = [n.strip() for n in names.split(",") if n.strip() not in ("", "none")]
+    if not isinstance(names, (list, tuple)):
+        raise UsageError(f"{field} must be names separated by commas, not {names!r}")
+    return tuple(p if isinstance(p, registry.base) else _found(registry, p, own_code)() for p in names)
+
+
+def _found(registry: Registry[Any], name: Any, own_code: bool) -> type[Any]:
+    if not isinstance(name, (str, type)):
+        raise UsageError(f"{name!r} is not a {registry.kind}; give one of {', '.join(registry.names())}")
+    return registry.load(name) if own_code and isinstance(name, str) else registry.find(name)
+
+
+def _leaves(config: FitConfig) -> dict[str, tuple[Path, Any]]:
+    """Return path and type hint of each setting by the name of its flag, with underscores."""
+    found = dict(_below(FitConfig, "", ()))
+    if config.strategy_config is not None:
+        found |= _below(type(config.strategy_config), f"{flag_group(config.strategy)}.", ("strategy_config",))
+    for field in PARTS:
+        for i, part in enumerate(getattr(config, field)):
+            found |= _below(type(part), f"{flag_group(part.name)}.", (field, str(i)))
+    return found
+
+
+def _below(kind: type, prefix: str, path: Path) -> Iterator[tuple[str, tuple[Path, Any]]]:
+    hints = typing.get_type_hints(kind)
+    for f in dataclasses.fields(kind):
+        hint, here = hints[f.name], (*path, f.name)
+        if isinstance(hint, type) and dataclasses.is_dataclass(hint):
+            yield from _below(hint, prefix if f.name == WITHOUT_PREFIX else f"{prefix}{f.name}.", here)
+        elif path or f.name not in OTHERS:
+            yield prefix + f.name, (here, hint)
+
+
+def _value(part: Any, path: Path) -> Any:
+    for name in path:
+        part = part[int(name)] if isinstance(part, tuple) else getattr(part, name)
+    return part
+
+
+def _put(changes: dict[str, Any], path: Path, value: Any) -> None:
+    """Put a value at a path into nested dictionaries."""
+    for name in path[:-1]:
+        changes = changes.setdefault(name, {})
+    changes[path[-1]] = value
+
+
+def _replaced(part: Any, changes: dict[str, Any]) -> Any:
+    """Return a dataclass, or a tuple of dataclasses, with fields replaced; each is built once, with all its changes."""
+    if isinstance(part, tuple):
+        return tuple(_replaced(p, changes.get(str(i), {})) for i, p in enumerate(part))
+    new = {n: _replaced(getattr(part, n), v) if isinstance(v, dict) else v for n, v in changes.items()}
+    return dataclasses.replace(part, **new) if new else part
+
+
+def _typed(value: Any, hint: Any, name: str) -> Any:
+    """Return a value converted to the type of its field; SchemaError if the type does not match."""
+    if name == "memory_limit" and isinstance(value, str) and value.lower() != "none":
+        return parse_bytes(value)
+    parts = typing.get_args(hint)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType) and type(None) in parts:
+        if value is None or (isinstance(value, str) and value.lower() == "none"):
+            return None
+        (hint,) = (p for p in parts if p is not type(None))
+    if isinstance(value, numbers.Integral) and not isinstance(value, bool):
+        value = int(value)
+    elif isinstance(value, numbers.Real) and not isinstance(value, (bool, int)):
+        value = float(value)
+    if typing.get_origin(hint) is tuple:
+        of_type(hint)(list(value) if isinstance(value, tuple) else value, name)
+        kinds = typing.get_args(hint)
+        return tuple(_typed(v, kinds[0], name) for v in value)
+    of_type(hint)(value, name)
+    return float(value) if hint is float else value
+
+
+def _unknown(name: str, place: str, config: FitConfig, keywords: bool) -> str:
+    """Return the message on an unknown setting, with the most similar name in the user's spelling."""
+    known = {keyword(n) if keywords else n: n for n in setting_names(config)}
+    groups = {n.partition(".")[0] for n in known.values() if "." in n}
+    if name in groups:
+        return (
+            f"{place}: {name} is a group of settings; give a mapping such as {{{name}: {{...}}}}, or name one of its settings"
+        )
+    last = [k for k, n in known.items() if n.rpartition(".")[2] == name.rpartition(".")[2]]  # `opacity` for `init.opacity`
+    if "." in name:  # `other.every` for `mcmc.every`, but only if `other` is not similar to a group
+        own = {n for n, (path, _) in _leaves(config).items() if path[0] in ("strategy_config", *PARTS)}
+        last = [k for k in last if known[k] in own and not did_you_mean(name.partition(".")[0], groups)]
+    hint = f"did you mean {last[0]}?" if last else did_you_mean(name, known) or "`warpgs fit --help-all` lists all"
+    return f"{place}: unknown setting {name[:60]!r}; {hint}"
+
+
+# Settings that follow from the number of training views and their size: one rule from 3 photographs to 300, on any
+# device.
+#
+# The constants were chosen by leaving training views out (docs/decisions/013-any-capture.md); docs/results.md lists
+# exceptions.
+
+MIN_STEPS, OPAQUE_STEPS = 3000, 4500
+"""Steps of a fit of up to `FEW` views: first for views with an alpha channel, then for opaque views."""
+FEW, STEPS_POWER, MAX_STEPS = 4, 0.75, 30_000
+"""Number of views above which steps exceed `MIN_STEPS`; exponent of this growth; and largest number of steps."""
+SCALES_LR, SCALES_VIEWS, SCALES_POWER = 0.1, 8, 0.6
+"""Learning rate of the log scales for up to `SCALES_VIEWS` views, and exponent with which it falls for more views."""
+OPACITIES_LR, MAX_OPACITIES_LR = 0.0125, 0.05
+"""Learning rate of the opacities for 3 views, which rises with the square root of the number of views; and its largest
+value."""
+HALF_RESOLUTION, HALF_VIEWS = 0.5, 4
+"""Fraction of the steps at half size for up to `HALF_VIEWS` views; for more views it is inversely proportional to their
+number."""
+DEGREES = (5, 9, 12)
+"""Fewest training views for spherical harmonics of degree 1, 2 and 3. With fewer, colours do not depend on the view: four
+photographs cannot distinguish a view-dependent colour from an error of the shape."""
+OPACITIES_DECAY, ONE_LAYER_VIEWS = 0.001, 54
+"""Fraction by which a step lowers every opacity, and the largest number of views with this decay and one layer. More views
+were not measured: they have no decay, and two layers (docs/decisions/023-opacity-decay.md)."""
+SMOOTH_STEPS, SMOOTH_WEIGHT, SMOOTH_VIEWS = 3000, 1.0, 4
+"""Fewest planned steps of a fit with the roughness of rendered depth in its loss; the weight of this term for opaque
+views; and the largest number of such views. The term does not help in 480 steps, and lowers PSNR with 9 opaque views
+(docs/decisions/024-smooth-depth.md)."""
+ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS = 0.5, 8
+"""Weight of the roughness for views with alpha, and the largest number of such views (docs/decisions/024-smooth-depth.md)."""
+EXTRAPOLATED_VIEWS, EXTRAPOLATED_DECAY = 4, 0.0015
+"""Largest number of opaque views for a start with extrapolated points, in fits of at least `SMOOTH_STEPS` steps; and the decay
+of opacities with such points. Fits with more views or fewer steps were not measured
+(docs/decisions/026-extrapolated-points.md)."""
+AVERAGE_LAST, AVERAGED_VIEWS = 0.05, 20
+"""Fraction of the steps over which parameters are averaged at the end, and fewest training views with this mean. With 12 views
+the gain is at most 0.04 dB (docs/decisions/029-mean-of-the-last-steps.md)."""
+MIN_GAIN_DB = 0.1
+"""Gain of held-out blocks below which growth ends [dB]. Nothing is held out if the time limit on a CPU shortens the fit: it is
+too short to end earlier, and a measurement renders every view (docs/decisions/025-time-on-a-cpu.md)."""
+CPU_PIXELS = 1.55e6
+"""Pixels per second that two cores of 2.5 GHz train with about as many Gaussians as pixels; with fewer Gaussians, up to three
+times as many pixels."""
+CPU_SECONDS = 45.0, 4.0, 1200.0
+"""Default time limit of a fit on a CPU [s]: constant part, part for each view, and upper bound of the sum."""
+ONE_LAYER = 1.1
+"""Time of a step on a CPU with one layer of Gaussians, relative to a step with two layers, where there are fewer Gaussians."""
+MEANS_LR, SH_LR, CPU_RATES, CPU_RATES_VIEWS = 1.6e-4, 2.5e-3, 2.5, 9
+"""Learning rates of the means and of the constant colour; and the factor of both if the time limit on a CPU shortens the fit
+and there are more than `CPU_RATES_VIEWS` views (docs/decisions/025-time-on-a-cpu.md)."""
+LOST_DB = 0.18
+"""Least loss of PSNR for each halving of the steps of a fit on a CPU [dB]; with many views the loss is larger."""
+
+
+def steps_by_views(views: int, opaque: bool = True) -> int:
+    """Return the largest number of steps for a number of views: 4500 up to 4 opaque views, 5511 for 9, 30,000 from 87 on."""
+    if opaque and views <= FEW:
+        return OPAQUE_STEPS
+    return min(MAX_STEPS, round(MIN_STEPS * max(1.0, views / FEW) ** STEPS_POWER))
+
+
+def cpu_seconds(views: int) -> float:
+    """Return the default time limit for the steps of a fit on a CPU [s]."""
+    least, each, most = CPU_SECONDS
+    return min(least + each * views, most)
+
+
+def pixels_of_steps(steps: int, half_resolution: float, pixels: int) -> float:
+    """Return the number of pixels that ``steps`` render; views have ``pixels``, or a quarter of them at half size."""
+    return steps * pixels * (1 - 0.75 * half_resolution)
+
+
+def steps_on_cpu(wanted: int, views: int, pixels: float) -> tuple[int, str]:
+    """Return how many steps fit into the time limit on a CPU, and a sentence for the user; it is empty if all steps fit.
+
+    Args:
+        wanted: Steps of the fit without a limit.
+        views: Number of training views.
+        pixels: Pixels that the wanted steps render, weighted by the time for a pixel.
+    """
+    seconds, most = pixels / CPU_PIXELS, cpu_seconds(views)
+    if seconds <= most:
+        return wanted, ""
+    steps = max(1, int(wanted * most / seconds))
+    lost = LOST_DB * math.log2(wanted / steps)
+    return steps, (
+        f"to save time on a CPU, the fit takes {steps:,} of {wanted:,} steps: about {most / 60:.1f} min on two cores, besides "
+        f"start and report; --no-cpu-limit takes all, about {seconds / 60:.0f} min, and raises PSNR by at least {lost:.1f} dB"
+    )
+
+
+def settings_by_views(config: FitConfig, train: list[View], device: str) -> tuple[FitConfig, list[str]]:
+    """Return the settings with all automatic ones (None) chosen, and sentences on the choices.
+
+    Args:
+        config: Settings.
+        train: Training views.
+        device: Kind of device, cpu or cuda: on a CPU the steps are limited to a time, unless ``cpu_limit`` is off.
+    """
+    views = len(train)
+    opaque = all(v.alpha is None for v in train)
+    one_layer = views <= ONE_LAYER_VIEWS
+    method = config.method
+    if method.hier is None:
+        method = dataclasses.replace(method, hier=not one_layer)
+    degree = config.sh_degree
+    if degree is None:
+        degree = sum(views >= n for n in DEGREES)
+    half = config.half_resolution
+    if half is None:
+        half = float(f"{HALF_RESOLUTION * min(1.0, HALF_VIEWS / views):.2g}")
+    wanted, limit = config.steps, ""
+    if wanted is None:
+        wanted = min(steps_by_views(views, opaque), config.max_steps)
+    steps = wanted
+    if config.steps is None and config.cpu_limit and device == "cpu":
+        pixels = config.batch * max(v.camera.width * v.camera.height for v in train)
+        steps, limit = steps_on_cpu(wanted, views, pixels_of_steps(wanted, half, pixels) * (1.0 if method.hier else ONE_LAYER))
+    optimizer = _rates_by_views(config.optimizer, views, bool(limit))
+    init = config.init
+    if init.extrapolate is None:
+        init = dataclasses.replace(init, extrapolate=opaque and views <= EXTRAPOLATED_VIEWS and steps >= SMOOTH_STEPS)
+        init = dataclasses.replace(init, extrapolate=extrapolates(init, train))
+    if optimizer.opacities_decay is None:
+        decay = EXTRAPOLATED_DECAY if extrapolates(init, train) else OPACITIES_DECAY
+        optimizer = dataclasses.replace(optimizer, opacities_decay=decay if one_layer else 0.0)
+    stopping, sh_every = config.stopping, config.sh_every
+    if stopping.min_gain_db is None:
+        stopping = dataclasses.replace(stopping, min_gain_db=0.0 if limit else MIN_GAIN_DB)
+        if limit and degree:  # as with held-out blocks, all degrees are in use when growth begins
+            sh_every = min(sh_every, max(1, plan_phases(config.phases, steps).refine // degree))
+    loss = config.loss
+    if loss.smooth_weight is None:
+        loss = dataclasses.replace(loss, smooth_weight=_smooth_weight_by_views(views, opaque, steps))
+    made = dataclasses.replace(
+        config, steps=steps, sh_degree=degree, sh_every=sh_every, half_resolution=half, init=init, optimizer=optimizer,
+        method=method, loss=loss, stopping=stopping,
+    )  # fmt: skip
+    words = _words_of_choices(config, made, wanted)
+    named = Detail(f"settings for {views} views: {', '.join(words)}") if words else ""
+    return made, [note for note in (named, limit) if note]
+
+
+def _rates_by_views(optimizer: OptimizerConfig, views: int, limited: bool) -> OptimizerConfig:
+    """Return the settings with the automatic learning rates and the fraction of averaged steps chosen.
+
+    Args:
+        optimizer: Settings.
+        views: Number of training views.
+        limited: Whether the time limit on a CPU shortens the fit.
+    """
+    factor = CPU_RATES if limited and views > CPU_RATES_VIEWS else 1.0
+    chosen = {
+        "scales_lr": SCALES_LR * min(1.0, SCALES_VIEWS / views) ** SCALES_POWER,
+        "opacities_lr": min(MAX_OPACITIES_LR, OPACITIES_LR * math.sqrt(views / 3)),
+        "means_lr": factor * MEANS_LR,
+        "sh_lr": factor * SH_LR,
+        "average_last": AVERAGE_LAST if views >= AVERAGED_VIEWS else 0.0,
+    }
+    return dataclasses.replace(optimizer, **{n: float(f"{v:.3g}") for n, v in chosen.items() if getattr(optimizer, n) is None})
+
+
+def _smooth_weight_by_views(views: int, opaque: bool, steps: int) -> float:
+    """Return the weight of the roughness of rendered depth.
+
+    Args:
+        views: Number of training views.
+        opaque: Whether no view has an alpha channel.
+        steps: Planned steps of the fit.
+    """
+    weight, most = (SMOOTH_WEIGHT, SMOOTH_VIEWS) if opaque else (ALPHA_SMOOTH_WEIGHT, ALPHA_SMOOTH_VIEWS)
+    return weight if views <= most and steps >= SMOOTH_STEPS else 0.0
+
+
+def _words_of_choices(config: FitConfig, made: FitConfig, wanted: int) -> list[str]:
+    """Return a phrase for each setting of ``made`` that is None in ``config``; ``wanted`` is the unlimited number of steps."""
+    optimizer, half, last = made.optimizer, made.half_resolution, made.optimizer.average_last
+    each = f" of {config.batch} views" if config.batch > 1 else ""
+    chosen = {
+        f"at most {wanted:,} steps{each}": config.steps, f"SH degree {made.sh_degree}": config.sh_degree,
+        f"means_lr {optimizer.means_lr:g}": config.optimizer.means_lr,
+        f"scales_lr {optimizer.scales_lr:g}": config.optimizer.scales_lr,
+        f"opacities_lr {optimizer.opacities_lr:g}": config.optimizer.opacities_lr,
+        f"opacities_decay {optimizer.opacities_decay:g}": config.optimizer.opacities_decay,
+        f"sh_lr {optimizer.sh_lr:g}": config.optimizer.sh_lr,
+        f"mean of the last {last:.0%} of the steps" if last else "no mean of the last steps": config.optimizer.average_last,
+        f"smooth_weight {made.loss.smooth_weight:g}": config.loss.smooth_weight,
+        f"{'' if made.init.extrapolate else 'no '}extrapolated points": config.init.extrapolate,
+        "held-out blocks" if made.stopping.min_gain_db else "no held-out blocks": config.stopping.min_gain_db,
+        "two layers" if made.method.hier else "one layer": config.method.hier,
+        f"half-size images for the first {half:.0%} of the steps": config.half_resolution,
+    }  # fmt: skip
+    return [words for words, given in chosen.items() if given is None]
+
+
+PIXELS_PER_GAUSSIAN = 4
+"""Ratio of pixels to Gaussians in the probe's render, about the mean over a fit of preset `quick`."""
+REPEATS = 5
+"""Timed renders of a probe, after a first render that compiles and loads kernels."""
+STEP, SETUP = 1.6, 11.0
+"""Mean time of a step of a fit, and set-up time for each training view, in units of a probe's time (`probe_seconds`). Measured
+on a CPU on fern with preset `quick`: 1.54 and 11.2 at 126 x 94 px, 1.56 and 10.8 at 168 x 126 px. On CUDA, where
+steps are captured but probes are not, a step takes less, so the prediction is an upper limit."""
+MIN_TIMED_STEPS = 100
+"""Fewest steps that are chosen: fewer give no usable scene. `steps_by_views` gives the upper limit."""
+
+
+def probe_seconds(width: int, height: int, device: torch.device) -> float:
+    """Measure the time of a render, its loss and gradients on this machine, for a fixed set of Gaussians [s].
+
+    Returns the median of `REPEATS`; takes some hundred milliseconds.
+    """
+    count = max(1, width * height // PIXELS_PER_GAUSSIAN)
+    real = {"dtype": torch.float32, "device": "cpu"}
+    sampled = real | {"generator": torch.Generator().manual_seed(0)}
+    depth = 2 + 4 * torch.rand(count, 1, **sampled)
+    across = torch.rand(count, 2, **sampled) - 0.5
+    means = torch.cat([across * depth * torch.tensor([1.0, height / width], **real), depth], 1)
+    tensors = {
+        "means": means, "quats": torch.randn(count, 4, **sampled),
+        "log_scales": torch.log(depth / width * (1 + 2 * torch.rand(count, 3, **sampled))),
+        "logit_opacities": torch.randn(count, **sampled), "sh": 0.3 * torch.randn(count, 4, 3, **sampled),
+    }  # fmt: skip
+    gaussians = Gaussians(**{n: t.to(device).requires_grad_() for n, t in tensors.items()})
+    K = torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]], **real)
+    camera = Camera(torch.eye(4, **real).to(device), K.to(device), width, height)
+    target = torch.rand(height, width, 3, **sampled).to(device)
+    seconds = []
+    for _ in range(REPEATS + 1):
+        began = time.perf_counter()
+        loss = photometric_loss(rasterize(gaussians, camera).rgb, target, None, LossConfig().ssim_weight)
+        torch.autograd.grad(loss, list(gaussians.tensors().values()))
+        loss.item()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds[1:])
+
+
+def within_budget(config: FitConfig, seconds: float, views: list[View], device: torch.device) -> tuple[FitConfig, str]:
+    """Choose the largest number of steps that is predicted to fit into a time budget, set-up included.
+
+    Args:
+        config: Settings; the steps are replaced.
+        seconds: Budget [s].
+        views: Training views.
+        device: Device of the fit.
+
+    Returns:
+        The configuration with its steps, and a note on the choice.
+
+    Raises:
+        UsageError: The budget is not a positive, finite number, or too short for the shortest fit.
+    """
+    check_budget(seconds)
+    largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
+    probe = probe_seconds(largest.width, largest.height, device)
+    setup, step = probe * SETUP * len(views), probe * STEP * config.batch
+    most = steps_by_views(len(views), all(v.alpha is None for v in views))
+    steps = min(int((seconds - setup) / step), most)
+    if steps < MIN_TIMED_STEPS:
+        raise UsageError(
+            f"time-budget {seconds:g} s is too short: "
+            f"{MIN_TIMED_STEPS} steps would take {setup + MIN_TIMED_STEPS * step:.0f} s "
+            f"on this machine ({1000 * probe:.0f} ms for an image with gradients); give more time, "
+            "or smaller images with --downscale"
+        )
+    needed = setup + steps * step
+    return dataclasses.replace(config, steps=steps), (
+        f"time-budget {seconds:g} s: chose --steps {steps} for preset {config.preset}, predicted to take {needed:.0f} s "
+        f"({1000 * probe:.0f} ms for an image with gradients)"
+        + (f"; {len(views)} views need no more steps" if steps == most else "")
+        + "; poses, start, scores and report take additional time"
+    )
+
+
+def check_budget(seconds: float) -> None:
+    """Check a time budget [s].
+
+    Raises:
+        UsageError: The budget is not a positive, finite number.
+    """
+    if not 0 < seconds < float("inf"):
+        raise UsageError(f"time-budget must be a positive number of seconds, not {seconds}")

@@ -1,1 +1,0 @@
-"""View modules, one per file: they learn parameters of each training view together with the Gaussians."""

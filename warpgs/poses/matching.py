@@ -1,0 +1,326 @@
+"""Matches between photographs: which pairs, and the network that matches them."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError
+from warpgs.files import writing
+from warpgs.io.images import decode_png
+from warpgs.onnx import first_line, read_model, start_session
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+
+# Pairs of photographs that are worth matching, where all pairs would be too many: neighbours in order, and look-alikes.
+#
+# Photographs look alike if their descriptors, of SIFT or a network, belong to the same visual words. The small
+# vocabulary of words is made from the descriptors themselves (tf-idf: Sivic and Zisserman, "Video Google", 2003). Sums
+# of integer products are exact in float32 while they are below 2^24, so the order of additions changes no bit.
+
+WORDS = 256
+"""Size of the vocabulary."""
+SAMPLES = 20_000
+"""Number of descriptors from which the vocabulary is made."""
+ROUNDS = 8
+"""Rounds of k-means."""
+NEIGHBOURS = {"photographs": 2, "video": 10}
+"""Number of neighbours on each side, in the order of names, that a photograph is matched with, by kind of source."""
+LOOKALIKES = {"photographs": 20, "video": 5}
+"""Number of most similar photographs that a photograph is matched with, by kind of source."""
+
+
+def vocabulary(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
+    """Return the words of a vocabulary, integers as float32 [W, D], by k-means on sampled descriptors.
+
+    Args:
+        descriptors: Descriptors of each photograph, by SIFT or a network, uint8 [K, D].
+        seed: Seed of the sample.
+    """
+    generator = np.random.default_rng(seed)
+    rows = np.concatenate(descriptors).astype(np.float32)
+    rows = rows[np.sort(generator.permutation(len(rows))[:SAMPLES])]
+    centers = rows[generator.permutation(len(rows))[:WORDS]]
+    for _ in range(ROUNDS):
+        nearest = _nearest(rows, centers)
+        counts = np.bincount(nearest, minlength=len(centers))
+        sums = np.stack([np.bincount(nearest, column, len(centers)) for column in rows.T], 1)
+        means = np.round(sums / np.maximum(counts, 1)[:, None]).astype(np.float32)
+        centers = np.where(counts[:, None] > 0, means, centers)
+    return centers
+
+
+def _nearest(rows: np.ndarray, centers: np.ndarray) -> np.ndarray:
+    """Return the number of the nearest centre of each row [K]; of several equally near, the first."""
+    return np.argmin((centers * centers).sum(1)[None] - 2 * (rows @ centers.T), axis=1)
+
+
+def similarity(descriptors: list[np.ndarray], seed: int = 0) -> np.ndarray:
+    """Return the similarity of each pair of photographs: the cosine of their tf-idf vectors, in [0, 1], float64 [N, N].
+
+    Args:
+        descriptors: Descriptors of each photograph, by SIFT or a network, uint8 [K, D].
+        seed: Seed of the vocabulary.
+    """
+    if not any(len(d) for d in descriptors):
+        return np.zeros((len(descriptors), len(descriptors)))
+    words = vocabulary(descriptors, seed)
+    counts = np.stack([np.bincount(_nearest(d.astype(np.float32), words), minlength=len(words)) for d in descriptors])
+    photographs = np.maximum((counts > 0).sum(0), 1)
+    vectors = np.sqrt(counts) * np.log(1 + len(descriptors) / photographs)
+    lengths = np.sqrt((vectors * vectors).sum(1, keepdims=True))
+    vectors = vectors / np.where(lengths > 0, lengths, 1)
+    return np.stack([(vectors * row).sum(1) for row in vectors])
+
+
+def choose_pairs(descriptors: list[np.ndarray], kind: str, seed: int = 0) -> list[tuple[int, int]]:
+    """Choose the pairs of photographs to match, each as two indices, the smaller one first, in ascending order.
+
+    Args:
+        descriptors: Descriptors of each photograph, by SIFT or a network, in the order of names, uint8 [K, D].
+        kind: photographs or video, which determines `NEIGHBOURS` and `LOOKALIKES`.
+        seed: Seed of the vocabulary.
+    """
+    count, alike = len(descriptors), similarity(descriptors, seed)
+    np.fill_diagonal(alike, -1)
+    pairs = {(i, j) for i in range(count) for j in range(i + 1, min(count, i + 1 + NEIGHBOURS[kind]))}
+    for i, row in enumerate(alike):
+        best = np.argsort(-row, kind="stable")[: LOOKALIKES[kind]]
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in best if row[j] >= 0}
+    return sorted(pairs)
+
+
+# Keypoints and matches of photographs by a network that the user names, for photographs without a pose from SIFT.
+#
+# The network is one ONNX file. It takes an image with colours in [0, 1]. Its outputs are `keypoints` [K, 2] in pixels
+# of its input (centres at +0.5), `scores` [K] (positive for a keypoint), and `descriptors` [K, D] of length 1.
+
+OUTPUTS = ("keypoints", "scores", "descriptors")
+SIDE = 1024
+"""Longer side at which the network sees a photograph [px]."""
+MULTIPLE = 32
+"""Divisor of both sides [px], the coarsest stride of such networks."""
+MAX_KEYPOINTS = 4096
+"""Largest number of keypoints of a photograph; those with the highest scores are kept."""
+MAX_CHANNELS = 256
+"""Largest number of entries of a descriptor."""
+MIN_COSINE = 0.82
+"""Smallest cosine between the descriptors of a match, as in XFeat (Potje et al. 2024)."""
+TURN_SIDE, TURN_KEYPOINTS = 512, 512
+"""Longer side [px] and number of keypoints of a photograph for the search of rotations between photographs."""
+TURN_GAIN = 2
+"""A photograph counts as rotated if rotating it gives at least this many times the matches: networks are not rotation
+invariant."""
+WHOLE = 2047
+"""Factor of descriptors before they are rounded: sums of their products stay below 2^24, where float32 is exact."""
+
+
+@dataclass(frozen=True)
+class Features:
+    """Keypoints of one photograph."""
+
+    pixels: np.ndarray
+    """Positions [px of the photograph], float32 [K, 2], pixel centres at +0.5."""
+    descriptors: np.ndarray
+    """Descriptors times `WHOLE`, integers as int16 [K, D]."""
+
+
+@dataclass(frozen=True)
+class Matcher:
+    """An opened network for keypoints."""
+
+    path: Path
+    """File of the network."""
+    sha256: str
+    """SHA-256 of the file, hexadecimal."""
+    session: InferenceSession
+    """The onnxruntime session."""
+    size: tuple[int, int] | None
+    """Height and width [px] that the graph fixes; None where both are free."""
+
+    @property
+    def title(self) -> str:
+        """File name and first digits of the hash, for reports."""
+        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+
+    def features(self, image: np.ndarray, turns: int = 0, side: int = SIDE, most: int = MAX_KEYPOINTS) -> Features:
+        """Return the keypoints of an image.
+
+        Args:
+            image: The image before rotation, uint8 RGB [H, W, 3].
+            turns: Quarter turns to the left by which the image is rotated first.
+            side: Longer side at which the network sees the image [px], unless its graph fixes the size.
+            most: Largest number of keypoints; those with the highest scores are kept.
+
+        Raises:
+            DataError: onnxruntime cannot run the network, or its outputs are not those of a matcher.
+        """
+        import cv2
+
+        image = np.ascontiguousarray(np.rot90(image, turns))
+        height, width = image.shape[:2]
+        h, w = self.size or _network_size(height, width, side)
+        seen = cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA if w <= width else cv2.INTER_CUBIC)
+        batch = np.ascontiguousarray((seen.astype(np.float32) / 255).transpose(2, 0, 1)[None])
+        try:
+            found = self.session.run(list(OUTPUTS), {self.session.get_inputs()[0].name: batch})
+        except Exception as e:  # onnxruntime's errors share no base but Exception
+            raise DataError(f"{self.path}: onnxruntime cannot run it on an image of {w} x {h} px ({first_line(e)}); export it "
+                            "again") from e  # fmt: skip
+        keypoints, scores, descriptors = (np.asarray(a) for a in found)
+        self._check(keypoints, scores, descriptors, h, w)
+        order = np.argsort(-scores, kind="stable")[:most]
+        order = order[scores[order] > 0]
+        pixels = keypoints[order] * np.array([width / w, height / h])
+        for _ in range(turns % 4):
+            pixels, height, width = np.stack([height - pixels[:, 1], pixels[:, 0]], 1), width, height
+        whole = np.round(descriptors[order] * WHOLE).astype(np.int16)
+        return Features(pixels.astype(np.float32), whole)
+
+    def _check(self, keypoints: np.ndarray, scores: np.ndarray, descriptors: np.ndarray, h: int, w: int) -> None:
+        """Raise a DataError if the outputs are not keypoints of an image of ``h`` x ``w`` px."""
+        shapes = ", ".join(f"{n} {list(a.shape)}" for n, a in zip(OUTPUTS, (keypoints, scores, descriptors)))
+        count = len(scores) if scores.ndim == 1 else -1
+        if keypoints.shape != (count, 2) or descriptors.ndim != 2 or len(descriptors) != count:
+            raise DataError(f"{self.path}: returned {shapes}, not K x 2, K and K x D numbers; export it again")
+        if not 0 < descriptors.shape[1] <= MAX_CHANNELS:
+            raise DataError(f"{self.path}: its descriptors have {descriptors.shape[1]} numbers, not 1 to {MAX_CHANNELS}")
+        if not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in (keypoints, scores, descriptors)):
+            raise DataError(f"{self.path}: its outputs contain NaN or infinity, or are not floating-point; check its weights")
+        there = scores > 0
+        inside = (keypoints >= 0) & (keypoints <= [w, h])
+        if not (inside[there].all() and (np.abs(np.linalg.norm(descriptors[there], axis=1) - 1) < 1e-2).all()):
+            raise DataError(
+                f"{self.path}: its keypoints are outside the image, or its descriptors do not have length 1; export it with "
+                "keypoints in pixels and normalised descriptors"
+            )
+
+
+def _network_size(height: int, width: int, side: int) -> tuple[int, int]:
+    """Return the height and width [px] at which a network sees a photograph, the longer one about ``side``."""
+    scale = side / max(height, width) / MULTIPLE
+    return max(1, round(scale * height)) * MULTIPLE, max(1, round(scale * width)) * MULTIPLE
+
+
+def open_matcher(path: str | Path, threads: int = 0) -> Matcher:
+    """Open an ONNX file and check that it maps one image to keypoints.
+
+    Args:
+        path: The file; its weights must be inside.
+        threads: CPU threads; 0 for as many as the process may use.
+
+    Raises:
+        DataError: The file is missing, not an ONNX model, needs other files or foreign operators, or has other inputs or
+            outputs.
+        ResourceError: onnxruntime is missing.
+    """
+    path = Path(path)
+    data = read_model(path)
+    session = start_session(data, path, "cpu", threads)
+    remedy = "give a file of `warpgs priors export --model xfeat`"
+    try:
+        inputs, outputs = session.get_inputs(), [o.name for o in session.get_outputs()]
+    except UnicodeDecodeError as e:
+        raise DataError(f"{path}: the name of an input or an output is not UTF-8; {remedy}") from e
+    shape = list(inputs[0].shape) if len(inputs) == 1 else []
+    if len(shape) != 4 or shape[:2] != [1, 3] or inputs[0].type != "tensor(float)":
+        raise DataError(f"{path}: a matcher takes one float image 1 x 3 x height x width; {remedy}")
+    if missing := [n for n in OUTPUTS if n not in outputs]:
+        raise DataError(f"{path}: is not a matcher, because it lacks the output {' and '.join(missing)}; {remedy}")
+    fixed = [n for n in shape[2:] if isinstance(n, int) and n > 0]
+    if len(fixed) == 1:
+        raise DataError(f"{path}: its input fixes only one side of the image; export it with both fixed or both free")
+    return Matcher(path, hashlib.sha256(data).hexdigest(), session, (fixed[0], fixed[1]) if fixed else None)
+
+
+def mutual_matches(a: Features, b: Features) -> np.ndarray:
+    """Return the pairs of keypoints that are each other's most similar, with a cosine above `MIN_COSINE`, uint32 [M, 2]."""
+    if not (len(a.pixels) and len(b.pixels)):
+        return np.zeros((0, 2), np.uint32)
+    products = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T
+    best, back = products.argmax(1), products.argmax(0)
+    rows = np.arange(len(best))
+    good = (back[best] == rows) & (products[rows, best] > MIN_COSINE * WHOLE**2)
+    return np.stack([rows[good], best[good]], 1).astype(np.uint32)
+
+
+def quarter_turns(matcher: Matcher, images: Iterable[np.ndarray], pairs: Sequence[tuple[int, int]]) -> list[int]:
+    """Return the quarter turns to the left after which photographs have the same side up; for most photographs 0.
+
+    Each pair is matched with the second photograph in all four turns. The pairs with the most matches, a maximum spanning tree,
+    decide.
+
+    Args:
+        matcher: The network.
+        images: The photographs, uint8 RGB [H, W, 3].
+        pairs: Pairs of photographs that may show the same place.
+    """
+    found = [[matcher.features(image, t, TURN_SIDE, TURN_KEYPOINTS) for t in range(4)] for image in images]
+    links = []
+    for i, j in pairs:
+        counts = [len(mutual_matches(found[i][0], turned)) for turned in found[j]]
+        best = int(np.argmax(counts))
+        turn = best if counts[best] >= TURN_GAIN * counts[0] else 0
+        links.append((-counts[turn], i, j, turn))
+    group = {i: {i: 0} for i in range(len(found))}  # photographs joined so far, each with its turns
+    for _, i, j, turn in sorted(links):
+        if group[i] is not group[j]:
+            more = group[i][i] + turn - group[j][j]
+            group[i].update({k: (t + more) % 4 for k, t in group[j].items()})
+            group.update(dict.fromkeys(group[j], group[i]))
+    turns = [group[i][i] for i in range(len(found))]
+    first = int(np.argmax(np.bincount(turns, minlength=4))) if turns else 0
+    return [(t - first) % 4 for t in turns]
+
+
+def write_matches(
+    matcher: Matcher, images: Sequence[Path], out: Path, kind: str, exhaustive: int, progress: Callable[[str], object]
+) -> list[int]:
+    """Find keypoints and matches of photographs, and write them for the worker.
+
+    Args:
+        matcher: The network.
+        images: Copies of the photographs that are matched, PNG.
+        out: File to write, .npz.
+        kind: photographs or video.
+        exhaustive: Largest number of photographs of which all pairs are matched.
+        progress: Called with lines for the user.
+
+    Returns:
+        Indices of the photographs that were rotated before the network saw them, because they then match others better.
+    """
+    found = []
+    for i, image in enumerate(images):
+        progress(f"finding features: photograph {i + 1} of {len(images)}")
+        found.append(matcher.features(decode_png(image)))
+    pairs = [(i, j) for j in range(len(found)) for i in range(j)]
+    if len(found) > exhaustive:
+        pairs = choose_pairs([(f.descriptors // 16 + 128).astype(np.uint8) for f in found], kind)
+    turned = []
+    if kind == "photographs":
+        progress("finding turned photographs")
+        turns = quarter_turns(matcher, map(decode_png, images), pairs)
+        turned = [i for i, t in enumerate(turns) if t]
+        for i in turned:
+            found[i] = matcher.features(decode_png(images[i]), turns[i])
+    matches = []
+    for k, (i, j) in enumerate(pairs):
+        progress(f"matching: pair {k + 1} of {len(pairs)}")
+        matches.append(mutual_matches(found[i], found[j]))
+    arrays = {
+        "keypoints": np.concatenate([f.pixels for f in found]),
+        "per_photograph": np.array([len(f.pixels) for f in found]),
+        "pairs": np.array(pairs).reshape(-1, 2),
+        "matches": np.concatenate(matches),
+        "counts": np.array([len(m) for m in matches]),
+    }
+    with writing(out) as file:
+        np.savez(file, **arrays)
+    return turned

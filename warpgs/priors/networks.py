@@ -1,0 +1,508 @@
+"""Networks of the priors: input, session, cache of results, and monocular depth."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpgs import schema
+from warpgs.errors import DataError, ResourceError, UsageError
+from warpgs.files import read_input, unread_reason, write_bytes
+from warpgs.folders import cache_home, private_folder
+from warpgs.onnx import PROVIDERS, first_line, read_model, start_session
+from warpgs.process import say
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+
+@contextlib.contextmanager
+def single_threaded_opencv() -> Iterator[None]:
+    """Keep OpenCV from starting threads in this process; our own threads call OpenCV in parallel.
+
+    Many OpenCV calls here are so short that starting threads costs time. The rounding of some calls depends on the number of
+    threads. With one thread, `cv2.distanceTransform` uses IPP's code, unless `without_ipp` turned it off. The fast global
+    smoother cuts an image into as many stripes as there are threads, and processes the last rows of a stripe by different code.
+    """
+    import cv2
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def without_ipp() -> None:
+    """Turn IPP off for the calling thread: its instructions, and so their rounding, depend on the processor."""
+    import cv2
+
+    cv2.ipp.setUseIPP(False)
+
+
+TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+
+
+@dataclass(frozen=True)
+class Network:
+    """An opened model with one image as input and one map as output."""
+
+    path: Path
+    """File of the model."""
+    sha256: str
+    """SHA-256 of the file, hexadecimal."""
+    session: InferenceSession
+    """The onnxruntime session."""
+    layout: str
+    """Order of the input's axes: nchw or nhwc."""
+    size: tuple[int, int] | None
+    """Height and width [px] that the graph fixes; None where both are free."""
+    type: type
+    """Scalar type of the input."""
+
+    @property
+    def title(self) -> str:
+        """File name and first digits of the hash, for reports."""
+        return f"{self.path.name} (SHA-256 {self.sha256[:12]})"
+
+    def run(self, image: np.ndarray) -> np.ndarray:
+        """Return the output, float32 of any shape, for one prepared image [h, w, 3].
+
+        Raises:
+            DataError: onnxruntime cannot run the graph, or the output is NaN, infinite, or the same number everywhere.
+        """
+        batch = image[None] if self.layout == "nhwc" else image.transpose(2, 0, 1)[None]
+        feed = {self.session.get_inputs()[0].name: np.ascontiguousarray(batch, dtype=self.type)}
+        try:
+            (output,) = self.session.run(None, feed)
+        except Exception as e:  # onnxruntime's errors share no base but Exception
+            shape = " x ".join(map(str, batch.shape))
+            raise DataError(f"{self.path}: onnxruntime cannot run it on an input of {shape} ({first_line(e)}); see --help for "
+                            "the flags that set its input") from e  # fmt: skip
+        output = np.asarray(output)
+        if output.dtype.kind != "f":
+            raise DataError(f"{self.path}: its output is of type {output.dtype}, not scores; leave argmax out of the export")
+        output = output.astype(np.float32)
+        if not np.isfinite(output).all():
+            raise DataError(f"{self.path}: its output holds NaN or infinity; check mean and standard deviation, or its weights")
+        if output.size == 0 or not output.max() > output.min():
+            raise DataError(f"{self.path}: its output is the same number everywhere; check the model's weights")
+        return output
+
+
+def _input_axes(path: Path, shape: list) -> tuple[str, tuple[int, int] | None]:
+    """Return layout and fixed size (height, width) of an input shape; names and None stand for free axes."""
+    dims = [d if isinstance(d, int) and d > 0 else None for d in shape]
+    text = " x ".join(str(d) for d in shape)
+    if len(dims) != 4 or dims[0] not in (1, None):
+        raise DataError(f"{path}: its input is {text}; one image, 1 x 3 x height x width or 1 x height x width x 3, is needed")
+    if dims[1] in (3, None) and (dims[1] == 3 or dims[3] != 3):
+        layout, sides = "nchw", (dims[2], dims[3])
+    elif dims[3] == 3:
+        layout, sides = "nhwc", (dims[1], dims[2])
+    else:
+        raise DataError(f"{path}: neither the second nor the last axis of its input, {text}, has the 3 channels of an image")
+    if (sides[0] is None) != (sides[1] is None):
+        raise DataError(f"{path}: its input, {text}, fixes only one side of the image; export it with both fixed or both free")
+    return layout, None if sides[0] is None else sides
+
+
+def open_network(path: str | Path, *, provider: str = "cpu", threads: int = 0) -> Network:
+    """Open an ONNX file and check that it maps one image to one output.
+
+    Args:
+        path: The file; its weights must be inside.
+        provider: cpu or cuda.
+        threads: CPU threads; 0 for as many as the process may use.
+
+    Returns:
+        The network.
+
+    Raises:
+        UsageError: The provider is neither cpu nor cuda.
+        DataError: The file is missing or not an ONNX model, needs other files or custom operators, or does not map one image to
+            one output.
+        ResourceError: onnxruntime or the provider is missing.
+    """
+    if provider not in PROVIDERS:
+        raise UsageError(f"onnx-provider {provider!r} is not one of {', '.join(PROVIDERS)}")
+    path = Path(path)
+    data = read_model(path)
+    session = start_session(data, path, provider, threads)
+    try:
+        return _checked(path, data, session)
+    except UnicodeDecodeError as e:
+        raise DataError(f"{path}: the name of an input or an output is not UTF-8; export the network again") from e
+
+
+def _checked(path: Path, data: bytes, session: Any) -> Network:
+    """Return the network of a session that has one input and one output; DataError for others."""
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    for what, found in (("input", inputs), ("output", outputs)):
+        names = ", ".join(f.name for f in found)  # read even if unused: names that are not UTF-8 fail here
+        if len(found) != 1:
+            raise DataError(f"{path}: it has {len(found)} {what}s ({names}); export it with only one")
+    if inputs[0].type not in TYPES:
+        raise DataError(f"{path}: its input is a {inputs[0].type}; float or float16 is needed")
+    layout, size = _input_axes(path, inputs[0].shape)
+    return Network(path, hashlib.sha256(data).hexdigest(), session, layout, size, TYPES[inputs[0].type])
+
+
+IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+"""Mean and standard deviation of ImageNet's colours, which torchvision's and Depth Anything's networks expect."""
+HALF = ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
+"""Mean and standard deviation for colours in [-1, 1], which DPT (Ranftl et al. 2021) expects."""
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """Size and colours of a network's input, and the meaning of its output."""
+
+    size: int
+    """Shorter side [px] of the input, unless the graph fixes the size."""
+    multiple: int
+    """Both sides are multiples of this [px], unless the graph fixes the size."""
+    mean: tuple[float, float, float]
+    """Colour subtracted from colours in [0, 1], red first."""
+    std: tuple[float, float, float]
+    """Divisor of the colours after ``mean`` is subtracted, red first."""
+    output: str
+    """Meaning of the output: disparity, depth or classes."""
+
+    def prepare(self, network: Network, image: np.ndarray) -> np.ndarray:
+        """Return the input, float32, shape [h, w, 3], for an image [H, W, 3] in [0, 1]; both have the same field of view."""
+        height, width = network.size or self.free_size(*image.shape[:2])
+        return (resize(image, height, width) - np.float32(self.mean)) / np.float32(self.std)
+
+    def free_size(self, height: int, width: int) -> tuple[int, int]:
+        """Return an input size (height, width) [px] with the proportions of an image, rounded to `multiple`."""
+        scale = self.size / min(height, width)
+        h, w = (max(1, round(scale * side / self.multiple)) * self.multiple for side in (height, width))
+        return h, w
+
+
+def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Return an image [H, W] or [H, W, C] at another size, float32, pixel centres aligned at +0.5.
+
+    If neither side grows, pixels are averaged over areas, so that fine texture does not alias; else they are interpolated
+    linearly.
+    """
+    import cv2
+
+    shrinks = height <= image.shape[0] and width <= image.shape[1]
+    method = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    if image.ndim == 2:
+        return cv2.resize(np.ascontiguousarray(image, np.float32), (width, height), interpolation=method)
+    # OpenCV averages over areas in at most four channels at a time
+    parts = [np.ascontiguousarray(image[..., i : i + 4], np.float32) for i in range(0, image.shape[2], 4)]
+    return np.dstack([cv2.resize(p, (width, height), interpolation=method) for p in parts])
+
+
+def _numbers(value: object) -> bool:
+    real = isinstance(value, (list, tuple)) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in value)
+    return real and len(value) == 3 and all(abs(v) < 1e6 for v in value)
+
+
+def _whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= 16384
+
+
+KEYS: dict[str, tuple[str, Callable[[object], bool]]] = {
+    "size": ("a whole number of pixels", _whole),
+    "multiple": ("a whole number of pixels", _whole),
+    "mean": ("three numbers", _numbers),
+    "std": ("three numbers above 0", lambda v: _numbers(v) and all(x > 0 for x in v)),
+    "output": ("disparity, depth or classes", lambda v: v in ("disparity", "depth", "classes")),
+}
+
+
+def check_value(key: str, value: object, where: str, error: type[Exception] = UsageError) -> None:
+    """Check that a value may describe a network's input or output.
+
+    Raises:
+        UsageError: The value is invalid; ``error`` instead, if given.
+    """
+    wanted, good = KEYS[key]
+    if not good(value):
+        raise error(f"{where}: {key} must be {wanted}, not {value!r}")
+
+
+def side_file(model: Path) -> Path:
+    """Return the path of the JSON file that describes a model: its name with .json appended."""
+    return model.with_name(model.name + ".json")
+
+
+def read_side_file(model: Path) -> dict:
+    """Return the entries of the JSON file beside a model; none without such a file.
+
+    Raises:
+        DataError: The file is not a JSON object, or has an unknown key or value.
+    """
+    path = side_file(model)
+    if not os.path.lexists(path):
+        return {}
+    try:
+        values = schema.read(path)
+    except (OSError, schema.SchemaError) as e:
+        why = unread_reason(e) if isinstance(e, OSError) else e
+        raise DataError(f"{path}: cannot be read ({why}); fix or remove it") from e
+    if not isinstance(values, dict):
+        raise DataError(f"{path}: holds no JSON object; write one with the keys {', '.join(KEYS)}")
+    for key, value in values.items():
+        if key not in KEYS:
+            raise DataError(f"{path}: the key {key!r} is unknown; {', '.join(KEYS)} are supported")
+        check_value(key, value, str(path), DataError)
+    return values
+
+
+def describe(network: Network, flags: dict, defaults: Preprocessing, flag: str) -> tuple[Preprocessing, list[str]]:
+    """Return the description of a network: flags override the file beside the model, and the file overrides the defaults.
+
+    Args:
+        network: The opened model.
+        flags: Values of flags by field name; None or 0 where a flag was not given.
+        defaults: Values for everything that neither the flags nor the file give.
+        flag: Prefix of the flags' names, for notes.
+
+    Returns:
+        The description, and notes on values that were assumed.
+
+    Raises:
+        DataError: The file beside the model is invalid.
+        UsageError: A size was requested that the graph does not allow.
+    """
+    given = {k: v for k, v in flags.items() if v}
+    values = read_side_file(network.path) | given
+    if network.size and given.get("size", min(network.size)) != min(network.size):
+        height, width = network.size
+        raise UsageError(f"--{flag}-size {given['size']}: {network.path} takes {width} x {height} px only; leave the flag out")
+    needed = ["mean", "std"] + ([] if network.size else ["size", "multiple"]) + (["output"] if flag == "depth" else [])
+    assumed = [k for k in needed if k not in values]
+    values = asdict(defaults) | values
+    values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    notes = []
+    if assumed:
+        assumed_text = ", ".join(
+            f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in values.items() if k in assumed
+        )
+        notes.append(
+            f"{network.path.name}: assumed {assumed_text}; change it with --{flag}-... or {side_file(network.path).name}"
+        )
+    return Preprocessing(**values), notes
+
+
+CODE = 1
+"""Version of the code between image and maps; increased whenever the same inputs would produce other maps."""
+
+
+def cache_folder() -> Path:
+    """Return the cache folder: WARPGS_CACHE if set, else warpgs in the system's folder for caches.
+
+    Without WARPGS_CACHE and a home folder, the maps go to a private folder of this process, and a line on stderr reports that.
+
+    Raises:
+        ResourceError: There is no home folder, and no folder for temporary files either; or WARPGS_CACHE names an unknown home
+            folder.
+    """
+    if own := os.environ.get("WARPGS_CACHE"):
+        asked = Path(os.path.expanduser(own))  # as a shell does, but not within quotes
+        if own.startswith("~") and not asked.is_absolute():
+            raise ResourceError(f"WARPGS_CACHE: the home folder of {own} is unknown; give an absolute path")
+        return asked
+    home = cache_home()
+    if home is None:
+        say("warpgs: no home folder: maps are kept for this run only; set WARPGS_CACHE to a folder", error=True)
+        return private_folder() / "maps"
+    return home / "warpgs" / "Cache" if sys.platform == "win32" else home / "warpgs"
+
+
+@dataclass
+class MapCache:
+    """A folder of maps. Damaged entries are computed again; notes report them, and report if the folder cannot be written."""
+
+    folder: Path
+    """Folder of the entries."""
+    notes: list[str] = field(default_factory=list)
+    """Messages for the user: entries that were damaged, a folder that cannot be written."""
+    found: int = 0
+    """Number of entries read from disk."""
+    made: int = 0
+    """Number of entries computed."""
+
+    def maps(
+        self, image: np.ndarray, names: tuple[str, ...], decided_by: dict, make: Callable[[], tuple[np.ndarray, ...]]
+    ) -> tuple[np.ndarray, ...]:
+        """Return the maps of an image, read from disk or computed.
+
+        Args:
+            image: Colours, float32, shape [H, W, 3].
+            names: Names of the maps.
+            decided_by: All other values that affect the maps, as JSON data.
+            make: Function that computes the maps, float32 [H, W] in [0, 1] each.
+
+        Returns:
+            One map per name, float32, shape [H, W].
+        """
+        path = self._path(image, names, decided_by)
+        stored = self._read(path, names, image.shape[:2])
+        if stored is not None:
+            self.found += 1
+            return stored
+        maps = make()
+        self.made += 1
+        self._write(path, names, maps)
+        return maps
+
+    def _path(self, image: np.ndarray, names: tuple[str, ...], decided_by: dict) -> Path:
+        words = {"code": CODE, "names": names, "shape": image.shape, "type": str(image.dtype), **decided_by}
+        key = hashlib.sha256(json.dumps(words, sort_keys=True).encode())
+        key.update(np.ascontiguousarray(image).data)
+        return self.folder / f"{key.hexdigest()}.safetensors"
+
+    def _read(self, path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> tuple[np.ndarray, ...] | None:
+        import safetensors
+        from safetensors.numpy import load
+
+        try:
+            stored = load(read_input(path))
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except (OSError, ValueError, KeyError, safetensors.SafetensorError) as e:
+            self.notes.append(f"{path}: a stored map could not be read ({e}) and was computed again")
+            return None
+        maps = tuple(stored.get(n) for n in names)
+        if all(m is not None and m.dtype == np.float32 and m.shape == shape and ((m >= 0) & (m <= 1)).all() for m in maps):
+            return maps
+        self.notes.append(f"{path}: a stored map was damaged and was computed again")
+        return None
+
+    def _write(self, path: Path, names: tuple[str, ...], maps: tuple[np.ndarray, ...]) -> None:
+        from safetensors.numpy import save
+
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_bytes(path, save({n: np.ascontiguousarray(m) for n, m in zip(names, maps)}))
+        except (OSError, ResourceError) as e:
+            note = f"maps are not cached ({e}); set WARPGS_CACHE to another folder"
+            if not any(n.startswith("maps are not cached") for n in self.notes):
+                self.notes.append(note)
+
+
+DEFAULTS = Preprocessing(384, 32, *HALF, output="disparity")
+"""Input and output of DPT (Ranftl et al. 2021), the paper's network."""
+CLIP = (0.5, 99.5)
+"""Percentiles to which consistent inverse depths are clipped: one wrong match must not decide the range of the map."""
+COLOR_SIGMA = 8.0
+"""Colour difference [1/255] at which the smoother's weight between neighbours falls to 1/e."""
+REACHES = ((10.0, 1.0), (100.0, 1e-3), (1000.0, 1e-6))
+"""Pairs of a length [px], over which consistent depths spread within a surface of uniform colour, and a weight. A long length
+matters only where no consistent depth is near."""
+MAX_ERROR_RATIO = 1e3
+"""Largest ratio of an error to the median error; larger ratios are clipped, so no weight is below a millionth."""
+MEAN_WEIGHT = 1e-9
+"""Weight of the mean of all consistent depths, for pixels that edges separate from all of them."""
+
+
+def unit_range(values: np.ndarray) -> np.ndarray:
+    """Return values scaled to [0, 1] by their minimum and maximum, float32; 0 everywhere if both are equal."""
+    low, high = float(values.min()), float(values.max())
+    if not high > low:
+        return np.zeros(values.shape, np.float32)
+    return ((values.astype(np.float64) - low) / (high - low)).astype(np.float32)
+
+
+def network_disparity(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
+    """Return the disparity of an image by a monocular network (DPT, MiDaS, Depth Anything and the like).
+
+    Args:
+        network: The opened model; its output is [1, h, w], [1, 1, h, w], [1, h, w, 1] or [h, w].
+        preprocessing: Size and colours of the network's input, and whether the output is disparity or depth.
+        image: Colours in [0, 1], shape [H, W, 3].
+
+    Returns:
+        Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
+
+    Raises:
+        DataError: The output is not a map, or holds depths that are not positive.
+    """
+    output = network.run(preprocessing.prepare(network, image))
+    shape = output.shape
+    if len(shape) == 4 and shape[1] != 1:
+        output = output[..., 0] if shape[3] == 1 else output
+    elif len(shape) == 4:
+        output = output[:, 0]
+    if output.ndim == 3 and shape[0] == 1:
+        output = output[0]
+    if output.ndim != 2:
+        raise DataError(f"{network.path}: its output has the shape {shape}, not that of one depth map; is it a depth network?")
+    if preprocessing.output == "depth":
+        if not output.min() > 0:
+            raise DataError(
+                f"{network.path}: its smallest depth is {output.min():.3g}, but depths must be above 0; "
+                "if the network gives inverse depth, use --depth-output disparity"
+            )
+        output = 1 / output
+    return unit_range(resize(output, *image.shape[:2]))
+
+
+def complete_disparity(image: np.ndarray, depth: np.ndarray, valid: np.ndarray, sensitivity: np.ndarray) -> np.ndarray:
+    """Fill the gaps of a depth map in inverse depth, along surfaces of uniform colour and not across colour edges.
+
+    The result is the ratio of smoothed ``w / z`` and smoothed ``w``, by the fast global smoother (Min et al. 2014), a solver
+    of weighted least squares that the image guides. The weight w is small where 1 / z changes much when the match shifts by
+    one pixel. So badly conditioned depths have less weight than their neighbours.
+
+    Args:
+        image: Colours in [0, 1], shape [H, W, 3].
+        depth: z-depth [u], shape [H, W].
+        valid: True where the depth is consistent, shape [H, W]; at least one pixel.
+        sensitivity: |dz/dpx| [u/px], at least 0, shape [H, W]; infinite values get the smallest weight.
+
+    Returns:
+        Relative inverse depth in [0, 1], larger is nearer, float32, shape [H, W].
+
+    Raises:
+        DataError: No pixel is valid.
+    """
+    valid = valid & (depth > 0) & np.isfinite(depth)
+    if not valid.any():
+        raise DataError("no pixel has a depth, so there is nothing to complete; use --depth-model, or other views")
+    inverse = np.zeros(depth.shape, np.float64)
+    inverse[valid] = 1 / depth[valid].astype(np.float64)
+    inverse[valid] = np.clip(inverse[valid], *np.percentile(inverse[valid], CLIP))
+    low, high = inverse[valid].min(), inverse[valid].max()
+    if not high > low:
+        return np.zeros(depth.shape, np.float32)
+    error = sensitivity[valid] * inverse[valid] ** 2  # |d(1/z)/dpx|
+    known = error[np.isfinite(error)]
+    scale = max(float(np.median(known)) if len(known) else 0.0, 1e-6 * high)
+    ratio = np.minimum(np.where(np.isfinite(error), error, np.inf) / scale, MAX_ERROR_RATIO)
+    weight = np.zeros(depth.shape, np.float32)
+    weight[valid] = 1 / (1 + ratio**2)
+    return unit_range(_spread(image, ((inverse - low) / (high - low)).astype(np.float32), weight))
+
+
+def _spread(image: np.ndarray, values: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return values [H, W] smoothed by weight: from nearby pixels if these have weight, else from farther ones."""
+    import cv2
+
+    guide = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    received = np.full(values.shape, MEAN_WEIGHT)
+    total = received * np.average(values, weights=weight)
+    with single_threaded_opencv():
+        for reach, fraction in REACHES:
+            # in one dimension the smoother's response falls as exp(-x / sqrt(lambda))
+            smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, reach**2, COLOR_SIGMA)
+            total += fraction * smoother.filter(weight * values)
+            received += fraction * smoother.filter(weight)
+    return total / received

@@ -1,0 +1,437 @@
+"""What networks say of each view: depth and saliency."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from warpgs.errors import DataError, UsageError
+from warpgs.onnx import PROVIDERS
+from warpgs.priors import networks
+from warpgs.priors.networks import (
+    IMAGENET,
+    MapCache,
+    Network,
+    Preprocessing,
+    check_value,
+    complete_disparity,
+    describe,
+    network_disparity,
+    open_network,
+    resize,
+    single_threaded_opencv,
+    without_ipp,
+)
+from warpgs.process import Detail, counted
+from warpgs.scene import Prior, View
+
+if TYPE_CHECKING:
+    from warpgs.scene import ViewDepth
+
+
+# Semantics of an image as three maps: confidence of the labels, their boundaries, and foreground.
+#
+# In the paper's section on Multi-Modal Importance Assessment: S_semantic = F_seg(I) (omega_boundary +
+# omega_foreground).
+
+CLASSES = 21
+"""Number of PASCAL VOC classes: background first, then 20 kinds of things."""
+DEFAULTS = Preprocessing(512, 32, *IMAGENET, output="classes")
+BOUNDARY_WIDTH = 2 / 500
+"""Standard deviation of omega_boundary, in image widths: 2 px at 500 px."""
+MIN_FOREGROUND = 0.01
+"""Smallest mean foreground; below it the network recognises nothing in the image."""
+SMOOTHING = 1000.0
+"""Strength of the smoothing of saliency within flat regions [px^2]."""
+L0_WEIGHT, L0_GROWTH = 0.04, 2.0
+"""Weight of a gradient, and growth per round, of L0 smoothing. Xu et al. 2011 use 0.02 and 2 for photographs; twice that weight
+drops foliage and gravel and keeps outlines."""
+MAX_PIXELS = 50_000
+"""Largest number of pixels that `classical_semantics` processes; larger images are reduced first, since smoothing takes 0.6 s
+at 504 x 378 px."""
+EDGE_LOW, EDGE_HIGH = 100.0, 250.0
+"""Canny's thresholds on the smoothed image: sums of absolute Sobel derivatives of 8-bit colours."""
+
+
+@dataclass(frozen=True)
+class SemanticMaps:
+    """The semantic maps of `warpgs.scene.Prior`: float32, shape [H, W], in [0, 1]."""
+
+    confidence: np.ndarray
+    boundary: np.ndarray
+    foreground: np.ndarray
+
+
+def _softmax(logits: np.ndarray) -> np.ndarray:
+    e = np.exp(logits - logits.max(-1, keepdims=True))
+    return e / e.sum(-1, keepdims=True)
+
+
+def class_probabilities(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> np.ndarray:
+    """Return the probability of each of the 21 classes at every pixel of an image [H, W, 3] in [0, 1].
+
+    An output that already sums to one is treated as probabilities. Any other output is treated as logits, which are resized
+    before the softmax.
+
+    Returns:
+        Probabilities, float32, shape [H, W, 21].
+
+    Raises:
+        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
+    """
+    output = network.run(preprocessing.prepare(network, image))
+    if output.ndim != 4 or output.shape[0] != 1 or CLASSES not in (output.shape[1], output.shape[3]):
+        raise DataError(
+            f"{network.path}: its output has the shape {output.shape}; scores of the {CLASSES} PASCAL VOC classes, "
+            f"1 x {CLASSES} x height x width, are needed"
+        )
+    scores = output[0].transpose(1, 2, 0) if output.shape[1] == CLASSES else output[0]
+    are_probabilities = bool((scores >= 0).all()) and np.allclose(scores.sum(-1), 1, atol=1e-3)
+    scores = resize(scores, *image.shape[:2])
+    return scores if are_probabilities else _softmax(scores)
+
+
+def boundary_weight(labels: np.ndarray) -> np.ndarray:
+    """Return omega_boundary of a label map [H, W]: exp(-d^2 / 2 s^2), float32, shape [H, W].
+
+    d is the distance [px] to the nearest pixel with a neighbour (of four) of another label, and s = 2 px per 500 px of width.
+    The result is 0 everywhere where all labels are the same.
+    """
+    edge = np.zeros(labels.shape, bool)
+    across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return _falloff(edge)
+
+
+def _falloff(edge: np.ndarray) -> np.ndarray:
+    """Return exp(-d^2 / 2 s^2) of the distance d to the nearest True pixel, shape [H, W]; 0 without one."""
+    import cv2
+
+    if not edge.any():
+        return np.zeros(edge.shape, np.float32)
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    squares = np.rint(distance.astype(float) ** 2)  # whole numbers, without the rounding errors of their roots
+    return np.exp(-0.5 / (BOUNDARY_WIDTH * edge.shape[1]) ** 2 * squares).astype(np.float32)
+
+
+def network_semantics(network: Network, preprocessing: Preprocessing, image: np.ndarray) -> SemanticMaps:
+    """Return the maps of an image [H, W, 3] in [0, 1] by a segmentation network.
+
+    Raises:
+        DataError: The output is not 1 x 21 x h x w or 1 x h x w x 21.
+    """
+    p = class_probabilities(network, preprocessing, image)
+    foreground = np.clip(1 - p[..., 0], 0, 1)
+    return SemanticMaps(np.clip(p.max(-1), 0, 1), boundary_weight(p.argmax(-1)), foreground)
+
+
+def _fast_length(length: int) -> int:
+    """Return the largest number up to ``length`` with the prime factors 2, 3 and 5 only, for fast Fourier transforms.
+
+    Transforms of other lengths take up to ten times as long. ``length`` is the side of a reduced image, at least 1 [px].
+    """
+    while length > 1:
+        rest = length
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            break
+        length -= 1
+    return length
+
+
+def classical_semantics(image: np.ndarray) -> SemanticMaps:
+    """Return the maps of an image [H, W, 3] in [0, 1] without a network, from its colours.
+
+    L0 smoothing (Xu et al. 2011) flattens texture; Canny's edges in the result are the boundaries. Foreground is
+    fine-grained saliency (Montabone and Soto 2010), smoothed within the flat regions. Confidence is the larger of foreground
+    and 1 - foreground. Images above `MAX_PIXELS` are reduced, and their maps enlarged.
+
+    Raises:
+        DataError: OpenCV cannot compute the saliency.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    shrink = (MAX_PIXELS / (height * width)) ** 0.5
+    if shrink < 1:
+        small = classical_semantics(resize(image, *(_fast_length(max(1, int(shrink * n))) for n in (height, width))))
+        parts = (np.clip(resize(part, height, width), 0, 1) for part in (small.confidence, small.boundary, small.foreground))
+        return SemanticMaps(*parts)
+    pixels = np.round(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    flat = np.clip(cv2.ximgproc.l0Smooth(pixels, None, L0_WEIGHT, L0_GROWTH), 0, 255).astype(np.uint8)
+    boundary = _falloff(cv2.Canny(flat, EDGE_LOW, EDGE_HIGH) > 0)
+    done, saliency = cv2.saliency.StaticSaliencyFineGrained_create().computeSaliency(pixels)
+    if not done:
+        raise DataError(f"the saliency of an image of {image.shape[1]} x {image.shape[0]} px cannot be computed")
+    even = cv2.ximgproc.fastGlobalSmootherFilter(flat, saliency.astype(np.float32), SMOOTHING, 8.0)
+    low, high = np.percentile(even, [2, 98])
+    foreground = np.clip((even - low) / max(high - low, 1e-6), 0, 1).astype(np.float32)
+    return SemanticMaps(np.maximum(foreground, 1 - foreground), boundary, foreground)
+
+
+def classical_maps(images: Sequence[np.ndarray], tell: Callable[[str], object] = lambda line: None) -> list[SemanticMaps]:
+    """Return `classical_semantics` of each image; ``tell`` is called with a line for each.
+
+    Each image is processed by one thread, so results do not depend on the number of threads.
+    """
+    with single_threaded_opencv(), ThreadPoolExecutor(os.cpu_count() or 1, initializer=without_ipp) as pool:
+        made = [pool.submit(classical_semantics, image) for image in images]
+        return [m.result() for m in counted(made, tell, "finding salient regions", "views")]
+
+
+def knows_foreground(maps: SemanticMaps) -> bool:
+    """Return whether the maps separate an object from its background.
+
+    They do not if the mean foreground is below 1 % (tabletop scans hold no VOC class). They also do not if there is no boundary
+    and the mean foreground is below a half.
+    """
+    mean = float(maps.foreground.mean())
+    return mean >= MIN_FOREGROUND and (bool(maps.boundary.any()) or mean >= 0.5)
+
+
+MIN_CONSISTENT = 50
+"""Smallest number of pixels with a geometrically consistent depth; below it a view's depth counts as unknown."""
+MAX_OBJECT_FRACTION = 0.9
+"""Largest fraction of the image that an object's region covers; a larger region only shows that a mask cuts something off."""
+FLAGS = ("size", "multiple", "mean", "std")
+OUTPUTS = ("auto", "disparity", "depth")
+
+Colors = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class PriorConfig:
+    """Networks for priors, and their inputs; without networks, classical methods are used."""
+
+    depth_model: str | None = None
+    """ONNX file of a monocular depth network (DPT, MiDaS, Depth Anything); without one, depth comes from the other views."""
+    depth_output: str = "auto"
+    """Output of the depth network: disparity (inverse depth), depth, or auto: as in FILE.onnx.json, else disparity."""
+    depth_guides: bool = False
+    """Use the depth network's map in views without a map of --depths, to place Gaussians and guide the fit."""
+    depth_size: int = 0
+    """Shorter input side of the depth network [px], unless the ONNX file fixes it. Default (0): FILE.onnx.json, else 384."""
+    depth_multiple: int = 0
+    """Divisor of both sides of the depth network's input [px]. Default (0): FILE.onnx.json, else 32.
+    Depth Anything needs 14."""
+    depth_mean: Colors | None = None
+    """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
+    depth_std: Colors | None = None
+    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else 0.5 0.5 0.5."""
+    segmentation_model: str | None = None
+    """ONNX file of a segmentation network for the 21 PASCAL VOC classes; without one, saliency and edges are used."""
+    segmentation_size: int = 0
+    """Shorter input side of the segmentation network [px], unless the ONNX file fixes it. Default (0): FILE.onnx.json, else
+    512."""
+    segmentation_multiple: int = 0
+    """Divisor of both sides of the segmentation network's input [px]. Default (0): FILE.onnx.json, else 32."""
+    segmentation_mean: Colors | None = None
+    """Colour subtracted from colours in [0, 1]. Default: FILE.onnx.json, else ImageNet's 0.485 0.456 0.406."""
+    segmentation_std: Colors | None = None
+    """Divisor of colours after the mean is subtracted. Default: FILE.onnx.json, else ImageNet's 0.229 0.224 0.225."""
+    onnx_provider: str = "cpu"
+    """Device of the networks: cpu or cuda."""
+    cache: bool = True
+    """Cache the outputs of networks in the user's cache folder, or in WARPGS_CACHE."""
+
+    def __post_init__(self):
+        if self.onnx_provider not in PROVIDERS:
+            raise UsageError(f"onnx-provider {self.onnx_provider!r} is not one of {', '.join(PROVIDERS)}")
+        if self.depth_output not in OUTPUTS:
+            raise UsageError(f"depth-output {self.depth_output!r} is not one of {', '.join(OUTPUTS)}")
+        for kind in ("depth", "segmentation"):
+            for key, value in self.flags(kind).items():
+                if value is not None and value != 0:
+                    check_value(key, value, f"--{kind}-{key}")
+                    if getattr(self, f"{kind}_model") is None:
+                        raise UsageError(f"--{kind}-{key} requires --{kind}-model; add it, or leave --{kind}-{key} out")
+        if self.depth_guides and self.depth_model is None:
+            raise UsageError("--depth-guides requires --depth-model; for maps from files, give --depths instead")
+        if self.depth_output != "auto" and self.depth_model is None:
+            raise UsageError("--depth-output requires --depth-model; add it, or leave --depth-output out")
+
+    def flags(self, kind: str) -> dict:
+        """Return the input flags of a network by name without prefix; ``kind`` is depth or segmentation."""
+        return {key: getattr(self, f"{kind}_{key}") for key in FLAGS}
+
+
+DisparitySource = Callable[[int], tuple[np.ndarray, str]]
+"""Function from the index of a view to its disparity, float32 [H, W], and a phrase on its source."""
+
+
+def _depth_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
+    network = open_network(config.depth_model, provider=config.onnx_provider, threads=threads)
+    output = None if config.depth_output == "auto" else config.depth_output
+    how, messages = describe(network, {**config.flags("depth"), "output": output}, networks.DEFAULTS, "depth")
+    if how.output not in ("disparity", "depth"):
+        raise DataError(f"{network.path}: its output is {how.output}, not depth; check --depth-model")
+    notes += [f"depth: {network.title} gives {how.output}", *messages]
+    decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
+
+    def disparity(i: int) -> tuple[np.ndarray, str]:
+        image = views[i].image
+
+        def make() -> tuple[np.ndarray]:
+            return (network_disparity(network, how, image),)
+
+        (found,) = make() if cache is None else cache.maps(image, ("disparity",), decided_by, make)
+        return found, f"{how.output} by {network.title}"
+
+    return disparity
+
+
+def _depth_views(views: Sequence[View], depths: Sequence[ViewDepth] | None, notes: list[str]) -> DisparitySource:
+    if depths is None:
+        notes.append("depth: neither a network nor other views gave depth, so the importance has no geometry score")
+        return lambda i: (np.zeros(views[i].image.shape[:2], np.float32), "none")
+    fractions = [float(d.valid.mean()) for d in depths]
+    span = f"{min(fractions):.1%} to {max(fractions):.1%}"
+    notes.append(Detail(f"depth: from the other views, {span} of a view's pixels, then filled in"))
+    poor = [v.name for v, d in zip(views, depths) if d.valid.sum() < MIN_CONSISTENT]
+    if poor:
+        notes.append(f"no consistent depth in {', '.join(poor)}, so there is no geometry score there; --depth-model adds depth")
+
+    def disparity(i: int) -> tuple[np.ndarray, str]:
+        view, d = views[i], depths[i]
+        if d.valid.sum() < MIN_CONSISTENT:
+            return np.zeros(d.depth.shape, np.float32), "none"
+        found = complete_disparity(view.image, d.depth, d.valid, d.sensitivity)
+        return found, f"depth consistent with other views at {fractions[i]:.1%} of the pixels, completed"
+
+    return disparity
+
+
+SemanticsSource = Callable[[int], tuple[SemanticMaps, str]]
+"""Function from the index of a view to its semantic maps and a phrase on their source."""
+
+
+def _segmentation_network(views: Sequence[View], config: PriorConfig, threads: int, cache: MapCache | None, notes: list[str]):
+    network = open_network(config.segmentation_model, provider=config.onnx_provider, threads=threads)
+    how, messages = describe(network, config.flags("segmentation"), DEFAULTS, "segmentation")
+    if how.output != "classes":
+        raise DataError(f"{network.path}: its output is {how.output}, not a segmentation; check the flags")
+    notes += [f"semantics: {network.title}, {CLASSES} classes", *messages]
+    decided_by = {"model": network.sha256, "provider": config.onnx_provider, **asdict(how)}
+
+    def maps(i: int) -> tuple[SemanticMaps, str]:
+        image = views[i].image
+
+        def make() -> tuple[np.ndarray, ...]:
+            m = network_semantics(network, how, image)
+            return m.confidence, m.boundary, m.foreground
+
+        found = make() if cache is None else cache.maps(image, ("confidence", "boundary", "foreground"), decided_by, make)
+        return SemanticMaps(*found), f"classes by {network.title}"
+
+    return maps
+
+
+def _classical(views: Sequence[View], notes: list[str], tell: Callable[[str], object]) -> SemanticsSource:
+    words = "semantics: no network, so saliency is used as foreground and edges as boundaries"
+    notes.append(Detail(f"{words}; --segmentation-model adds a network"))
+
+    found = classical_maps([v.image for v in views], tell)
+    return lambda i: (found[i], "saliency and edges")
+
+
+def _stands_out(region: np.ndarray | None) -> bool:
+    """Return whether a region shows an object; False if a mask only cuts off a frame or a passer-by."""
+    return region is not None and 0 < float(region.mean()) <= MAX_OBJECT_FRACTION
+
+
+def _fall_back(found: list[tuple[SemanticMaps, str]], views: Sequence[View], regions, classical: bool, notes: list[str]):
+    """Replace an unknown foreground by the region of the view, or by zeros if the view has no region."""
+    replaced, empty, result = [], [], []
+    for (maps, source), view, region in zip(found, views, regions):
+        if _stands_out(region) and (classical or not knows_foreground(maps)):
+            replaced.append(view.name)
+            foreground, source = region.astype(np.float32), f"{source}; foreground from the view's mask or black background"
+            if classical:  # saliency is an estimate, a region is known
+                maps = SemanticMaps(np.ones_like(foreground), maps.boundary, foreground)
+            else:
+                maps = SemanticMaps(maps.confidence, boundary_weight(region), foreground)
+        elif not knows_foreground(maps):
+            empty.append(view.name)
+            zeros = np.zeros_like(maps.foreground)
+            maps, source = (
+                SemanticMaps(maps.confidence, zeros, zeros),
+                "none: almost no foreground and no object mask",
+            )
+        result.append((maps, source))
+    reason = "a mask is more reliable than saliency" if classical else "the network finds hardly any foreground"
+    if replaced:
+        words = f"semantics: {reason}, so the object's mask or its black background gave the foreground of {_names(replaced)}"
+        notes.append(Detail(words) if classical else words)
+    if empty:
+        notes.append(f"semantics: no score for {_names(empty)}, which have hardly any foreground and no object mask")
+    return result
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more views" if len(names) > 5 else "")
+
+
+def view_priors(
+    views: Sequence[View],
+    config: PriorConfig,
+    *,
+    depths: Callable[[], Sequence[ViewDepth] | None] = lambda: None,
+    regions: Sequence[np.ndarray | None] | None = None,
+    threads: int = 0,
+    cache: Path | None = None,
+    tell: Callable[[str], object] = lambda line: None,
+) -> tuple[list[Prior], list[str]]:
+    """Return a prior for the pixels of each view, before anything is fitted.
+
+    Args:
+        views: The training views.
+        config: Networks and their inputs.
+        depths: Function that gives for each view the depth consistent with the others, or None for no depth; called last, and
+            only if no depth network is given.
+        regions: For each view the pixels that show its object, bool [H, W], or None; they replace saliency, or a foreground
+            that the network does not find.
+        threads: CPU threads of a network; 0 for as many as the process may use.
+        cache: Folder that keeps the maps of networks; no map is kept if the folder is None or ``config.cache`` is False.
+        tell: Called with a line for each view.
+
+    Returns:
+        A prior per view, and notes on choices, assumptions and missing inputs.
+
+    Raises:
+        DataError: A model is invalid, or its output is not a map.
+        UsageError: A flag contradicts a model.
+        ResourceError: onnxruntime or its provider is missing.
+    """
+    store = MapCache(Path(cache)) if config.cache and cache is not None else None
+    notes: list[str] = []
+    # both are opened before either runs: a wrong file is found at once
+    disparity = None if config.depth_model is None else _depth_network(views, config, threads, store, notes)
+    if config.segmentation_model is not None:
+        maps = _segmentation_network(views, config, threads, store, notes)
+    else:
+        maps = _classical(views, notes, tell)
+    found = [maps(i) for i in counted(range(len(views)), tell, "finding salient regions", "views")]
+    found = _fall_back(found, views, regions or [None] * len(views), config.segmentation_model is None, notes)
+    if disparity is None:
+        disparity = _depth_views(views, depths(), notes)
+    priors = []
+    for i in counted(range(len(views)), tell, "finding disparity", "views"):
+        (m, source), (d, where) = found[i], disparity(i)
+        priors.append(Prior(d, m.confidence, m.boundary, m.foreground, where, source))
+    if store is not None:
+        notes += store.notes
+        if store.found:
+            words = f"priors: {store.found} of {store.found + store.made} maps were read from the cache {store.folder}"
+            notes.append(Detail(words))
+    return priors, notes

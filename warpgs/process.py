@@ -1,0 +1,673 @@
+"""This process and its children: output, the terminal, signals, and Python modules in processes of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import gc
+import io
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import unicodedata
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TextIO, TypeVar, cast
+
+from warpgs.errors import ResourceError, UsageError
+from warpgs.files import DESCRIPTORS, FULL, readable
+from warpgs.folders import shared_locks, temporary_folder
+
+# Output that cannot be written: one line on stderr, and the command continues.
+#
+# Causes are a closed pipe, a full disk, a closed descriptor or a closed terminal. After the first failed write, all
+# output goes to the null device, including that of native libraries.
+
+NAMES = ("stdin", "stdout", "stderr")
+"""Standard streams by their descriptors."""
+
+
+def open_missing_descriptors() -> None:
+    """Open the null device instead of a closed stdin, stdout or stderr.
+
+    Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
+    """
+    for number in range(len(NAMES)):
+        try:
+            os.fstat(number)
+        except OSError:
+            _send_to_null(number)
+
+
+def _send_to_null(number: int) -> None:
+    """Point a descriptor at the null device; leave it unchanged if no further descriptor can be opened."""
+    with contextlib.suppress(OSError):
+        null = os.open(os.devnull, os.O_RDWR)
+        if null == number:  # it was closed, and the lowest free descriptor
+            os.set_inheritable(number, True)
+            return
+        os.dup2(null, number)
+        os.close(null)
+
+
+def is_gone_reader(error: BaseException | None) -> bool:
+    """Return whether a write failed because the pipe's reader has gone, as with ``| head``."""
+    return isinstance(error, BrokenPipeError) or (
+        sys.platform == "win32" and isinstance(error, OSError) and error.errno == errno.EINVAL
+    )
+
+
+def reason(error: BaseException) -> str:
+    """Return why a write failed, as the system reports it."""
+    return (isinstance(error, OSError) and error.strerror) or str(error)
+
+
+class CarefulStream:
+    """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
+
+    def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
+        """Wrap a stream.
+
+        Args:
+            stream: The stream; None for one whose descriptor was closed when Python started.
+            name: stdout or stderr.
+            goes_on: True to print on stderr at once that the command continues without this stream.
+        """
+        self.closed_at_start = stream is None
+        self.stream: TextIO = io.StringIO() if stream is None else stream
+        self.name, self.goes_on = name, goes_on
+        self.failure: BaseException | None = None
+
+    def write(self, text: str) -> int:
+        """Write text, if the stream takes it; return its length."""
+        try:
+            if self.closed_at_start:
+                raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+            if self.failure is None:
+                self.stream.write(text)
+        except (OSError, ValueError) as e:
+            self._lose(e)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the buffer, if the stream takes it."""
+        try:
+            if self.failure is None:
+                self.stream.flush()
+        except (OSError, ValueError) as e:
+            self._lose(e)
+
+    def writelines(self, lines: Any) -> None:
+        """Write several texts."""
+        for line in lines:
+            self.write(line)
+
+    def _lose(self, error: OSError | ValueError) -> None:
+        """Keep the first error, and point the descriptor at the null device: buffers are flushed once more when Python ends."""
+        if isinstance(error, ValueError) and not isinstance(error, OSError) and not self.stream.closed:
+            raise error
+        if self.failure is not None:
+            return
+        self.failure = error
+        if not self.closed_at_start:
+            with contextlib.suppress(OSError, ValueError):
+                _send_to_null(self.stream.fileno())
+        if self.goes_on:
+            say_lost(self.name, error)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+def say_lost(name: str, error: BaseException) -> None:
+    """Print on stderr that the command continues without stdout; a lost stderr cannot be reported."""
+    if name == "stdout":
+        _to_stderr(f"warpgs: stdout cannot be written ({reason(error)}); the command continues without it")
+
+
+def _to_stderr(line: str) -> None:
+    """Write a line to stderr, if that is possible."""
+    if sys.stderr is not None:
+        with contextlib.suppress(OSError, ValueError):
+            print(line.encode("ascii", "backslashreplace").decode(), file=sys.stderr, flush=True)
+
+
+class CarefulOutput:
+    """Streams of a command, and their state."""
+
+    def __init__(self, stdout: CarefulStream, stderr: CarefulStream, is_product: bool):
+        """Keep both streams, and whether stdout is the command's only result."""
+        self.stdout, self.stderr, self.is_product = stdout, stderr, is_product
+
+    def exit_code(self, code: int) -> int:
+        """Return ``code``, or the code of ResourceError if the command succeeded but its only result could not be written."""
+        self.stdout.flush()
+        self.stderr.flush()
+        failure = self.stdout.failure
+        if code or failure is None or not self.is_product or is_gone_reader(failure):
+            return code
+        full = isinstance(failure, OSError) and failure.errno in FULL
+        remedy = "free some disk space, or send the output elsewhere" if full else "send the output elsewhere"
+        _to_stderr(f"warpgs: stdout cannot be written ({reason(failure)}); {remedy}")
+        return ResourceError.exit_code
+
+
+@contextlib.contextmanager
+def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
+    """Replace stdout and stderr by streams whose writes do not raise.
+
+    Args:
+        is_product: True if stdout is the command's only result. Then a failure to write fails the command,
+            unless the reader of a pipe has closed it. Otherwise the command continues with one line on stderr.
+    """
+    open_missing_descriptors()
+    before = sys.stdout, sys.stderr
+    streams = CarefulStream(before[0], "stdout", not is_product), CarefulStream(before[1], "stderr", False)
+    sys.stdout, sys.stderr = (cast(TextIO, s) for s in streams)
+    try:
+        yield CarefulOutput(*streams, is_product)
+    finally:
+        for stream in streams:
+            stream.flush()
+        sys.stdout, sys.stderr = before
+
+
+def careful(stream: TextIO) -> TextIO:
+    """Return a stream whose writes do not raise, wrapped unless it already is; for displays that draw during a fit."""
+    return stream if isinstance(stream, CarefulStream) else cast(TextIO, CarefulStream(stream, "stdout"))
+
+
+T = TypeVar("T")
+
+HIDDEN = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Categories of characters that move the cursor, change the direction of text, end a line, or are surrogates."""
+JOINERS = "\u200c\u200d"
+"""Exceptions to `HIDDEN` that scripts and emoji need; they affect only adjacent letters."""
+
+
+class Detail(str):
+    """A note that needs no action: it goes to the files of a run and the last section of its report, not to the terminal."""
+
+    __slots__ = ()
+
+
+def printable(text: object) -> str:
+    """Return text with codes in place of control characters, such as ESC, and of bytes that are not text."""
+    return "".join(
+        c.encode("unicode_escape").decode() if unicodedata.category(c) in HIDDEN and c not in JOINERS else c
+        for c in readable(str(text))
+    )
+
+
+_quiet = False
+_lost = False
+
+
+def be_quiet() -> None:
+    """Print only errors from now on, since another process prints the same lines."""
+    global _quiet
+    _quiet = True
+
+
+def say(line: object = "", *, error: bool = False) -> None:
+    """Print one `printable` line at once, with codes for letters that the terminal does not have.
+
+    If stdout cannot be written, one line on stderr reports that, and the program continues.
+
+    Args:
+        line: The line.
+        error: True to print on stderr instead of stdout.
+    """
+    global _lost
+    if _quiet and not error:
+        return
+    try:
+        _print(line, error)
+    except OSError as e:
+        if not (error or _lost):
+            _lost = True
+            say_lost("stdout", e)
+
+
+def answer(line: object) -> None:
+    """Print one line to the process that started this one.
+
+    Raises:
+        OSError: The other process has ended, so the answer is not needed.
+    """
+    _print(line, False)
+
+
+def _print(line: object, error: bool) -> None:
+    """Print one line as `say` does."""
+    stream = sys.stderr if error else sys.stdout
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    print(printable(line).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+
+
+def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
+    """Yield items; before each item, print how many are done: ``scoring: 3 of 12 views``.
+
+    Args:
+        items: The items.
+        tell: Function that takes a line.
+        what: Name of the work on the items.
+        unit: Plural word for the items.
+    """
+    for done, item in enumerate(items):
+        tell(f"{what}: {done} of {len(items)} {unit}")
+        yield item
+
+
+def accept_all_letters() -> None:
+    """Print codes for letters that the terminal does not have, also in the output of other libraries to stdout and stderr."""
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure = getattr(stream, "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+@contextlib.contextmanager
+def hidden_stderr() -> Iterator[None]:
+    """Hide the output to stderr in the block, also that of native libraries and other threads."""
+    open_missing_descriptors()
+    _flush(2)
+    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+        os.close(sink)
+
+
+@contextlib.contextmanager
+def output_to(descriptor: int) -> Iterator[None]:
+    """Send stdout and stderr in the block to an open file, also for native libraries and other threads."""
+    open_missing_descriptors()
+    _flush(1, 2)
+    saved = [os.dup(number) for number in (1, 2)]
+    try:
+        for number in (1, 2):
+            os.dup2(descriptor, number)
+        yield
+    finally:
+        _flush(1, 2)
+        for number, old in zip((1, 2), saved, strict=True):
+            os.dup2(old, number)
+            os.close(old)
+
+
+def _flush(*numbers: int) -> None:
+    """Flush stdout (1) or stderr (2), if there is one and it can be written."""
+    for number in numbers:
+        stream = (sys.stdout, sys.stderr)[number - 1]
+        if stream is not None:
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+
+
+# File names that are not UTF-8: Linux allows any bytes in a name, and Python stores undecodable bytes as surrogates.
+#
+# Python opens such files. Libraries that expect UTF-8 fail on such names, and some end the process.
+
+
+def is_utf8(text: str) -> bool:
+    """Return whether text can be written as UTF-8."""
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def use_utf8_names() -> None:
+    """Start this program again in Python's UTF-8 mode, with a note, if Python reads file names in another encoding.
+
+    File names in scene files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python cannot
+    open them.
+    """
+    encoding = sys.getfilesystemencoding()
+    if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
+        return
+    say(f"warpgs: this locale reads file names as {encoding}; started again in Python's UTF-8 mode (PYTHONUTF8=1)", error=True)
+    os.environ["PYTHONUTF8"] = "1"  # for processes that this one starts
+    if sys.stdout is not None:  # letters that the terminal lacks are still printed as codes
+        os.environ.setdefault("PYTHONIOENCODING", f"{sys.stdout.encoding}:backslashreplace")
+    # the options of the interpreter, -P and -I among them, are part of orig_argv
+    os.execv(sys.executable, [sys.executable, "-X", "utf8", *sys.orig_argv[1:]])
+
+
+@contextlib.contextmanager
+def utf8_name(path: Path) -> Iterator[str]:
+    """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its open folder or of the file.
+
+    Args:
+        path: The file. A file to be written must have a UTF-8 name; its folder need not.
+
+    Raises:
+        UsageError: The name is not UTF-8, and this system has no other path to the file.
+    """
+    if is_utf8(str(path)):
+        yield str(path)
+        return
+    by_folder = is_utf8(path.name)
+    if not DESCRIPTORS.is_dir():
+        raise UsageError(f"{readable(str(path))}: the name is not UTF-8, which is needed here; rename the file or its folder")
+    descriptor = os.open(path.parent if by_folder else path, os.O_RDONLY)
+    try:
+        yield f"{DESCRIPTORS}/{descriptor}/{path.name}" if by_folder else f"{DESCRIPTORS}/{descriptor}"
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def fast_imports() -> Iterator[None]:
+    """Switch garbage collection off for imports in the block, and exempt the imported objects from later collections.
+
+    Modules leave no garbage, and collection takes a fifth of the import time.
+    """
+    if "torch" in sys.modules or not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+STOPPING = tuple(s for n in ("SIGINT", "SIGTERM", "SIGHUP") if (s := getattr(signal, n, None)))  # Windows has no SIGHUP
+AGAIN = 0.05
+"""Time after which a signal that Python discarded is sent again [s]."""
+
+
+def _heeded() -> list[signal.Signals]:
+    """Return the signals that end this process, without those that it was started to ignore (by nohup, or in the background).
+
+    The list is empty in other threads than the main thread, which alone may handle signals.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    return [s for s in STOPPING if signal.getsignal(s) not in (signal.SIG_IGN, None)]
+
+
+@contextlib.contextmanager
+def _handled(handler: Callable[..., Any] | signal.Handlers) -> Iterator[None]:
+    """Handle the signals by a function while the body runs."""
+    before = {s: signal.signal(s, handler) for s in _heeded()}
+    try:
+        yield
+    finally:
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+def _send(number: signal.Signals) -> None:
+    """Send a signal to the main thread, and wake the thread where the system can do that."""
+    if sys.platform == "win32":
+        signal.raise_signal(number)
+    else:
+        main = threading.main_thread().ident
+        assert main is not None
+        signal.pthread_kill(main, number)
+
+
+@contextlib.contextmanager
+def interrupting_signals() -> Iterator[None]:
+    """Raise KeyboardInterrupt in the body when a signal comes.
+
+    Python discards an exception that is raised in a destructor or in a callback of a weak reference. A signal that comes there
+    is sent again.
+    """
+    before = sys.unraisablehook
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def unraisable(thrown: sys.UnraisableHookArgs) -> None:
+        if thrown.exc_type is not KeyboardInterrupt:
+            before(thrown)
+        elif numbers:  # from a thread: a signal sent here would interrupt this function
+            timers.append(threading.Timer(AGAIN, _send, numbers[:1]))
+            timers[-1].daemon = True
+            timers[-1].start()
+
+    numbers, timers = _heeded(), list[threading.Timer]()
+    sys.unraisablehook = unraisable
+    try:
+        with _handled(interrupt):
+            yield
+    finally:
+        for timer in timers:
+            timer.cancel()
+        sys.unraisablehook = before
+
+
+@contextlib.contextmanager
+def noted_signals() -> Iterator[Callable[[], bool]]:
+    """Note the first signal, so that the body can end normally; a second one raises KeyboardInterrupt in the body.
+
+    Yields a function that returns whether a signal came.
+    """
+    came = False
+
+    def note(*_: object) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt
+        came = True
+
+    with _handled(note):
+        yield lambda: came
+
+
+@contextlib.contextmanager
+def ignored_signals() -> Iterator[None]:
+    """Drop signals while the body prints the last lines of a program that is already ending."""
+    with _handled(signal.SIG_IGN):
+        yield
+
+
+# Other processes. Python processes import nothing from the folder that warpgs was called in; no shell is started.
+
+ENDS_WITH_PARENT = (
+    "import os as _os, threading as _threading\n"
+    "_threading.Thread(target=lambda: (_os.read(0, 1), _os._exit(1)), daemon=True).start()\n"
+)
+"""Beginning of a program that ends once its stdin ends."""
+
+
+def end_with_parent() -> None:
+    """Have this process end with its parent, even if the parent is killed: the stdin of this process ends then."""
+    threading.Thread(target=lambda: (os.read(0, 1), os._exit(1)), daemon=True).start()
+
+
+@contextlib.contextmanager
+def _stdin_until_our_end() -> Iterator[int]:
+    """Give a child an empty stdin, which closes at the end of the block or of this process; the child then ends."""
+    read, write = os.pipe()
+    try:
+        yield read
+    finally:
+        os.close(read)
+        os.close(write)
+
+
+def run_python(
+    code: str, *arguments: str, timeout: float, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run Python code in another process, and return its exit code and its output.
+
+    The process works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it nor its
+    children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene with a numpy.py.
+
+    Args:
+        code: The code.
+        arguments: Its ``sys.argv[1:]``; paths must be absolute.
+        timeout: Seconds until the process is ended.
+        environment: Variables in addition to those of this process.
+
+    Raises:
+        subprocess.TimeoutExpired: The process took too long.
+    """
+    with temporary_folder() as folder, shared_locks() as locks, _stdin_until_our_end() as stdin:
+        return subprocess.run(
+            [sys.executable, "-P", "-c", ENDS_WITH_PARENT + code, *arguments],
+            env={**os.environ, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8", **(environment or {})},
+            cwd=folder.path,
+            stdin=stdin,
+            pass_fds=locks,
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=timeout,
+            check=False,
+        )
+
+
+class ProcessFailed(Exception):
+    """A process that ended with another exit code than 0."""
+
+    def __init__(self, code: int, errors: str):
+        """Keep the exit code, negative for a signal, and the text that the process wrote to stderr."""
+        super().__init__(f"exit code {code}")
+        self.code, self.errors = code, errors
+
+
+def _environment(more: dict[str, str] | None) -> dict[str, str]:
+    """Return variables with which a process imports this package as this process does, and nothing from the current folder."""
+    home = str(Path(__file__).parents[1])
+    search = os.pathsep.join(p for p in (home, os.environ.get("PYTHONPATH", "")) if p)
+    own = {"PYTHONPATH": search, "PYTHONSAFEPATH": "1", "PYTHONIOENCODING": "utf-8"}
+    return {**os.environ, **own, **(more or {})}
+
+
+def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
+    """Run a module of this package in another process, and yield the lines of its stdout as they come.
+
+    As in `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
+    The module calls `end_with_parent`, so that the process ends when this one is killed.
+
+    Args:
+        module: Full name of the module, run as ``__main__``.
+        arguments: Its ``sys.argv[1:]``; paths must be absolute.
+        folder: Folder to work in.
+        environment: Variables in addition to those of this process.
+
+    Raises:
+        ProcessFailed: The process ended with another exit code than 0.
+    """
+    with tempfile.TemporaryFile() as errors, shared_locks() as locks, _stdin_until_our_end() as stdin:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder,
+            stdin=stdin, stdout=subprocess.PIPE, stderr=errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
+        )  # fmt: skip
+        try:
+            assert process.stdout is not None
+            yield from process.stdout
+            if process.wait():
+                errors.seek(0)
+                raise ProcessFailed(process.returncode, errors.read().decode("utf-8", "replace").strip())
+        finally:
+            process.kill()
+            process.wait()
+
+
+class ProgramResult(NamedTuple):
+    """Outcome of a program."""
+
+    code: int
+    """Exit code; 1 if the program could not be run or took too long."""
+    output: str
+    errors: str
+    """Text of stderr, or the reason why the program could not be run or was ended."""
+
+
+def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
+    """Run a program that starts this package elsewhere, and return its outcome.
+
+    Args:
+        program: Name of the program, searched in PATH.
+        options: Its arguments.
+        stdin: Text for its stdin.
+        timeout: Seconds until the program is ended.
+        hidden: Prefix of the environment variables that are not passed on.
+    """
+    environment = {k: v for k, v in _environment(None).items() if not k.startswith(hidden)}
+    try:
+        done = subprocess.run(
+            [program, *options], input=stdin, env=environment, capture_output=True, text=True, encoding="utf-8",
+            errors="replace", timeout=timeout, check=False,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as e:
+        return ProgramResult(1, "", str(e))
+    return ProgramResult(done.returncode, done.stdout, done.stderr)
+
+
+class PythonWorker:
+    """A process that runs a module of this package, takes lines on its stdin and answers on its stdout.
+
+    As in `run_python`, the process does not import modules from its folder. Only its parent handles Ctrl-C. The process
+    stops at the end of its stdin, which also ends if the parent is killed.
+    """
+
+    def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):
+        """Start the process.
+
+        Args:
+            module: Full name of the module, run as ``__main__``.
+            arguments: Its ``sys.argv[1:]``.
+            environment: Variables in addition to those of this process.
+        """
+        self._errors = tempfile.TemporaryFile()  # closed by `end`
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", start_new_session=True,
+        )  # fmt: skip
+
+    @property
+    def number(self) -> int:
+        """Number of the process."""
+        return self._process.pid
+
+    def send(self, line: str) -> bool:
+        """Send a line; return False where the process has ended."""
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(f"{line}\n")
+            self._process.stdin.flush()
+        except (OSError, ValueError):
+            return False
+        return True
+
+    def lines(self) -> Iterator[str]:
+        """Yield the lines that the process answers, until the process ends."""
+        assert self._process.stdout is not None
+        yield from self._process.stdout
+
+    def end(self, seconds: float) -> tuple[int, str]:
+        """Close the stdin of the process, and kill it if it still runs after ``seconds``.
+
+        Returns its exit code, and the last 2000 bytes of its stderr as text.
+        """
+        with contextlib.suppress(OSError):
+            if self._process.stdin is not None:
+                self._process.stdin.close()
+        try:
+            self._process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._errors.closed:
+            return self._process.returncode, ""
+        with self._errors:
+            self._errors.seek(0, os.SEEK_END)
+            self._errors.seek(max(0, self._errors.tell() - 2000))
+            return self._process.returncode, self._errors.read().decode("utf-8", "replace").strip()

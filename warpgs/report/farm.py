@@ -1,0 +1,246 @@
+"""The table of a farm, on the terminal and as a page."""
+
+from __future__ import annotations
+
+import html
+import re
+import sys
+import textwrap
+import time
+from collections import Counter, defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from warpgs.device import format_bytes
+from warpgs.files import write_text
+from warpgs.process import careful, printable, say
+from warpgs.report.page import STYLE
+from warpgs.report.progress import PLAIN_INTERVAL, duration, is_live, waiting
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+STATES = ("waiting", "running", "elsewhere", "done", "failed")
+STYLES = {"running": "bold", "elsewhere": "dim", "done": "green", "failed": "bold red"}
+LAST = 6
+"""Number of rows for the jobs that ended last."""
+MOST_RUNNING = 12
+"""Largest number of rows for running jobs."""
+
+
+@dataclass(frozen=True)
+class JobRow:
+    """A row of the table: one job."""
+
+    name: str
+    state: str
+    """waiting, running, elsewhere (in another process), done or failed."""
+    step: int = 0
+    """Steps done; 0 if unknown."""
+    seconds: float = 0.0
+    """Time that the job has taken [s]."""
+    psnr: float | None = None
+    """Mean PSNR over held-out views [dB]."""
+    gaussians: int = 0
+    message: str = ""
+    """Reason of a failure, or a note."""
+
+
+def row_values(row: JobRow) -> tuple[str, ...]:
+    """Return the cells of a row: name, state, steps, time, PSNR, Gaussians, message."""
+    return (
+        row.name, row.state, f"{row.step:,}" if row.step else "", duration(row.seconds) if row.seconds else "",
+        "" if row.psnr is None else f"{row.psnr:.2f} dB", f"{row.gaussians:,}" if row.gaussians else "", row.message,
+    )  # fmt: skip
+
+
+class FarmTable:
+    """Context manager that shows the numbers of jobs by state, the running jobs, the last finished jobs, and the time left."""
+
+    def __init__(self, *, live: bool | None = None):
+        """Prepare; ``live`` None shows the table only in a terminal."""
+        self.live = is_live() if live is None else live
+        self.began = self.printed = time.monotonic()
+        self.rows: list[JobRow] = []
+        self.left: float | None = None
+        self.order: dict[str, None] = {}
+        self.display: Any = None
+
+    def __enter__(self) -> FarmTable:
+        """Start the display."""
+        if self.live:
+            from rich.console import Console
+            from rich.live import Live
+
+            waiting().clear()
+            self.display = Live(self.panel(), console=Console(file=careful(sys.stdout)), refresh_per_second=4)
+            self.display.__enter__()
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        """Show the last state and stop."""
+        if self.display is not None:
+            self.display.update(self.panel())
+            self.display.__exit__(*error)
+        elif error[0] is not None:
+            say(self.summary())
+
+    def update(self, rows: list[JobRow], left: float | None) -> None:
+        """Show the jobs, and the time left [s] where it is known."""
+        ended = [r for r in rows if r.state in ("done", "failed") and r.name not in self.order]
+        self.order |= dict.fromkeys(r.name for r in ended)
+        self.rows, self.left = rows, left
+        if self.display is not None:
+            self.display.update(self.panel())
+            return
+        for row in ended:
+            say("  ".join(filter(None, row_values(row))))
+        if ended or time.monotonic() - self.printed >= PLAIN_INTERVAL:
+            self.printed = time.monotonic()
+            say(self.summary())
+
+    def summary(self) -> str:
+        """Return the numbers of jobs by state, the time that passed, and the time left."""
+        counts = Counter(r.state for r in self.rows)
+        states = "  ".join(f"{counts[s]:,} {s}" for s in STATES if counts[s] or s != "elsewhere")
+        left = "" if self.left is None or not self.left else f"  left {duration(self.left)}"
+        return f"{states}  after {duration(time.monotonic() - self.began)}{left}"
+
+    def panel(self) -> RenderableType:
+        """Return the table."""
+        from rich.console import Group
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+        for name in ("scene", "state", "step", "time", "PSNR", "Gaussians"):
+            table.add_column(name, justify="left" if name in ("scene", "state") else "right", no_wrap=True)
+        by_name = {r.name: r for r in self.rows}
+        last = [by_name[n] for n in list(self.order)[-LAST:] if n in by_name]
+        running = [r for r in self.rows if r.state == "running"]
+        for row in [*running[:MOST_RUNNING], *reversed(last)]:
+            cells = [Text(printable(c)) for c in row_values(row)[:-1]]
+            table.add_row(*cells, style=STYLES.get(row.state, ""))
+        done = sum(r.state in ("done", "failed") for r in self.rows)
+        bar = Table.grid()  # alone, the bar does not end its line
+        bar.add_row(ProgressBar(total=max(1, len(self.rows)), completed=done, width=78))
+        more = len(running) - MOST_RUNNING
+        rest = [Text(f"and {more} more running", style="dim")] if more > 0 else []
+        messages = [
+            Text(printable(f"{r.name}: {r.message}"), style="dim", no_wrap=True, overflow="ellipsis")
+            for r in reversed(last) if r.message
+        ]  # fmt: skip
+        return Group(bar, Text(self.summary(), style="bold"), table, *rest, *messages)
+
+
+CARDS = """
+.cards{display:grid;grid-template-columns:repeat(auto-fill,minmax(240px,1fr));gap:18px}
+.card{background:var(--card);border:1px solid var(--line);border-radius:10px;overflow:hidden;min-width:0}
+.card img{border-radius:0;aspect-ratio:8/3;object-fit:cover;background:var(--line)}
+.card .none{aspect-ratio:8/3;display:grid;place-items:center;color:var(--soft);background:var(--paper);font-size:13px}
+.card p{margin:0;padding:10px 14px 12px;font-size:13px;color:var(--soft);overflow-wrap:anywhere}
+.card b{display:block;font-size:15px;color:var(--ink)}.failed b{color:#c0392b}a{color:inherit}
+.card.failed{border-color:#c0392b}
+"""
+SHORT = 120
+"""Largest number of letters of a message on a card; the table of failures shows the whole message."""
+
+
+@dataclass(frozen=True)
+class JobCard:
+    """A job on the page."""
+
+    row: JobRow
+    ssim: float | None = None
+    """Mean SSIM over held-out views."""
+    ply_bytes: int = 0
+    """Size of the PLY file."""
+    thumbnail: str = ""
+    """Path of the job's image, relative to the page; empty without one."""
+    report: str = ""
+    """Path of the job's report, relative to the page; empty without one."""
+
+
+def _address(path: str) -> str:
+    """Return a path as an address; bytes of names that are not text are kept."""
+    return quote(path, errors="surrogateescape")
+
+
+def _link(path: str, inner: str) -> str:
+    return f'<a href="{_address(path)}">{inner}</a>' if path else inner
+
+
+def _card(card: JobCard) -> str:
+    row, name = card.row, html.escape(card.row.name)
+    image = f'<img loading="lazy" alt="render and photograph of {name}" src="{_address(card.thumbnail)}">'
+    if not card.thumbnail:
+        image = f'<div class="none">{html.escape(row.state)}</div>'
+    failed = row.state == "failed"
+    facts = [
+        "" if row.psnr is None else f"PSNR {row.psnr:.2f} dB", "" if card.ssim is None else f"SSIM {card.ssim:.3f}",
+        f"{row.gaussians:,} Gaussians" if row.gaussians else "", format_bytes(card.ply_bytes) if card.ply_bytes else "",
+        duration(row.seconds) if row.seconds and not failed else "",
+        textwrap.shorten(row.message, SHORT, placeholder=" ...") if failed else "",
+    ]  # fmt: skip
+    words = html.escape(", ".join(filter(None, facts)) or row.state)
+    image, head = _link(card.report, image), _link(card.report, f"<b>{name}</b>")
+    return f'<div class="card {html.escape(row.state)}">{image}<p>{head}{words}</p></div>'
+
+
+def _failures(cards: list[JobCard]) -> str:
+    """Return failed jobs by message, the most frequent first."""
+    by_message: dict[str, list[str]] = defaultdict(list)
+    for card in cards:
+        if card.row.state == "failed":
+            name = rf"(?<!\w){re.escape(card.row.name)}(?!\w)"
+            message = re.sub(name, "SCENE", card.row.message)  # messages that differ only in the job's name count as one
+            by_message[message].append(card.row.name)
+    rows = "".join(
+        f"<tr><td>{html.escape(message)}</td><td>{len(names)}</td><td>{html.escape(', '.join(names[:20]))}</td></tr>"
+        for message, names in sorted(by_message.items(), key=lambda item: -len(item[1]))
+    )
+    head = "<tr><th>message</th><th>scenes</th><th>names</th></tr>"
+    return f'<h2>Failures</h2><div class="table"><table>{head}{rows}</table></div>' if rows else ""
+
+
+def farm_page(title: str, cards: list[JobCard], seconds: float) -> str:
+    """Return the page of a farm.
+
+    Args:
+        title: Headline.
+        cards: The jobs, in the order to show them.
+        seconds: Time since the farm began [s].
+    """
+    states = [c.row.state for c in cards]
+    scores = [c.row.psnr for c in cards if c.row.psnr is not None]
+    figures = [
+        ("scenes", f"{len(cards):,}"), ("done", f"{states.count('done'):,}"), ("failed", f"{states.count('failed'):,}"),
+        ("mean held-out PSNR", f"{sum(scores) / len(scores):.2f} dB" if scores else "-"),
+        ("all PLY files", format_bytes(sum(c.ply_bytes for c in cards))), ("time", duration(seconds)),
+    ]  # fmt: skip
+    open_jobs = len(cards) - states.count("done") - states.count("failed")
+    line = f"{open_jobs:,} jobs are not done yet; load the page again later." if open_jobs else "All jobs have ended."
+    cells = "".join(f"<div><b>{html.escape(v)}</b><span>{html.escape(k)}</span></div>" for k, v in figures)
+    body = (
+        f'<h1>{html.escape(title)}</h1><p class="sub">{line} <a href="results.csv">results.csv</a></p>'
+        f'<div class="figures">{cells}</div>{_failures(cards)}<h2>Scenes</h2>'
+        f'<div class="cards">{"".join(map(_card, cards))}</div>'
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width,'
+        f'initial-scale=1"><title>{html.escape(title)}</title><style>{STYLE}{CARDS}</style></head><body><main>{body}</main></body>'
+        "</html>\n"
+    )
+
+
+def write_farm_page(path: Path, title: str, cards: list[JobCard], seconds: float) -> None:
+    """Write the page of `farm_page`, with links to images and reports.
+
+    Raises:
+        ResourceError: The file cannot be written.
+    """
+    write_text(path, farm_page(title, cards, seconds))
