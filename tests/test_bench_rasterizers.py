@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import torch
 
-from bench.lib import inputs, peers, performance_page, rasterizers
+from bench.lib import inputs, peers, rasterizers, rasterizers_page
 from bench.lib.rasterizers import Drawing
 from warpgs import RasterizeOptions, rasterize
 from warpgs.constants import RULES, Rule
@@ -106,9 +106,9 @@ def result_of_others() -> dict:
 def test_tables_of_other_rasterizers():
     """Each program has its row; ratios are right."""
     result = result_of_others()
-    made = performance_page.times_table(result)
+    made = rasterizers_page.times_table(result)
     assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 | 2.5 | 5 | 12.5 | 3.5 |" in made
-    chosen = performance_page.times_table(result, 32)
+    chosen = rasterizers_page.times_table(result, 32)
     assert "| 1k, 320 x 240 | gsplat dense | 4 | 8 | 20 | 8 | 16 | 40 | 7 |" in chosen
-    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 |\n" in performance_page.gpu_table(result, ("Faster-GS",))
-    assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in performance_page.steps_table(result)
+    assert "| 1k, 320 x 240 | Faster-GS | 1.25 | 2.5 | 6.25 |\n" in rasterizers_page.gpu_table(result, ("Faster-GS",))
+    assert "| 1k, 320 x 240 | 2 | 8 | 0.250 |" in rasterizers_page.steps_table(result)

@@ -6,7 +6,7 @@ import pytest
 
 from bench.lib.arms import ABLATION, ARMS, LADDER, RIVALS, Arm, chosen_steps
 from bench.lib.one_fit import config_of, is_peer, peer_settings
-from bench.lib.results_page import arms_table, other_steps_table
+from bench.lib.rivals_page import arms_table, other_steps_table
 from tests.scenes import photos
 from tests.test_bench_presets import results
 from warpgs.errors import UsageError

@@ -14,30 +14,18 @@ import torch
 
 from bench.lib import result_file
 from bench.lib.arguments import parse
+from bench.lib.scorer import Scorer
 from warpgs.export import spz
 from warpgs.export.base import arrays_of, read_gaussians, suffixes
-from warpgs.geometry import convert_gaussians
-from warpgs.pipeline.run.commands import scene_of
 from warpgs.pipeline.run.export import Filters, export
-from warpgs.pipeline.run.folder import open_run
-from warpgs.pipeline.run.results import evaluate_run
-from warpgs.scene import Gaussians
 
 WHAT = "file size, and loss of PSNR on held-out views, of each file format"
 
 
 def rows_of(folder: Path) -> list[dict]:
     """Return a row for each format of a run whole and cleaned, and one for each version of SPZ."""
-    run, rows = open_run(folder, "cpu"), []
-    _, *views = scene_of(run)
-
-    def psnr(gaussians: Gaussians) -> float:
-        return float(evaluate_run(None, gaussians, *views, run.options())["test"]["psnr"])
-
-    def loss(gaussians: Gaussians) -> float:
-        return known["psnr"] - psnr(convert_gaussians(gaussians, run.normalization, "file", "scene"))
-
-    known = {"run": folder.name, "of": len(run.gaussians()), "psnr": psnr(run.gaussians())}
+    scorer, rows = Scorer(folder), []
+    known = {"run": folder.name, "of": len(scorer.run.gaussians()), "psnr": scorer.own}
     with tempfile.TemporaryDirectory() as name:
         for suffix in suffixes():
             for clean in (False, True):
@@ -48,7 +36,7 @@ def rows_of(folder: Path) -> list[dict]:
                 back = read_gaussians(file)
                 rows.append(known | {
                     "format": suffix, "clean": clean, "gaussians": len(back), "degree": back.sh_degree,
-                    "bytes": file.stat().st_size, "write_s": round(written, 2), "loss_db": loss(back),
+                    "bytes": file.stat().st_size, "write_s": round(written, 2), "loss_db": scorer.loss(back),
                     "said": lines[:-1],
                 })  # fmt: skip
         export(folder, whole := Path(name) / "whole.ply", Filters(clean=False))
@@ -57,7 +45,7 @@ def rows_of(folder: Path) -> list[dict]:
             file.write_bytes(b"".join(spz.encode(arrays_of(read_gaussians(whole)), version)))
             rows.append(known | {
                 "format": f".spz version {version}", "clean": False, "gaussians": known["of"], "bytes": file.stat().st_size,
-                "loss_db": loss(read_gaussians(file)),
+                "loss_db": scorer.loss(read_gaussians(file)),
             })  # fmt: skip
     return rows
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from bench.lib import result_file
-from bench.lib.arguments import parse
+from bench.lib.arguments import SCENE, parse
 from bench.lib.tables import named
 from bench.lib.timing import measure
 from bench.lib.training import Trainer, make_trainer, one_step, step_parts
@@ -65,7 +65,7 @@ def stages(trainer: Trainer) -> tuple[list[dict], int]:
 def main() -> None:
     """Measure, print, write."""
     a = parse(
-        __doc__, None, {"scene": Path}, split="llff:3", downscale=1, gaussians=100_000, warm_steps=300, device="auto", out=Path,
+        __doc__, None, SCENE, split="llff:3", downscale=1, gaussians=100_000, warm_steps=300, device="auto", out=Path,
     )  # fmt: skip
     device, where = choose_device(a.device)
     scene = load_scene(a.scene, downscale=a.downscale)

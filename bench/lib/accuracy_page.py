@@ -1,4 +1,4 @@
-"""The measured parts of docs/accuracy.md: the error budget (`python -m tests.numerics.report`) and the same bits."""
+"""The measured parts of docs/numerics.md: the error budget (`python -m tests.numerics.report`) and the same bits."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def budget_text(results: dict[str, dict]) -> str:
 
 
 def parts() -> dict[str, str]:
-    """Return the generated parts of docs/accuracy.md by name."""
+    """Return the generated parts of docs/numerics.md by name."""
     return {
         "budget": budget_text(result_file.stored("budget")),
         "same bits": same_bits.table(result_file.read(same_bits.RESULTS)["rows"]),

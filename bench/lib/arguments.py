@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from pathlib import Path
 
 WORDS = {
     "arms": "methods to compare: the first so many of the set, or their names where the default is a list",
@@ -68,3 +69,7 @@ def parse(
             how |= {"default": default, "type": type(default)}
         parser.add_argument(f"--{name.replace('_', '-')}", **how)
     return parser.parse_args(given)
+
+
+SCENE = {"scene": Path}
+"""Positional argument of most programs: one scene folder."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -159,15 +160,27 @@ def strategy_of(s: Settings, size: float):
     return strategy, strategy.initialize_state()
 
 
-def loaded(view: View, device: torch.device, scale: float) -> tuple:
-    """Return viewmat, K, image and mask (None for all pixels) of a view on the device, with our unit ``scale`` long."""
+@dataclass(frozen=True)
+class _Loaded:
+    """A training view on the device, in gsplat's world."""
+
+    viewmat: torch.Tensor
+    K: torch.Tensor
+    image: torch.Tensor
+    mask: torch.Tensor | None
+
+
+def loaded(view: View, device: torch.device, scale: float) -> _Loaded:
+    """Return a view on the device with our unit ``scale`` long."""
     viewmat = np.array(view.camera.viewmat, dtype=np.float64)
     viewmat[:3, 3] *= scale
     there = [torch.as_tensor(a, dtype=torch.float32, device=device) for a in (viewmat, view.camera.K, view.image)]
-    return *there, None if view.mask is None else torch.as_tensor(view.mask, device=device)
+    return _Loaded(*there, None if view.mask is None else torch.as_tensor(view.mask, device=device))
 
 
-def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float) -> dict:
+def train(
+    views: list[View], first: Gaussians, s: Settings, *, seed: int, scale: float, size: float, draw: Callable = render
+) -> dict:
     """Train from the positions and colours of the first Gaussians, and return gsplat's parameters in its own world.
 
     Args:
@@ -177,6 +190,7 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
         seed: Seed of torch, and of the order of views.
         scale: Length of our unit in gsplat's world.
         size: Size of the scene in gsplat's world.
+        draw: Rasterizer, with arguments and results of `render`.
     """
     device = first.means.device
     torch.manual_seed(seed)
@@ -188,11 +202,11 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
     there, order = [loaded(v, device, scale) for v in views], []
     for step in range(s.steps):
         order = order or torch.randperm(len(there)).tolist()
-        viewmat, K, target, mask = there[order.pop()]
-        height, width = target.shape[:2]
-        image, info = render(params, viewmat, K, width, height, min(step // s.sh_every, s.sh_degree), s.background)
+        view = there[order.pop()]
+        height, width = view.image.shape[:2]
+        image, info = draw(params, view.viewmat, view.K, width, height, min(step // s.sh_every, s.sh_degree), s.background)
         strategy.step_pre_backward(params=params, optimizers=optimizers, state=state, step=step, info=info)
-        loss_of(image, target, mask, params, s).backward()
+        loss_of(image, view.image, view.mask, params, s).backward()
         for optimizer in optimizers.values():
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)
@@ -202,7 +216,10 @@ def train(views: list[View], first: Gaussians, s: Settings, *, seed: int, scale:
     return params
 
 
-def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed: int):
+def fit(
+    scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed: int, own_units: bool = True,
+    draw: Callable = render,
+):  # fmt: skip
     """Train on views of a scene; return the parameters, and seconds, count, unit and size of the scene as figures of a row.
 
     Args:
@@ -211,6 +228,8 @@ def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed:
         first: Gaussians whose means and colours are the start.
         s: Settings.
         seed: Seed of torch, and of the order of views.
+        own_units: Scale the world as gsplat's parser does; else use our units.
+        draw: Rasterizer, with arguments and results of `render`.
 
     Raises:
         UsageError: The scene's images are composited over a background other than that of the settings.
@@ -218,9 +237,9 @@ def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed:
     if any(scene.background) and scene.background != s.background:
         raise UsageError(f"{scene.path}: its background is {scene.background}, but the settings have {s.background}")
     cameras, began = [view.camera for view in scene.views], time.perf_counter()
-    unit = own_scale(cameras, scene.normalization)
+    unit = own_scale(cameras, scene.normalization) if own_units else 1.0
     size = scene_scale(cameras, unit)
-    params = train(views, first, s, seed=seed, scale=unit, size=size)
+    params = train(views, first, s, seed=seed, scale=unit, size=size, draw=draw)
     if first.means.is_cuda:
         torch.cuda.synchronize(first.means.device)
     row = {"points": len(first), "gaussians": len(params["means"]), "unit": unit, "scene_scale": size}
@@ -228,12 +247,12 @@ def fit(scene: Scene, views: list[View], first: Gaussians, s: Settings, *, seed:
 
 
 @torch.no_grad()
-def image_of(params, view: View, scale: float, background=BLACK) -> np.ndarray:
+def image_of(params, view: View, scale: float, draw: Callable = render, background=BLACK) -> np.ndarray:
     """Return the image of a view over a background [3], in [0, 1], shape [H, W, 3], all coefficients in use."""
-    viewmat, K, *_ = loaded(view, params["means"].device, scale)
+    there = loaded(view, params["means"].device, scale)
     degree = math.isqrt(params["shN"].shape[1] + 1) - 1
     size = view.camera.width, view.camera.height
-    return render(params, viewmat, K, *size, degree, background)[0].clamp(0, 1).cpu().numpy()
+    return draw(params, there.viewmat, there.K, *size, degree, background)[0].clamp(0, 1).cpu().numpy()
 
 
 def compile_kernels(device: torch.device) -> None:

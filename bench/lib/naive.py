@@ -9,7 +9,7 @@ import torch
 import warp as wp
 from torch.autograd.function import once_differentiable
 
-from warpgs.constants import RULES
+from warpgs.constants import RULES, Rule
 from warpgs.kernels import launch
 from warpgs.kernels.project import project
 from warpgs.kernels.tiles import Tiles, bin_tiles, grid
@@ -128,23 +128,36 @@ def backward_kernel():
 
 
 class Naive:
-    """The kernels bound to one set of inputs, over black; colour only, neither alpha nor depth."""
+    """The kernels bound to one set of inputs; colour only, neither alpha nor depth."""
 
-    def __init__(self, projected: torch.Tensor, tiles: Tiles, width: int, height: int):
-        cameras, rule = len(projected), RULES["exact"]
-        self.pixels, self.device = cameras * height * width, wp.device_from_torch(projected.device)
-        self.projected, black = projected.detach().contiguous(), projected.new_zeros(cameras, 3)
+    def __init__(
+        self,
+        projected: torch.Tensor,
+        tiles: Tiles,
+        backgrounds: torch.Tensor,
+        width: int,
+        height: int,
+        rule: Rule,
+    ):
+        if not rule.inclusive_stop or rule.square_sigma:
+            raise ValueError("the naive kernels know only the rule `exact`")
+        cameras, pixels = len(backgrounds), len(backgrounds) * height * width
+        self.projected, self.device, self.pixels = (
+            projected.detach().contiguous(),
+            wp.device_from_torch(projected.device),
+            pixels,
+        )
         self.rgb = projected.new_empty(cameras, height, width, 3)
         self.v_projected = torch.zeros_like(self.projected)
-        transmittances = projected.new_empty(self.pixels)
-        ends = torch.empty(self.pixels, dtype=torch.int32, device=projected.device)
+        transmittances = projected.new_empty(pixels)
+        ends = torch.empty(pixels, dtype=torch.int32, device=projected.device)
         columns, rows = grid(width, height, tiles.size)
         self.inputs = [
             launch.view(self.projected.view(-1, 12), wp.float32), launch.view(tiles.ranges, wp.int32),
-            launch.view(tiles.gaussian_ids, wp.int32), launch.view(black, wp.float32), width, height, columns,
+            launch.view(tiles.gaussian_ids, wp.int32), launch.view(backgrounds, wp.float32), width, height, columns,
             columns * rows, tiles.size, rule.alpha_cut, rule.alpha_max,
         ]  # fmt: skip
-        self.stop, self.kept = rule.transmittance_stop, [black, transmittances, ends]
+        self.stop, self.kept = rule.transmittance_stop, [transmittances, ends]
         self.state = [launch.view(transmittances, wp.float32), launch.view(ends, wp.int32)]
 
     def _launch(self, kernel, inputs: list) -> None:
@@ -169,7 +182,8 @@ class Naive:
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, projected, tiles, width, height):
-        ctx.naive = Naive(projected, tiles, width, height)
+        black = projected.new_zeros(len(projected), 3)
+        ctx.naive = Naive(projected, tiles, black, width, height, RULES["exact"])
         return ctx.naive.forward()
 
     @staticmethod

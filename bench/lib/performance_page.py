@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 
-from bench.lib import result_file
+from bench.lib import rasterizers_page, result_file
 from bench.lib.plot import Line, Panel, chart
 from bench.lib.points import BASE, SIZES, Point, Series, along, diagonal, tasks
 from bench.lib.tables import figure, markdown
@@ -14,7 +14,6 @@ COLORS = {
     "project": 0, "sh": 1, "tiles": 2, "blend": 3, "ssim": 4, "adam": 5, "knn": 6,
     "render forward": 0, "render both": 1, "step step": 2,
 }  # fmt: skip
-DIRECTIONS = ("image", "forward", "both")
 WORDS = ("op", "program", "direction", "machine", "other", "Gaussians, image", "capture")
 """Columns that hold words."""
 POINTS = (Point(10_000), Point(100_000), Point(1_000_000), Point(1_000_000, 1920, 1080))
@@ -135,44 +134,6 @@ def peers_table(results: dict[str, dict]) -> str:
     return markdown(head, body, WORDS)
 
 
-def _size(row: dict) -> str:
-    return row["configuration"].replace(" at ", ", ").replace("x", " x ")
-
-
-def _of(result: dict, channels: int) -> list[dict]:
-    return [r for r in result["rows"] if r["channels"] == channels]
-
-
-def times_table(result: dict, channels: int = 3) -> str:
-    """Return GPU and wall time by direction, and peak memory, of each program that took ``channels``."""
-    body = []
-    for row in _of(result, channels):
-        for who, peak in row["peak_mib"].items():
-            times = [figure(row[kind][d][who]["median"]) for kind in ("gpu_ms", "wall_ms") for d in DIRECTIONS]
-            body.append([_size(row), who, *times, figure(peak)])
-    times = [f"{kind}: {DIRECTIONS[0]} [ms]" for kind in ("GPU", "wall")]
-    rest = [f"{d} [ms]" for d in DIRECTIONS[1:]]
-    return markdown(["Gaussians, image", "program", times[0], *rest, times[1], *rest, "MiB"], body, WORDS)
-
-
-def gpu_table(result: dict, programs: tuple[str, ...]) -> str:
-    """Return GPU time by direction of each of some programs that took three channels."""
-    body = [
-        [_size(row), who, *(figure(row["gpu_ms"][d][who]["median"]) for d in DIRECTIONS)]
-        for row in _of(result, 3) for who in row["peak_mib"] if who in programs
-    ]  # fmt: skip
-    return markdown(["Gaussians, image", "program", *(f"{d} [ms]" for d in DIRECTIONS)], body, WORDS)
-
-
-def steps_table(result: dict) -> str:
-    """Return wall times of training steps, ours as a graph and gsplat's with torch."""
-    body = []
-    for row in _of(result, 3):
-        ours, theirs = (row["step_wall_ms"][who]["median"] for who in (f"{OURS} graph", "gsplat"))
-        body.append([_size(row), figure(ours), figure(theirs), f"{ours / theirs:.3f}"])
-    return markdown(["Gaussians, image", "warpgs [ms]", "gsplat [ms]", "ratio"], body, WORDS)
-
-
 def _lines(series: list[Series], name) -> tuple[Line, ...]:
     lines = []
     for s in series:
@@ -233,10 +194,10 @@ def parts() -> dict[str, str]:
     gswarp = result_file.read(result_file.FOLDER / "gswarp_h200.json")
     return {
         "sizes": sizes_table(ops) + sources,
-        "rasterizers": times_table(beside) + _sources("rasterizers", others),
-        "gswarp": gpu_table(gswarp, (OURS, "gswarp")) + "\n" + result_file.source("gswarp_h200"),
-        "many channels": times_table(beside, 32),
-        "steps": steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
+        "rasterizers": rasterizers_page.times_table(beside) + _sources("rasterizers", others),
+        "gswarp": rasterizers_page.gpu_table(gswarp, (OURS, "gswarp")) + "\n" + result_file.source("gswarp_h200"),
+        "many channels": rasterizers_page.times_table(beside, 32),
+        "steps": rasterizers_page.steps_table(next(iter(steps.values()))) + _sources("training_steps", steps),
         "whole fits": fits_table(turns) + _sources("turns", turns),
         "ops": ops_table(ops),
         "other programs": peers_table(ops),

@@ -1,4 +1,4 @@
-"""The generated parts of docs/results.md, and of docs/method.md what the importance scores gain."""
+"""The generated parts of docs/results.md but rivals and ladder, and what the importance scores gain, of docs/method.md."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 
 from bench.lib import result_file
-from bench.lib.arms import LADDER, RIVALS, SCORES, Arm, chosen_steps, steps_in
+from bench.lib.arms import SCORES
 from bench.lib.preset_table import by_seed
 from bench.lib.scenes import ROWS
 from bench.lib.tables import markdown, mean_sd
@@ -38,8 +38,6 @@ SCORED = {
     "synthetic objects, 8 (before smooth depth)": ("importance_objects_h200", None),
 }
 """Result file and row of each scene; the fits of objects differ in the object instead of the seed."""
-SEEDS = 3
-"""Fewest seeds of an interval."""
 
 
 def table(head: Sequence[str], rows: list[list[str]]) -> str:
@@ -47,8 +45,7 @@ def table(head: Sequence[str], rows: list[list[str]]) -> str:
     return markdown(head, rows, head[:1])
 
 
-def with_source(name: str) -> tuple[dict, str]:
-    """Return a kept result, and the line on its source for a page."""
+def _result(name: str) -> tuple[dict, str]:
     return result_file.read(result_file.FOLDER / f"{name}.json"), "\n" + result_file.source(name)
 
 
@@ -67,7 +64,7 @@ def _change(own: dict[int, dict], base: dict[int, dict], key: str, digits: int) 
 
 def ablation() -> str:
     """Return the table of the method with one part off: means over both scenes, differences to the full method by seed."""
-    result, source = with_source("ablation_llff3_h200")
+    result, source = _result("ablation_llff3_h200")
     scores: dict[str, dict[int, dict]] = {}
     for variant in ("full", *ABLATED):
         rows = [r for r in result["rows"] if r["variant"] == variant]
@@ -85,7 +82,7 @@ def ablation() -> str:
 
 def views() -> str:
     """Return the table of held-out scores by scene and preset, `default` from its own run; empty cells were not measured."""
-    (others, source), (own, own_source) = with_source("presets_h200"), with_source("default_h200")
+    (others, source), (own, own_source) = _result("presets_h200"), _result("default_h200")
     found = by_seed(others["rows"]) | by_seed(own["rows"])
     body = []
     for name, (scene, count) in CAPTURES.items():
@@ -99,7 +96,7 @@ def views() -> str:
 
 def meshes() -> str:
     """Return the table of the accuracy of meshes."""
-    result, source = with_source("demo_mesh_cpu2")
+    result, source = _result("demo_mesh_cpu2")
     body = []
     for r in sorted((r for r in result["rows"] if r["row"] == "mesh"), key=lambda r: -r["voxel"]):
         if r["depth"] == "median":
@@ -130,107 +127,3 @@ def scores() -> str:
     files = ", ".join(f"`{file}.json`" for file in dict.fromkeys(file for file, _ in SCORED.values()))
     note = "held-out PSNR [dB]; objects: over white, and measured before `default` smoothed depth with 8 views"
     return markdown(head, body, head[:1]) + f"\nSources: {files}; {note}.\n"
-
-
-def preset_in(rows: list[dict], row: str, arm: Arm) -> str | None:
-    """Return the preset that an arm has on a row, with the chosen steps; None where it was not measured."""
-    held_out = {r["preset"] for r in rows if r["row"] == row and not r.get("left_out") and "error" not in r}
-    if arm.steps and not any(arm.with_steps(n) in held_out for n in arm.steps):
-        return None
-    preset = arm.with_steps(chosen_steps(rows, row, arm)) if arm.steps else arm.preset
-    return preset if preset in held_out else None
-
-
-def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], above: bool) -> str:
-    """Return PSNR and SSIM of each arm on each row, with its steps, and the difference in PSNR to the base by seed.
-
-    Args:
-        arms: Rows of the table.
-        rows: Results on held-out views, and on training views left out.
-        names: Rows of the comparison, a group of columns each.
-        above: The base of an arm is the one above it, else the first arm.
-    """
-    held_out = [r for r in rows if not r.get("left_out")]
-    found, confidence, body = by_seed(held_out), family_confidence(len(arms) - 1), []
-    for place, arm in enumerate(arms):
-        body.append([arm.words])
-        for name in names:
-            preset = preset_in(rows, name, arm)
-            if preset is None:
-                body[-1] += ["", "", ""]
-                continue
-            own = found[name, preset]
-            base = arms[place - 1] if above else arms[0]
-            theirs = found.get((name, preset_in(rows, name, base) or ""), {}) if place else {}
-            seeds = sorted(own.keys() & theirs.keys())
-            d = paired_difference([own[s]["psnr"] for s in seeds], [theirs[s]["psnr"] for s in seeds], confidence)
-            change = (
-                f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if len(seeds) >= SEEDS else f"{d.mean:+.2f}" if seeds else ""
-            )
-            count = "" if len(own) == max(len(s) for s in found.values()) else f" ({len(own)} seed{'s' * (len(own) > 1)})"
-            score = f"{mean_sd([r['psnr'] for r in own.values()])} / {statistics.mean(r['ssim'] for r in own.values()):.3f}"
-            body[-1] += [f"{steps_in(preset):,}", score + count, change]
-    scenes = [name.split(":")[0] for name in names]
-    what = "change" if above else f"difference to {arms[0].words}"
-    head = [heading for s in scenes for heading in (f"{s}: steps", f"{s}: PSNR / SSIM", what)]
-    return markdown(["step" if above else "method", *head], body, ["step" if above else "method"])
-
-
-def _names(rows: list[dict]) -> list[str]:
-    """Return the names of the rows of results, in the order of `ROWS`."""
-    return [name for name in ROWS if any(r["row"] == name for r in rows)]
-
-
-def _page_table(name: str, arms: Sequence[Arm], above: bool) -> str:
-    """Return the table of the kept results of a set, by machine."""
-    tables = []
-    for machine, result in result_file.stored(name).items():
-        rows = result["rows"]
-        tables.append(arms_table(arms, rows, _names(rows), above) + "\n" + result_file.source(f"{name}_{machine}"))
-    return "\n".join(tables)
-
-
-def rivals() -> str:
-    """Return the table of methods under one rule."""
-    return _page_table("rivals", RIVALS, above=False)
-
-
-def ladder_of_default() -> str:
-    """Return the table of the method's steps from plain 3DGS, each beside the one above it."""
-    return _page_table("ladder", LADDER, above=True)
-
-
-def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str]) -> str:
-    """Return held-out PSNR of the arms with numbers of steps that were not chosen; arguments are those of `arms_table`."""
-    found, body = by_seed([r for r in rows if not r.get("left_out")]), []
-    for name in names:
-        first = found.get((name, preset_in(rows, name, arms[0]) or ""), {})
-        for arm in arms:
-            for preset in (arm.with_steps(n) for n in arm.steps):
-                own = found.get((name, preset))
-                if own and preset != preset_in(rows, name, arm):
-                    psnr = [r["psnr"] for r in own.values()]
-                    body.append(
-                        [name.split(":")[0], arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"]
-                    )
-                    seeds = sorted(own.keys() & first.keys())
-                    body[-1].append(
-                        f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else ""
-                    )
-    head = ["scene", "method", "steps", "PSNR", f"difference to {arms[0].words}"]
-    return markdown(head, body, ["scene", "method"])
-
-
-def other_steps() -> str:
-    """Return the table of the kept results of rivals with numbers of steps that were not chosen."""
-    tables = []
-    for machine, result in result_file.stored("rivals").items():
-        rows = result["rows"]
-        tables.append(other_steps_table(RIVALS, rows, _names(rows)) + f"\nSource: `rivals_{machine}.json`.\n")
-    return "\n".join(tables)
-
-
-def parts() -> dict[str, str]:
-    """Return the generated parts of docs/results.md by name."""
-    named = {"other steps": other_steps(), "ladder of default": ladder_of_default()}
-    return {"ablation": ablation(), "views": views(), "meshes": meshes(), "rivals": rivals()} | named

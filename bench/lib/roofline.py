@@ -5,8 +5,9 @@ stores for its backward pass count, scratch memory does not. There are two excep
 read once per (Gaussian, tile) instance, and a radix sort reads and writes all pairs once per 8 bits of key.
 
 Operations: float multiplications, additions, comparisons, selections, square roots and divisions count 1 each, an exponential
-counts 10 (a polynomial of degree 6 and its scaling). They are counted by hand from the kernels' formulas, per Gaussian to about
-a fifth. Blending counts the pairs that are blended; pairs that are evaluated and dropped are overhead.
+    10
+(a polynomial of degree 6 and its scaling). They are counted by hand from the kernels' formulas, per Gaussian to about a fifth.
+Blending counts the pairs that are blended; pairs that are evaluated and dropped are overhead.
 """
 
 from __future__ import annotations

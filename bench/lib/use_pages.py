@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from bench.lib.results_page import table, with_source
+from bench.lib import result_file
+from bench.lib.results_page import table
 from bench.lib.tables import markdown
 
 MODELS = {
@@ -21,9 +22,13 @@ FORMATS = {
 """Encoding, SH degrees and programs of each file format."""
 
 
+def _result(name: str) -> tuple[dict, str]:
+    return result_file.read(result_file.FOLDER / f"{name}.json"), "\n" + result_file.source(name)
+
+
 def packing() -> str:
     """Return the table of fits that share a GPU."""
-    result, source = with_source("farm_h200")
+    result, source = _result("farm_h200")
     body = []
     for r in result["rows"]:
         gpus = "" if r["gpus"] == 1 else f" on each of {r['gpus']} H200"
@@ -33,7 +38,7 @@ def packing() -> str:
 
 def ranks() -> str:
     """Return the table of steps by the number of GPUs."""
-    result, source = with_source("ranks_h200")
+    result, source = _result("ranks_h200")
     body = []
     for case, words in MODELS.items():
         rows = sorted((r for r in result["rows"] if r["case"] == case), key=lambda r: r["ranks"])
@@ -47,7 +52,7 @@ def ranks() -> str:
 
 def formats() -> str:
     """Return the table of file formats: encoding, bytes of a Gaussian, loss; without filters, SPZ in its default version."""
-    result, source = with_source("formats_fern_cpu2")
+    result, source = _result("formats_fern_cpu2")
     rows = {r["format"]: r for r in result["rows"] if not r["clean"]}
     body = []
     for name, (encoding, degrees, programs) in FORMATS.items():

@@ -1,4 +1,4 @@
-"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/extremes.md)."""
+"""Binning and sorting at the limits of their numbers, and pictures of extreme sizes (docs/numerics.md)."""
 
 import dataclasses
 from types import SimpleNamespace

@@ -1,0 +1,112 @@
+"""The generated parts of docs/results.md on rivals and on the ladder."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Sequence
+
+from bench.lib import result_file
+from bench.lib.arms import LADDER, RIVALS, Arm, chosen_steps, steps_in
+from bench.lib.preset_table import by_seed
+from bench.lib.scenes import ROWS
+from bench.lib.tables import markdown, mean_sd
+from warpgs.pipeline.study.tables import family_confidence, paired_difference
+
+SEEDS = 3
+"""Fewest seeds of an interval."""
+
+
+def preset_in(rows: list[dict], row: str, arm: Arm) -> str | None:
+    """Return the preset that an arm has on a row, with the chosen steps; None where it was not measured."""
+    held_out = {r["preset"] for r in rows if r["row"] == row and not r.get("left_out") and "error" not in r}
+    if arm.steps and not any(arm.with_steps(n) in held_out for n in arm.steps):
+        return None
+    preset = arm.with_steps(chosen_steps(rows, row, arm)) if arm.steps else arm.preset
+    return preset if preset in held_out else None
+
+
+def arms_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str], above: bool) -> str:
+    """Return PSNR and SSIM of each arm on each row, with its steps, and the difference in PSNR to the base by seed.
+
+    Args:
+        arms: Rows of the table.
+        rows: Results on held-out views, and on training views left out.
+        names: Rows of the comparison, a group of columns each.
+        above: The base of an arm is the one above it, else the first arm.
+    """
+    held_out = [r for r in rows if not r.get("left_out")]
+    found, confidence, body = by_seed(held_out), family_confidence(len(arms) - 1), []
+    for place, arm in enumerate(arms):
+        body.append([arm.words])
+        for name in names:
+            preset = preset_in(rows, name, arm)
+            if preset is None:
+                body[-1] += ["", "", ""]
+                continue
+            own = found[name, preset]
+            base = arms[place - 1] if above else arms[0]
+            theirs = found.get((name, preset_in(rows, name, base) or ""), {}) if place else {}
+            seeds = sorted(own.keys() & theirs.keys())
+            d = paired_difference([own[s]["psnr"] for s in seeds], [theirs[s]["psnr"] for s in seeds], confidence)
+            change = (
+                f"{d.mean:+.2f} [{d.low:+.2f}, {d.high:+.2f}]" if len(seeds) >= SEEDS else f"{d.mean:+.2f}" if seeds else ""
+            )
+            count = "" if len(own) == max(len(s) for s in found.values()) else f" ({len(own)} seed{'s' * (len(own) > 1)})"
+            score = f"{mean_sd([r['psnr'] for r in own.values()])} / {statistics.mean(r['ssim'] for r in own.values()):.3f}"
+            body[-1] += [f"{steps_in(preset):,}", score + count, change]
+    scenes = [name.split(":")[0] for name in names]
+    what = "change" if above else f"difference to {arms[0].words}"
+    head = [heading for s in scenes for heading in (f"{s}: steps", f"{s}: PSNR / SSIM", what)]
+    return markdown(["step" if above else "method", *head], body, ["step" if above else "method"])
+
+
+def _page_table(name: str, arms: Sequence[Arm], above: bool) -> str:
+    """Return the table of the kept results of a set, by machine; where there are none, the command that makes them."""
+    tables = []
+    for machine, result in result_file.stored(name).items():
+        rows = result["rows"]
+        names = [n for n in ROWS if any(r["row"] == n for r in rows)]
+        tables.append(arms_table(arms, rows, names, above) + "\n" + result_file.source(f"{name}_{machine}"))
+    command = f"python -m bench.fits.rivals DATA --rows fern:3 horns:3 --set {name} --out FILE"
+    return "\n".join(tables) or f"Not measured yet: `{command}`.\n"
+
+
+def rivals() -> str:
+    """Return the table of methods under one rule."""
+    return _page_table("rivals", RIVALS, above=False)
+
+
+def ladder_of_default() -> str:
+    """Return the table of the method's steps from plain 3DGS, each beside the one above it."""
+    return _page_table("ladder", LADDER, above=True)
+
+
+def other_steps_table(arms: Sequence[Arm], rows: list[dict], names: Sequence[str]) -> str:
+    """Return held-out PSNR of the arms with numbers of steps that were not chosen; arguments are those of `arms_table`."""
+    found, body = by_seed([r for r in rows if not r.get("left_out")]), []
+    for name in names:
+        first = found.get((name, preset_in(rows, name, arms[0]) or ""), {})
+        for arm in arms:
+            for preset in (arm.with_steps(n) for n in arm.steps):
+                own = found.get((name, preset))
+                if own and preset != preset_in(rows, name, arm):
+                    psnr = [r["psnr"] for r in own.values()]
+                    body.append(
+                        [name.split(":")[0], arm.words, f"{steps_in(preset):,}", f"{mean_sd(psnr)} ({len(psnr)} seeds)"]
+                    )
+                    seeds = sorted(own.keys() & first.keys())
+                    body[-1].append(
+                        f"{statistics.mean(own[s]['psnr'] - first[s]['psnr'] for s in seeds):+.2f}" if seeds else ""
+                    )
+    head = ["scene", "method", "steps", "PSNR", f"difference to {arms[0].words}"]
+    return markdown(head, body, ["scene", "method"])
+
+
+def other_steps() -> str:
+    """Return the table of the kept results of rivals with numbers of steps that were not chosen."""
+    tables = []
+    for machine, result in result_file.stored("rivals").items():
+        rows = result["rows"]
+        names = [n for n in ROWS if any(r["row"] == n for r in rows)]
+        tables.append(other_steps_table(RIVALS, rows, names) + f"\nSource: `rivals_{machine}.json`.\n")
+    return "\n".join(tables)
