@@ -137,7 +137,7 @@ def test_items_run_in_any_order(monkeypatch, whole, poisoned_memory):
     """One by one from the last to the first: the same bits, since none may rely on another having run."""
 
     def backwards(kernel, count, inputs, device, **_):
-        arrays = [a.array() if isinstance(a, interop.View) else a for a in inputs]
+        arrays = [a.array() if isinstance(a, interop.View) else a for a in interop.arguments(kernel, inputs)]
         for i in reversed(range(count)):
             wp.launch(kernel, 1, inputs=[i, *arrays], device="cpu")
 

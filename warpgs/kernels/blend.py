@@ -3,7 +3,6 @@
 import functools
 from collections.abc import Iterator, Sequence
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import torch
 import warp as wp
@@ -327,17 +326,6 @@ def make_kernels(real, width: int):
     return SimpleNamespace(color=color, add=add)
 
 
-class _Group(NamedTuple):
-    """The channels of one pass."""
-
-    channels: slice
-    """Slice of all D channels."""
-    projected: torch.Tensor
-    """Projected Gaussians that have these channels instead of a colour, shape [C, N, 9 + G]. All groups share the memory."""
-    backgrounds: torch.Tensor
-    """Background of the channels, shape [C, G]: zeros fill up the last group."""
-
-
 def _padded(values: torch.Tensor, width: int) -> torch.Tensor:
     """Return values [..., F], filled up with zeros to [..., width]."""
     return torch.nn.functional.pad(values, (0, width - values.shape[-1]))
@@ -350,15 +338,16 @@ def _given(v_image: torch.Tensor, width: int, native: bool) -> torch.Tensor:
 
 def _groups(
     projected: torch.Tensor, tiles: Tiles, colors: torch.Tensor, backgrounds: torch.Tensor, width: int
-) -> Iterator[_Group]:  # fmt: skip
-    """Yield the groups of ``width`` channels, in order; use each group before you request the next."""
+) -> Iterator[tuple[slice, torch.Tensor, torch.Tensor]]:  # fmt: skip
+    """Yield for each pass a slice of the D channels, Gaussians [C, N, 9 + G] with these channels, and backgrounds [C, G]."""
+    # The Gaussians share their memory: use them before you request the next. Zeros fill up the last group.
     count, real = colors.shape[-1], launch.real_of(colors)
     colored = projected.new_empty(*projected.shape[:2], GEOMETRY + width + 3)
     inputs = [projected, tiles.counts, colors]
     for first in range(0, count, width):
         channels = slice(first, min(first + width, count))
         launch.launch(make_kernels(real, width).color, len(tiles.counts), [*inputs, first, colored], projected.device, cost=5)
-        yield _Group(channels, colored, _padded(backgrounds[:, channels], width).contiguous())
+        yield channels, colored, _padded(backgrounds[:, channels], width).contiguous()
 
 
 class _BlendChannels(torch.autograd.Function):
@@ -370,12 +359,13 @@ class _BlendChannels(torch.autograd.Function):
         projected, colors = projected.contiguous(), colors.contiguous()
         image = projected.new_empty(len(projected), settings.height, settings.width, colors.shape[-1])
         found = None
-        for group in _groups(projected, tiles, colors, backgrounds, _width(projected, colors.shape[-1], settings.absgrad)):
+        width = _width(projected, colors.shape[-1], settings.absgrad)
+        for channels, colored, behind in _groups(projected, tiles, colors, backgrounds, width):
             # the first pass computes everything that does not depend on the channels
-            part = image[..., group.channels]
-            whole = part.shape[-1] == group.backgrounds.shape[-1]
+            part = image[..., channels]
+            whole = part.shape[-1] == behind.shape[-1]
             rgb, *rest = composite(
-                group.projected, tiles, group.backgrounds, settings, save=save and found is None,
+                colored, tiles, behind, settings, save=save and found is None,
                 image=part if whole or is_native(projected) else None,
             )  # fmt: skip
             if rgb is not part:
@@ -396,20 +386,17 @@ class _BlendChannels(torch.autograd.Function):
         v_projected, v_colors = torch.zeros_like(projected), torch.zeros_like(colors)
         v_image, v_alpha, v_depth = (None if v is None else v.contiguous() for v in (v_image, v_alpha, v_depth))
         real, width = launch.real_of(projected), _width(projected, colors.shape[-1], ctx.settings.absgrad)
-        for group in _groups(projected, tiles, colors, backgrounds, width):
-            first = group.channels.start
+        for channels, colored, behind in _groups(projected, tiles, colors, backgrounds, width):
+            first = channels.start
             if v_image is None and first > 0:
                 break
-            saved = [image[..., group.channels], *shared]
+            saved = [image[..., channels], *shared]
             if is_native(projected) and first > 0:
                 # states hold the channels of one group, so that memory does not grow with the number of channels
-                again = composite(
-                    group.projected, tiles, group.backgrounds, ctx.settings, save=True, image=image[..., :0]
-                )  # fmt: skip
-                saved[1:] = again[2:]
-            v_rgb = None if v_image is None else _given(v_image[..., group.channels], width, is_native(projected))
+                saved[1:] = composite(colored, tiles, behind, ctx.settings, save=True, image=image[..., :0])[2:]
+            v_rgb = None if v_image is None else _given(v_image[..., channels], width, is_native(projected))
             v_images = (v_rgb, v_alpha, v_depth) if first == 0 else (v_rgb, None, None)
-            v = composite_gradients(group.projected, tiles, group.backgrounds, ctx.settings, saved, v_images)
+            v = composite_gradients(colored, tiles, behind, ctx.settings, saved, v_images)
             inputs, count = [v, tiles.counts, first, v_projected, v_colors], v_colors.shape[0] * v_colors.shape[1]
             launch.launch(make_kernels(real, width).add, count, inputs, v.device, cost=5)
         v_backgrounds = background_gradient(shared[1], v_image, colors.shape[-1]) if ctx.needs_input_grad[2] else None
