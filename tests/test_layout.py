@@ -42,7 +42,7 @@ def test_an_op_is_compared_with_a_dense_reference():
 def launches(node: ast.stmt) -> bool:
     """Whether a statement defines a public function that launches a kernel, or calls an autograd function that does."""
     called = [ast.unparse(n.func).rpartition(".")[2] for n in ast.walk(node) if isinstance(n, ast.Call)]
-    return isinstance(node, ast.FunctionDef) and node.name[0] != "_" and bool({"launch", "apply"} & set(called))
+    return isinstance(node, ast.FunctionDef) and node.name[0] != "_" and bool({"launch", "apply", "_walk"} & set(called))
 
 
 def nodes_of(path: Path) -> list[ast.AST]:
