@@ -52,32 +52,37 @@ def make_walk(real, tile_size: int, make_visit):
         instance = ranges[tile, 0]
         while instance < ranges[tile, 1] and unfinished > 0:
             i = gaussian_ids[instance]
-            u11 = projected[i, 2]
-            bounds = f.bounds_of(
-                projected[i, 0], projected[i, 1], u11, projected[i, 4], projected[i, 10], projected[i, 11], settings.whole_tiles
-            )
+            # values of its own, since the visitor's stores might change the array for all that the compiler knows
+            mx = real(projected[i, 0])
+            my = real(projected[i, 1])
+            u11 = real(projected[i, 2])
+            u12 = real(projected[i, 3])
+            u22 = real(projected[i, 4])
+            opacity = real(projected[i, 5])
+            depth = real(projected[i, 9])
+            bounds = f.bounds_of(mx, my, u11, u22, projected[i, 10], projected[i, 11], settings.whole_tiles)
             for lane in range(strip):
                 ramp[lane] = f.apart(u11 * real(lane))
             for row in range(side):
-                dy = real(settings.origin_y + top + row) + real(0.5) - projected[i, 1]
-                e2 = projected[i, 4] * dy
-                e12 = f.apart(projected[i, 3] * dy)
+                dy = real(settings.origin_y + top + row) + real(0.5) - my
+                e2 = u22 * dy
+                e12 = f.apart(u12 * dy)
                 e22 = f.apart(e2 * e2)
                 for part in range(parts):
                     x = real(settings.origin_x + left + part * strip) + real(0.5)
-                    start = f.apart(u11 * (x - projected[i, 0])) + e12
+                    start = f.apart(u11 * (x - mx)) + e12
                     if f.reaches(start, u11, e22, bounds[0], bounds[1]):
                         for lane in range(strip):
                             p = row * side + part * strip + lane
                             e1 = start + ramp[lane]
-                            alpha = wp.min(settings.alpha_max, projected[i, 5] * f.falloff(e1 * e1 + e22))
+                            alpha = wp.min(settings.alpha_max, opacity * f.falloff(e1 * e1 + e22))
                             if alpha >= settings.alpha_cut and t[p] > real(0.0):
                                 after = t[p] * (real(1.0) - alpha)
                                 finished = after < settings.stop
                                 if settings.inclusive != 0 or not finished:
                                     pixel = (camera * settings.height + top + row) * settings.width + left + part * strip + lane
                                     ended = visit(
-                                        pixel, instance, i - camera * per_camera, alpha * t[p], after, projected[i, 9],
+                                        pixel, instance, i - camera * per_camera, alpha * t[p], after, depth,
                                         slots, k, reals, ids, counts,
                                     )  # fmt: skip
                                     finished = finished or ended
@@ -92,7 +97,7 @@ def make_walk(real, tile_size: int, make_visit):
 def make_median(real):
     """Make the visitor that writes the depth at which a pixel has lost half of its light, and finishes the pixel there."""
 
-    @wp.func
+    @wp.func(inline=True)
     def visit(
         pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
         depths: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
@@ -108,7 +113,7 @@ def make_median(real):
 def make_heaviest(real):
     """Make the visitor that puts a Gaussian into its pixel's sorted list of k, behind those of equal weight."""
 
-    @wp.func
+    @wp.func(inline=True)
     def visit(
         pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
         weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
@@ -132,7 +137,7 @@ def make_heaviest(real):
 def make_contributions(real):
     """Make the visitor that adds to the sum and maximum of an instance's weight, in slot order."""
 
-    @wp.func
+    @wp.func(inline=True)
     def visit(
         pixel: int, instance: int, i: int, weight: real, after: real, depth: real, slots: wp.array(dtype=int), k: int,
         weights: wp.array(dtype=real), ids: wp.array(dtype=int), counts: wp.array(dtype=int),
