@@ -180,7 +180,7 @@ def test_the_device_that_is_current_stays_so(monkeypatch, several):
     monkeypatch.setattr(interop, "_recorded", lambda *_: Noted())
     monkeypatch.setattr(interop, "warp_stream", lambda _: "ours")
     monkeypatch.setattr(interop, "warp_device", lambda _: Noted())
-    interop.launch(None, 1, [], device)
+    interop.launch(mark, 1, [None, None], device)
     with interop.stream_of(device):
         events.append("sort")
     guarded = [[("enter", device), *body, "exit"] if several else body for body in (["launch"], ["ours", "sort", "before"])]

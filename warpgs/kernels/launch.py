@@ -422,13 +422,13 @@ def launch(kernel, count: int, inputs: Sequence, device: torch.device, *, cost: 
     if count == 0:
         return
     _check_size(count)
-    inputs = arguments(kernel, inputs)
     if device.type == "cuda":
         with _current(device):
-            _recorded(kernel, device, block_dim).launch(count, inputs, warp_stream(device))
+            _recorded(kernel, device, block_dim).launch(count, arguments(kernel, inputs), warp_stream(device))
         return
     if device.type != "cpu":
         raise ValueError(f"{kernel.key}: the kernels run on cpu and cuda only, not on {device}")
+    inputs = arguments(kernel, inputs)
     if _OF_THREAD.shared is not None:
         _OF_THREAD.shared.finish()
         _OF_THREAD.shared = None
