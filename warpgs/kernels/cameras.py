@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import warp as wp
 
@@ -132,7 +132,7 @@ def make_linear(real: type) -> SimpleNamespace:
             wp.clamp(pixel[1], -margin * height, height + margin * height),
         )
 
-    def products(jacobian: Callable[..., object]) -> dict[str, object]:
+    def products(jacobian: Callable[..., Any]) -> dict[str, object]:
         """Return ``project_axes`` and ``axes_backward`` of a model by its ``jacobian(position, K, lens, point) -> Rows``."""
 
         @wp.func
