@@ -241,10 +241,10 @@ def _run(arguments: list[str]) -> int:
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
+            own = name in OWN_FILES
             with fast_imports():
-                module = importlib.import_module(f"warpgs.app.{name if name in OWN_FILES else 'commands'}")
-            command = getattr(module, f"run_{name.replace('-', '_')}")
-            code: int = command(arguments[1:], COMMANDS[name])
+                module = importlib.import_module(f"warpgs.app.{name if own else 'commands'}")
+            code: int = module.run(*(() if own else (name,)), arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
         return last_words(f"warpgs: {e}", e.exit_code)

@@ -18,7 +18,7 @@ from typing import Literal
 from warpgs.app.flags import parse_flags
 from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
 from warpgs.errors import ResourceError, UsageError, install_extras
-from warpgs.process import counted, fast_imports, hidden_stderr, printable, say
+from warpgs.process import counted, fast_imports, hidden_stderr, printable
 from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
@@ -384,31 +384,21 @@ def print_report(findings: list[Finding], console=None) -> int:
 # `warpgs doctor`: check this machine. Parses, calls, prints; no logic.
 
 
-def run_doctor(arguments: list[str], about: str) -> int:
+def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` describes it in its help.
 
     Raises:
-        UsageError: Flags exclude each other, or a value is invalid.
+        UsageError: A flag or a value is invalid.
     """
 
     @dataclass(frozen=True)
     class Doctor:
         warm: bool = False
         """Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks."""
-        repeat: Path | None = None
-        """File not_finite.safetensors of a run: repeat the saved step, name the non-finite values, and skip the checks."""
-        device: str = "auto"
-        """Device for --repeat: auto, cpu or cuda."""
 
+    if any(a.partition("=")[0] == "--repeat" for a in arguments):
+        raise UsageError("--repeat was removed: the error of the fit itself names step, view, loss term and tensors")
     a = parse_flags(Doctor, arguments, "warpgs doctor", about)
-    if a.repeat is None and a.device != "auto":
-        raise UsageError("--device requires --repeat")
-    if a.repeat is not None:
-        from warpgs.pipeline.run.commands import repeat_failed_step
-
-        for line in repeat_failed_step(a.repeat, a.device):
-            say(line)
-        return 0
     if a.warm:
         with fast_imports():
             from warpgs.pipeline.run.precompile import print_warming

@@ -15,7 +15,7 @@ SWITCHES = ("help", "help-all")
 """Flags of the farm that take no value."""
 
 
-def run_farm(arguments: list[str], about: str) -> int:
+def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` describes it in its help."""
     import tyro
 

@@ -7,7 +7,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import MAX_THREADS, check_range, flags_of, listed, load_own, parse_flags, settings_of, word_after
+from warpgs.app.flags import (
+    MAX_THREADS,
+    MAX_WHOLE,
+    check_range,
+    flags_of,
+    listed,
+    load_own,
+    parse_flags,
+    settings_of,
+    word_after,
+)
 from warpgs.device import parse_bytes
 from warpgs.errors import UsageError
 from warpgs.io.folder import READERS
@@ -47,6 +57,8 @@ def scene_of(flags: Any, path: str) -> SceneRequest:
         UsageError: There is no such reader.
     """
     asked = settings_of(SceneRequest, flags)
+    if asked.downscale is not None:
+        check_range("--downscale", asked.downscale, 1, MAX_WHOLE)
     if asked.reader is not None:
         reader = asked.reader
         load_own(READERS.kind, reader, lambda: READERS.load(reader))
@@ -64,30 +76,27 @@ CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view"
 """Flags that may accompany --resume when a run keeps its settings, and the number of values of each."""
 
 
-def _request_type() -> type:
-    """Return the dataclass of the flags that are not settings of a fit: its input, output and machine."""
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Flags that are not settings of a fit: its input, output and machine."""
 
-    @dataclass(frozen=True, kw_only=True)
-    class Request:
-        out: Path
-        """Run folder to fill; new or empty."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-        threads: int = 0
-        """CPU threads; 0 for as many as there are cores."""
-        resume: bool = False
-        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
-        all settings from the run."""
-        lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
-        time_budget: float | None = None
-        """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
-        view: bool = False
-        """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
-        view_port: int = 8080
-        """Port of --view; 0 for any free one."""
-
-    return Request
+    out: Path
+    """Run folder to fill; new or empty."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    threads: int = 0
+    """CPU threads; 0 for as many as there are cores."""
+    resume: bool = False
+    """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
+    all settings from the run."""
+    lpips_weights: Path | None = None
+    """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+    time_budget: float | None = None
+    """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
+    view: bool = False
+    """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
+    view_port: int = 8080
+    """Port of --view; 0 for any free one."""
 
 
 def _load(registry: Registry[Any], name: str) -> type[Any]:
@@ -188,7 +197,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     own = {} if base.strategy_config is None else {flag_group(base.strategy): base.strategy_config}
     reading, unread = scene_flags(positional=True)
     fields.append(("reading", Annotated[reading, tyro.conf.arg(name="")], field(default=unread)))
-    kinds = (FitConfig, SceneRequest, _request_type())
+    kinds = (FitConfig, SceneRequest, Request)
     taken = {f.name for kind in kinds for f in dataclasses.fields(kind)} | {"config", "reading"}
     for name, settings in [*own.items(), *terms.items(), *modules.items()]:
         if name in taken:
@@ -199,7 +208,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     for name in VIEW_MODULES.names():
         about = (inspect.getdoc(VIEW_MODULES.find(name)) or "").partition("\n\n")[0]
         fields.append((name, Annotated[bool, tyro.conf.arg(help=about)], field(default=name in modules)))
-    return dataclasses.make_dataclass("Fit", fields, bases=(_request_type(),), frozen=True, kw_only=True)
+    return dataclasses.make_dataclass("Fit", fields, bases=(Request,), frozen=True, kw_only=True)
 
 
 def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
@@ -240,32 +249,21 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
     """Return the request that continues a run with its original settings."""
     from warpgs.pipeline.run.folder import stored_request
 
-    @dataclass(frozen=True, kw_only=True)
-    class Continue:
-        out: Path
-        """Run folder."""
-        resume: bool = False
-        """Continue the run."""
-        device: str | None = None
-        """auto, cpu or cuda. Default: the device of the run."""
-        threads: int = 0
-        """CPU threads; 0 for as many as there are cores."""
-        view: bool = False
-        """Show the model in a browser while it trains."""
-        view_port: int = 8080
-        """Port of --view; 0 for any free one."""
-        lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; a run does not store the file, so give it again to measure LPIPS."""
+    a = parse_flags(Request, arguments, "warpgs fit", about)
+    view_port = _machine(a)
+    request = stored_request(a.out)
+    say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    device = request.device if word_after(arguments, "--device") is None else a.device
+    return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 
-    a = parse_flags(Continue, arguments, "warpgs fit", about)
+
+def _machine(a: Any) -> int | None:
+    """Set the number of threads; return the port of the viewer, None for no viewer."""
     check_range("--threads", a.threads, 0, MAX_THREADS)
     check_range("--view-port", a.view_port, 0, 65535)
     if a.threads:
         set_threads(a.threads)
-    request = stored_request(a.out)
-    say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
-    device, view_port = a.device or request.device, a.view_port if a.view else None
-    return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
+    return a.view_port if a.view else None
 
 
 def request_of(arguments: list[str], about: str) -> FitRequest:
@@ -280,20 +278,17 @@ def request_of(arguments: list[str], about: str) -> FitRequest:
     parts = _parts(LOSS_TERMS, "--loss-terms", arguments, base.loss_terms), _view_modules(arguments, base)
     a: Any = parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")
     scene = scene_of(a.reading, a.reading.path)
-    check_range("--threads", a.threads, 0, MAX_THREADS)
-    check_range("--view-port", a.view_port, 0, 65535)
-    if a.threads:
-        set_threads(a.threads)
+    view_port = _machine(a)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
+    check_range("--steps", config.steps or 1, 1, MAX_WHOLE)
     _check_time_budget(a, arguments)
     notes = (origin_note(origin, base, config),)
     if word_after(arguments, "--preset") is None:
         say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
-    view_port = a.view_port if a.view else None
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
 
 
-def run_fit(arguments: list[str], about: str) -> int:
+def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` describes it in its help."""
     if place()[0] > 0:
         be_quiet()

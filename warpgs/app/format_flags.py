@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import either, flags_of, listed, load_own, settings_of, word_after
+from warpgs.app.flags import flags_of, listed, load_own, settings_of, word_after
 from warpgs.errors import UsageError
 from warpgs.export.base import FORMATS, Format, all_formats, find_format
 from warpgs.pipeline.run.export import Filters
@@ -83,4 +83,6 @@ def chosen_formats(a: Any, target: Path) -> list[Format]:
 
 def filters_of(a: Any) -> Filters:
     """Return the filters of parsed flags of `format_flags`."""
-    return Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)
+    if a.clean and a.no_clean:
+        raise UsageError("--clean and --no-clean exclude each other; give one of them")
+    return Filters(a.crop, a.clean or (False if a.no_clean else None), a.sh_degree, a.rotate)
