@@ -50,11 +50,7 @@ UNITS = {"B": 1} | {f"{p}{u}": b**i for i, p in enumerate("KMGT", 1) for u, b in
 
 
 def parse_bytes(text: str) -> int:
-    """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes.
-
-    Raises:
-        UsageError: The text is not a size, or the size is below one byte or not below 2^63.
-    """
+    """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes."""
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
@@ -178,10 +174,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
-    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True.
-
-    ``purpose`` may state the use of the memory, such as " for step 3".
-    """
+    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True."""
     remedy = (
         "Reduce the memory of the fit with --memory-limit or --downscale, or end other programs; --resume continues from the "
         "last checkpoint"
@@ -211,17 +204,11 @@ def machine_memory() -> Memory | None:
 
 
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
-    """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit.
-
-    Only Linux has control groups; on other systems, and without a limit, this is None. Both versions of control groups are
-    read, from the process's own group up to the root, since the limits of all of them apply (kernel documentation, cgroup-v2
-    "Memory" and cgroup-v1 "Memory Resource Controller"). Cached files that were not used lately count as free: the kernel drops
-    them first.
-
-    Args:
-        own: File that lists the process's groups; None for /proc/self/cgroup.
-        mount: Folder in which groups are mounted; None for /sys/fs/cgroup.
-    """
+    """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit."""
+    # Only Linux has control groups; on other systems, and without a limit, this is None. Both versions of control
+    # groups are read, from the process's own group up to the root, since the limits of all of them apply (kernel
+    # documentation, cgroup-v2 "Memory" and cgroup-v1 "Memory Resource Controller"). Cached files that were not used
+    # lately count as free: the kernel drops them first.
     limits, rooms = [], []
     for folder, limit_name, used_name, cache_name in _groups(own or OWN_CGROUPS, mount or CGROUPS):
         limit, used = _number(folder / limit_name), _number(folder / used_name)
@@ -312,11 +299,7 @@ class KernelCache(NamedTuple):
 
 @functools.cache
 def prepare_kernel_cache() -> KernelCache:
-    """Choose the folder, and set it in Warp's settings before `wp.init`; print a line on stderr if the folder is private.
-
-    Raises:
-        ResourceError: There is no writable folder.
-    """
+    """Choose the folder, and set it in Warp's settings before `wp.init`; print a line on stderr if the folder is private."""
     import warp
 
     chosen = choose_kernel_cache(warp.config.kernel_cache_dir)
@@ -332,14 +315,7 @@ def prepare_kernel_cache() -> KernelCache:
 
 
 def choose_kernel_cache(configured: str | None = None) -> KernelCache:
-    """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable.
-
-    Args:
-        configured: Value of ``warp.config.kernel_cache_dir``: set by the user's program, or by Warp once started.
-
-    Raises:
-        ResourceError: Neither the usual nor the private folder can be written.
-    """
+    """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable."""
     folder, refused = _usual(configured)
     if folder is not None:
         refused = _fault(folder)

@@ -40,10 +40,7 @@ def missing_package(error: Exception) -> str:
 
 
 def report_defect(error: Exception, arguments: list[str]) -> int:
-    """Store the traceback in a file for a bug report, and print one line; return the exit code.
-
-    An uninstalled dependency is not a defect of warpgs: the line then only names the package.
-    """
+    """Store the traceback in a file for a bug report, and print one line; return the exit code."""
     import tempfile
     import traceback
 
@@ -121,11 +118,7 @@ def wants_help(arguments: list[str]) -> bool:
 
 
 def help_lines(about: str) -> list[str]:
-    """Return the help of `warpgs fit` in at most 45 lines of 80 columns.
-
-    Args:
-        about: Description of the command.
-    """
+    """Return the help of `warpgs fit` in at most 45 lines of 80 columns."""
 
     def rows(pairs: list[tuple[str, str]]) -> list[str]:
         width = max(len(left) for left, _ in pairs)
@@ -198,11 +191,7 @@ def _help() -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted.
-
-    Raises:
-        SystemExit: A command has printed its help.
-    """
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted."""
     if arguments is None:
         use_utf8_names()
     with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error

@@ -323,14 +323,7 @@ def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
 
 
 def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]:
-    """Check everything that a fit and its report need.
-
-    Args:
-        tell: Called with lines on the progress.
-
-    Returns:
-        The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.
-    """
+    """Check everything that a fit and its report need."""
     with ThreadPoolExecutor(len(APART)) as pool:
         apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
         checks = [check for check in CHECKS if check not in APART]
@@ -339,15 +332,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
 
 
 def print_report(findings: list[Finding], console=None) -> int:
-    """Print the findings as a table, and the fixes below it.
-
-    Args:
-        findings: Result of `diagnose`.
-        console: A `rich.console.Console`; None for the standard output.
-
-    Returns:
-        The exit code: 0 if a fit can run, else 4.
-    """
+    """Print the findings as a table, and the fixes below it."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -385,11 +370,7 @@ def print_report(findings: list[Finding], console=None) -> int:
 
 
 def run(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help.
-
-    Raises:
-        UsageError: A flag or a value is invalid.
-    """
+    """Run the command; ``about`` describes it in its help."""
 
     @dataclass(frozen=True)
     class Doctor:

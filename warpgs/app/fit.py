@@ -36,11 +36,7 @@ from warpgs.ranks import join, place
 
 
 def scene_flags(*, positional: bool) -> tuple[type, Any]:
-    """Return the dataclass of the flags, and their defaults.
-
-    Args:
-        positional: True if the scene folder is a positional argument; False if the command has its own argument for scenes.
-    """
+    """Return the dataclass of the flags, and their defaults."""
     import tyro
 
     if positional:
@@ -51,11 +47,7 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
 
 
 def scene_of(flags: Any, path: str) -> SceneRequest:
-    """Return the request for a scene folder from parsed flags; a user-defined reader is loaded.
-
-    Raises:
-        UsageError: There is no such reader.
-    """
+    """Return the request for a scene folder from parsed flags; a user-defined reader is loaded."""
     asked = settings_of(SceneRequest, flags)
     if asked.downscale is not None:
         check_range("--downscale", asked.downscale, 1, MAX_WHOLE)
@@ -267,11 +259,7 @@ def _machine(a: Any) -> int | None:
 
 
 def request_of(arguments: list[str], about: str) -> FitRequest:
-    """Return the request for the arguments of a command line.
-
-    Raises:
-        UsageError: A flag is wrong, or a plug-in cannot be loaded.
-    """
+    """Return the request for the arguments of a command line."""
     if _names_a_run_alone(arguments):
         return _continued(arguments, about)
     base, origin = _preset(arguments)

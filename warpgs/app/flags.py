@@ -55,10 +55,7 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
 
 
 def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | None = None) -> tuple[type, Any]:
-    """Return a subclass of a settings dataclass whose fields are flags with their docstrings as help, and its defaults.
-
-    ``special`` has markers and constructors of tyro for some fields, by name.
-    """
+    """Return a subclass of a settings dataclass whose fields are flags with their docstrings as help, and its defaults."""
     import tyro
 
     hints, docs, fields, values = typing.get_type_hints(kind), field_docs(kind), [], {}

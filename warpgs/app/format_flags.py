@@ -60,15 +60,7 @@ def _found(choice: str) -> Format:
 
 
 def chosen_formats(a: Any, target: Path) -> list[Format]:
-    """Return formats to prefer: the target file's format if it has options, then the format of --format if given.
-
-    Args:
-        a: Parsed flags of `format_flags`.
-        target: The file to write.
-
-    Raises:
-        UsageError: There is no such format, or an option belongs to another format.
-    """
+    """Return formats to prefer: the target file's format if it has options, then the format of --format if given."""
     named = [] if a.format is None else [_found(a.format)]
     written = next((type(f) for f in [*named, *all_formats()] if f.fits(target)), Format)
     for group, config in _with_options(a.format).items():

@@ -53,17 +53,7 @@ class Slot:
 
 
 def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
-    """Return the slots of this machine.
-
-    Args:
-        device: auto, cpu or cuda.
-        slots: Number of slots; None: ``per_gpu`` for each GPU, or one on a CPU.
-        per_gpu: Slots of each GPU.
-
-    Raises:
-        ResourceError: CUDA was requested and is missing.
-        UsageError: More slots are requested than are possible, or than the GPUs have.
-    """
+    """Return the slots of this machine."""
     import torch
 
     kind = choose_device(device)[0].type
@@ -130,11 +120,7 @@ class LocalEngine:
             process.worker.end(SECONDS_TO_SAVE)
 
     def _compile(self, process: _Process, device: str) -> None:
-        """Compile kernels of all devices that a process sees.
-
-        Raises:
-            ResourceError: The process ends early.
-        """
+        """Compile kernels of all devices that a process sees."""
         process.worker.send(json.dumps({"kernels": device}))
         _, line = self._news.get()
         if line is None or json.loads(line).get("state") != "done":
@@ -150,11 +136,7 @@ class LocalEngine:
         return {name: process.worker.number for name, process in self._busy.items()}
 
     def start(self, job: FarmJob) -> None:
-        """Start a job in an idle process, or in a new one; before the first job, kernels are compiled.
-
-        Raises:
-            ResourceError: The kernels cannot be compiled.
-        """
+        """Start a job in an idle process, or in a new one; before the first job, kernels are compiled."""
         if not self._compiled:
             self._prepare()
         process = self._idle.pop() if self._idle else _Process(self._free.pop(), self._news)
@@ -245,24 +227,10 @@ class JobStatus:
 def run_farm(
     jobs: list[FarmJob], engine: Engine, show: Callable[[list[JobStatus]], object] = lambda _: None, *, poll: float = POLL
 ) -> list[JobStatus]:
-    """Run jobs until each is done or has failed.
-
-    A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more after the
-    others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has locked is checked
-    again later, and its result is used.
-
-    Args:
-        jobs: The jobs.
-        engine: Engine that runs the jobs; it is not closed.
-        show: Called with the status of all jobs whenever one changed, and every ``poll`` seconds.
-        poll: Time between checks of a job that another farm works on [s].
-
-    Returns:
-        The status of each job.
-
-    Raises:
-        ResourceError: A record or a lock cannot be written.
-    """
+    """Run jobs until each is done or has failed."""
+    # A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more
+    # after the others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has
+    # locked is checked again later, and its result is used.
     return _Farm(jobs, engine, show, poll).run()
 
 
@@ -410,16 +378,7 @@ def row_of(status: JobStatus) -> JobRow:
 
 
 def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None:
-    """Write index.html and results.csv of a farm.
-
-    Args:
-        folder: Folder of the results.
-        statuses: The jobs.
-        seconds: Time since the farm began [s].
-
-    Raises:
-        ResourceError: A file cannot be written.
-    """
+    """Write index.html and results.csv of a farm."""
     cards = []
     for status in statuses:
         record, job = status.record, status.job
@@ -476,13 +435,7 @@ class EngineRequest:
 
 
 def make_engine(request: EngineRequest, device: str) -> Engine:
-    """Make the engine that is requested.
-
-    Raises:
-        ResourceError: The device is missing, the cluster cannot be reached, or Slurm's private folder cannot be written.
-        UsageError: The engine is unknown or not installed, has fewer slots than requested, or other users can write to
-            ``slurm_folder``.
-    """
+    """Make the engine that is requested."""
     r = request
     if r.engine not in ENGINES:
         raise UsageError(f"--engine {r.engine!r} is not one of {', '.join(ENGINES)}")
@@ -501,20 +454,7 @@ def make_engine(request: EngineRequest, device: str) -> Engine:
 
 
 def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bool | None = None) -> list[JobStatus]:
-    """Run a farm, show its progress, and write its index.
-
-    Args:
-        jobs: The jobs, with folders below ``results``.
-        engine: Engine that runs the jobs; it is closed at the end.
-        results: Folder of the results.
-        live: As in `FarmTable`.
-
-    Returns:
-        The status of each job.
-
-    Raises:
-        ResourceError: The folder cannot be written, or no job could be started.
-    """
+    """Run a farm, show its progress, and write its index."""
     began = time.monotonic()
     shown = written = began - INDEX_INTERVAL
     count = f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}"
@@ -545,11 +485,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
 
 
 def check_failures(statuses: list[JobStatus]) -> None:
-    """Check that no job failed.
-
-    Raises:
-        ResourceError: A job failed; the message names up to five failed jobs.
-    """
+    """Check that no job failed."""
     failed = [s for s in statuses if s.state == "failed"]
     if failed:
         first = failed[0].record

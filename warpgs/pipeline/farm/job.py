@@ -62,11 +62,7 @@ def job_text(job: FarmJob) -> str:
 
 
 def job_of(text: str) -> FarmJob:
-    """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text.
-
-    Raises:
-        UsageError: The user code cannot be imported.
-    """
+    """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text."""
     values = schema.parse(text)
     r = values["request"]
     scene, config = SceneRequest(**r["scene"]), r["config"]
@@ -150,12 +146,7 @@ class ListedJob:
 
 
 def list_jobs(jobs: str) -> list[ListedJob]:
-    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file.
-
-    Raises:
-        DataError: A line of the file is not a job, or a name is not valid for a folder.
-        UsageError: There is nothing to fit, the folder is a single scene, or two jobs have the same name.
-    """
+    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file."""
     path = Path(jobs)
     if path.is_dir():
         if any(r.probe(path) is not None for r in all_readers()):
@@ -297,11 +288,7 @@ class JobRecord:
 
 
 def write_record(folder: Path, record: JobRecord) -> None:
-    """Write the record of a job.
-
-    Raises:
-        ResourceError: The record cannot be written.
-    """
+    """Write the record of a job."""
     write_json(folder / RECORD, asdict(record))
 
 
@@ -316,11 +303,7 @@ def read_job_record(folder: Path) -> JobRecord | None:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits.
-
-    Raises:
-        ResourceError: The file cannot be read.
-    """
+    """Return the SHA-256 of a file, in hexadecimal digits."""
     try:
         return input_digest(path, path.parent)
     except OSError as e:

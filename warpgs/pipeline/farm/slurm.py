@@ -68,20 +68,7 @@ class SlurmEngine:
         partition: str | None = None,
         folder: Path | None = None,
     ):
-        """Look for Slurm, and make a private folder.
-
-        Args:
-            device: cpu or cuda.
-            slots: Jobs that are queued or running at a time; None for 100.
-            threads: CPU threads of a job.
-            minutes: Time after which Slurm ends a job [min].
-            partition: Slurm's partition; None for its default.
-            folder: As the base of `private_shared_folder`.
-
-        Raises:
-            ResourceError: The private folder cannot be written.
-            UsageError: Slurm is not installed, or other users can write to the folder.
-        """
+        """Look for Slurm, and make a private folder."""
         missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
         if missing:
             raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: run warpgs on a machine of the cluster")
@@ -100,11 +87,7 @@ class SlurmEngine:
         self._told = False
 
     def start(self, job: FarmJob) -> None:
-        """Hand a job to Slurm.
-
-        Raises:
-            ResourceError: Slurm rejects it.
-        """
+        """Hand a job to Slurm."""
         number = next(self._numbers)
         text, answer, log = (self._folder / f"{number}.{kind}" for kind in ("json", "answer", "log"))
         write_text(text, job_text(job))

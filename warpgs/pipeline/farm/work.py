@@ -98,11 +98,7 @@ def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, spl
 
 
 def _set_aside(folder: Path) -> Path:
-    """Rename the folder of a run that cannot be used; no result is deleted.
-
-    Raises:
-        ResourceError: Another process writes there, or the folder cannot be moved.
-    """
+    """Rename the folder of a run that cannot be used; no result is deleted."""
     with hold_folder(folder):
         pass  # no process writes there; the lock is released first, since Windows moves no folder with an open file
     number = 1
@@ -133,23 +129,9 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the finished run that is requested.
-
-    A finished run with the same configuration, user code, data, views, kind of device and version is kept. An interrupted run
-    is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
-
-    Args:
-        request: The fit; ``out`` is its folder, ``resume`` is ignored.
-        fingerprint: Fingerprint of the scene's data.
-        split: Training and held-out views; None if no existing run can match.
-        device: cpu or cuda.
-        variants: Definitions of the required LPIPS scores by name; empty for none.
-        resolved: The settings of ``request`` with automatic ones chosen; None if no setting is automatic.
-        others: Further arguments of `fit`: on_step, verbose.
-
-    Returns:
-        The outcome. It contains the error of this run, if any, so that other runs continue.
-    """
+    """Ensure that a run folder holds the finished run that is requested."""
+    # A finished run with the same configuration, user code, data, views, kind of device and version is kept. An
+    # interrupted run is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
     try:
         record, why = _stored(request.out)
         gap = "" if record is None else _difference(record, resolved or request.config, fingerprint, split, device)
@@ -212,16 +194,7 @@ THUMBNAIL_SIDE = 480
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Run a job from its text; the job's output goes to its log.
-
-    Args:
-        text: Result of `job_text`.
-        threads: CPU threads; 0 for as many as there are.
-        on_step: As in `fit`.
-
-    Returns:
-        The state: done, failed, or held if another farm works on the job. The job's record has all other results.
-    """
+    """Run a job from its text; the job's output goes to its log."""
     if threads:
         set_threads(threads)
     job = job_of(text)
@@ -244,11 +217,7 @@ def _logged(path: Path) -> Iterator[None]:
 
 
 def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does.
-
-    Raises:
-        ResourceError: The record cannot be written.
-    """
+    """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does."""
     began, again, message = time.perf_counter(), False, ""
     source = source_stamp(Path(job.request.scene.path))
     try:
