@@ -15,7 +15,7 @@ import threading
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO, TypeVar, cast
+from typing import Any, TextIO, TypeVar, cast
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import DESCRIPTORS, FULL, readable
@@ -489,34 +489,20 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 
 
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
-    """Run a module of this package in another process, and yield the lines of its stdout as they come."""
-    with tempfile.TemporaryFile() as errors, shared_locks() as locks, _stdin_until_our_end() as stdin:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder,
-            stdin=stdin, stdout=subprocess.PIPE, stderr=errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
-        )  # fmt: skip
-        try:
-            assert process.stdout is not None
-            yield from process.stdout
-            if process.wait():
-                errors.seek(0)
-                raise ProcessFailed(process.returncode, errors.read().decode("utf-8", "replace").strip())
-        finally:
-            process.kill()
-            process.wait()
+    """Run a module of this package in ``folder``, yield the lines of its stdout, and end it once no more lines are read."""
+    # the module calls `end_with_parent`: its stdin ends when this process is killed
+    with shared_locks() as locks:
+        worker = PythonWorker(module, *arguments, folder=folder, environment=environment, locks=locks)
+    try:
+        yield from worker.lines()
+        code, errors = worker.end(None)
+        if code:
+            raise ProcessFailed(code, errors)
+    finally:
+        worker.end(0)
 
 
-class ProgramResult(NamedTuple):
-    """Outcome of a program."""
-
-    code: int
-    """Exit code; 1 if the program could not be run or took too long."""
-    output: str
-    errors: str
-    """Text of stderr, or the reason why the program could not be run or was ended."""
-
-
-def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
+def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> tuple[int, str, str]:
     """Run a program that starts this package elsewhere, and return its outcome."""
     environment = {k: v for k, v in _environment(None).items() if not k.startswith(hidden)}
     try:
@@ -525,8 +511,12 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
             errors="replace", timeout=timeout, check=False,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as e:
-        return ProgramResult(1, "", str(e))
-    return ProgramResult(done.returncode, done.stdout, done.stderr)
+        return 1, "", str(e)
+    return done.returncode, done.stdout, done.stderr
+
+
+LAST_BYTES = 10_000
+"""Bytes at the end of a process's stderr that are kept."""
 
 
 class PythonWorker:
@@ -536,12 +526,16 @@ class PythonWorker:
     stops at the end of its stdin, which also ends if the parent is killed.
     """
 
-    def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):
-        """Start the process."""
+    def __init__(
+        self, module: str, *arguments: str, folder: Path | None = None, environment: dict[str, str] | None = None,
+        locks: tuple[int, ...] = (),
+    ):  # fmt: skip
+        """Start the process in ``folder``, with more ``environment`` variables and descriptors of ``locks`` to inherit."""
         self._errors = tempfile.TemporaryFile()  # closed by `end`
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", start_new_session=True,
+            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
+            start_new_session=True,
         )  # fmt: skip
 
     @property
@@ -564,8 +558,8 @@ class PythonWorker:
         assert self._process.stdout is not None
         yield from self._process.stdout
 
-    def end(self, seconds: float) -> tuple[int, str]:
-        """Close the stdin of the process, and kill it if it still runs after ``seconds``."""
+    def end(self, seconds: float | None) -> tuple[int, str]:
+        """Close stdin, kill the process if it still runs after ``seconds``; return its exit code and the end of its stderr."""
         with contextlib.suppress(OSError):
             if self._process.stdin is not None:
                 self._process.stdin.close()
@@ -578,5 +572,5 @@ class PythonWorker:
             return self._process.returncode, ""
         with self._errors:
             self._errors.seek(0, os.SEEK_END)
-            self._errors.seek(max(0, self._errors.tell() - 2000))
+            self._errors.seek(max(0, self._errors.tell() - LAST_BYTES))
             return self._process.returncode, self._errors.read().decode("utf-8", "replace").strip()

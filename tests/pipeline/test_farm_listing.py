@@ -11,8 +11,8 @@ def test_folders_and_globs(tmp_path):
     """Each folder is a scene, hidden ones are not; equal names are told apart by the folders above."""
     for name in ("b/scene", "a/scene", ".hidden"):
         (tmp_path / name).mkdir(parents=True)
-    assert [(j.name, j.scene) for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
-    assert [j.name for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
+    assert [j[:2] for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
+    assert [j[0] for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
     with pytest.raises(UsageError, match="no scene found"):
         list_jobs(f"{tmp_path}/*/nothing")
 

@@ -400,12 +400,11 @@ def study_flags() -> type:
 def run_study_of(a: Any, variants: dict, marks: dict) -> list[str]:
     """Run the study of parsed flags; return lines for the user."""
     from warpgs.app.fit import scene_of
-    from warpgs.pipeline.farm.farm import EngineRequest
     from warpgs.pipeline.study.study import StudyRequest, run_study
 
     scenes = tuple(scene_of(a.reading, str(s)) for s in a.scenes)
     apart = a.slots is not None or a.per_gpu is not None
-    engine = EngineRequest(slots=a.slots, per_gpu=1 if a.per_gpu is None else a.per_gpu) if apart else None
+    engine = {"slots": a.slots, "per_gpu": 1 if a.per_gpu is None else a.per_gpu} if apart else None
     return run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, engine, marks))
 
 

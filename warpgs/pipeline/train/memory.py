@@ -184,7 +184,7 @@ def most_instances(gaussians: Gaussians, cameras: list[Camera], options: Rasteri
 def plan(
     layout: Layout, *, count: int, instances: int, most: int, limit: int | None, available: int, capacity_factor: float = 1.0
 ) -> tuple[MemoryPlan, Layout]:
-    """Plan a fit of ``count`` Gaussians and ``instances`` in the heaviest view, at most ``most`` Gaussians; return the layout, too."""
+    """Plan a fit of ``count`` Gaussians and ``instances`` in the heaviest view, growing to ``most``; return its layout, too."""
     cap, refused = max(most, count), False
     single = replace(layout, graphs=0)
     if limit is not None:
