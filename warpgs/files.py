@@ -125,6 +125,22 @@ DESCRIPTORS = Path("/proc/self/fd")
 
 
 @contextlib.contextmanager
+def writable(path: Path, remedy: str = "", done: str = "written", amount: str = "", note: str = "") -> Iterator[None]:
+    """Raise ResourceError where the block cannot write ``path``; it names what cannot be done with what amount, and the fix."""
+    try:
+        yield
+    except RefusedError as e:
+        raise ResourceError(f"{path}: cannot be {done}, as {e}") from e
+    except OSError as e:
+        fix = remedy or (
+            "Close the programs that have it open, or write elsewhere"
+            if WINDOWS and isinstance(e, PermissionError)
+            else "Free some disk space, or write elsewhere"
+        )
+        raise ResourceError(f"{path}: {amount}cannot be {done} ({e.strerror or e}){note}. {fix}") from e
+
+
+@contextlib.contextmanager
 def replacing(
     path: Path, check: Callable[[Path], object] | None = None, *, size: int | None = None, suffix: str = ""
 ) -> Iterator[Path]:
@@ -148,28 +164,21 @@ def _replaced(
     path: Path, size: int | None, check: Callable[[Path], object] | None = None, suffix: str = ""
 ) -> Iterator[tuple[TemporaryFile, Folder]]:
     """Give a temporary file and its folder; after the block the file is synced and checked, and replaces ``path``."""
-    try:
+    amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
+    with writable(path, amount=amount, note="; the old file is untouched"):
         with open_folder(path.parent) as folder:
             with TemporaryFile(folder, suffix) as temporary:
                 yield temporary, folder
                 os.fsync(temporary.descriptor)
                 written = os.fstat(temporary.descriptor)
-                found = written.st_size
                 if not os.path.samestat(written, folder.lstat(temporary.name)):
                     raise OSError(errno.EIO, "another file took the place of the temporary one")
-                if size is not None and found != size:  # some file systems report no error
-                    raise OSError(errno.EIO, f"only {found} of {size} bytes were written")
+                if size is not None and written.st_size != size:  # some file systems report no error
+                    raise OSError(errno.EIO, f"only {written.st_size} of {size} bytes were written")
                 if check is not None:
                     check(_reachable(folder) / temporary.name)
                 _replace(folder, temporary, path.name)
             _sync(folder)
-    except RefusedError as e:
-        raise ResourceError(f"{path}: cannot be written, as {e}") from e
-    except OSError as e:
-        amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
-        raise ResourceError(
-            f"{path}: {amount}cannot be written ({e.strerror or e}); the old file is untouched. {_remedy(e)}"
-        ) from e
 
 
 def _reachable(folder: Folder) -> Path:
@@ -185,36 +194,21 @@ def filling(folder: Path) -> Iterator[Path]:
     if os.path.realpath(target) == os.path.realpath(Path.cwd()):
         raise UsageError(f"{folder}: refusing to replace the current directory; choose another path")
     make_folder(target.parent)
-    try:
+    with writable(folder, done="created"):
         above = open_folder(target.parent)
         sweep(above)
         temporary = TemporaryFolder(above)
-    except OSError as e:
-        raise _not_made(folder, e) from e
     with temporary:
         path = target.parent / temporary.name
         with output_folder(path):
             yield path
-        try:
+        with writable(folder, done="created"):
             if above.is_link(target.name) or target.is_dir():
-                _clear(above, target.name)
+                with above.folder(target.name) as inside:
+                    sweep(inside)  # leftovers of killed writers
+                above.rmdir(target.name)
             above.rename(temporary.name, target.name)
-        except OSError as e:
-            raise _not_made(folder, e) from e
         _sync(above)
-
-
-def _clear(above: Folder, name: str) -> None:
-    """Remove an empty folder, and leftovers of killed writers in it."""
-    with above.folder(name) as inside:
-        sweep(inside)
-    above.rmdir(name)
-
-
-def _not_made(folder: Path, error: OSError) -> ResourceError:
-    if isinstance(error, RefusedError):
-        return ResourceError(f"{folder}: cannot be created, as {error}")
-    return ResourceError(f"{folder}: cannot be created ({error.strerror or error}). {_remedy(error)}")
 
 
 def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
@@ -228,12 +222,6 @@ def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
         except PermissionError:
             time.sleep(pause)
     folder.replace(temporary.name, name)
-
-
-def _remedy(error: OSError) -> str:
-    if WINDOWS and isinstance(error, PermissionError):
-        return "Close the programs that have it open, or write elsewhere"
-    return "Free some disk space, or write elsewhere"
 
 
 def _sync(folder: Folder) -> None:
@@ -298,11 +286,9 @@ def appending(path: Path) -> BinaryIO:
 
 def remove_file(path: Path) -> None:
     """Remove a file, or a link itself, if it is there."""
-    try:
-        with contextlib.suppress(FileNotFoundError), open_folder(path.parent) as folder:
+    with writable(path, "Remove it by hand", "removed"), contextlib.suppress(FileNotFoundError):
+        with open_folder(path.parent) as folder:
             folder.unlink(path.name)
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be removed ({e.strerror or e}); remove it by hand") from e
 
 
 def move_folder(folder: Path, name: str) -> Path:
@@ -315,19 +301,12 @@ def move_folder(folder: Path, name: str) -> Path:
 
 def make_folder(folder: Path) -> bool:
     """Make a folder and its missing parents; return False if the folder existed."""
-    try:
+    with writable(folder, "Choose another folder, or free some disk space", "written, as the folder cannot be created"):
         made = not os.path.exists(folder)  # False where Path.exists would raise an error
         if is_below(folder):
             open_folder(folder, make=True).close()
         else:
             folder.mkdir(parents=True, exist_ok=True)
-    except RefusedError as e:
-        raise ResourceError(f"{folder}: cannot be written, as {e}") from e
-    except OSError as e:
-        raise ResourceError(
-            f"{folder}: cannot be written, as the folder cannot be created ({e.strerror or e}); "
-            f"{'free some disk space, or ' if e.errno in FULL else ''}choose another folder"
-        ) from e
     return made
 
 
@@ -336,12 +315,8 @@ def writing_into(folder: Path) -> Iterator[bool]:
     """Make a folder if it is missing, and follow no link below it in this block; yield whether it was missing."""
     made = make_folder(folder)
     with contextlib.ExitStack() as stack:
-        try:
+        with writable(folder, "Choose another folder"):
             stack.enter_context(output_folder(folder))
-        except RefusedError as e:
-            raise ResourceError(f"{folder}: cannot be written, as {e}") from e
-        except OSError as e:
-            raise ResourceError(f"{folder}: cannot be written ({e.strerror or e}); choose another folder") from e
         yield made
 
 

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -56,7 +55,9 @@ class Folder:
 
     def __init__(self, path: Path, descriptor: int | None):
         """Take the path of the folder and its descriptor, None where the system has no descriptors of folders."""
-        self.path, self.descriptor = path, descriptor
+        self.path, self.descriptor, self.blocks = path, descriptor, 0
+        status = os.stat(path) if descriptor is None else os.fstat(descriptor)
+        self.identity = status.st_dev, status.st_ino
 
     def __enter__(self) -> Folder:
         return self
@@ -165,17 +166,8 @@ class Folder:
                 raise
 
 
-@dataclass
-class _Root:
-    """A folder that is open for a block."""
-
-    path: Path
-    folder: Folder
-    identity: tuple[int, int]
-    blocks: int = 0
-
-
-_ROOTS: dict[tuple[str, ...], _Root] = {}
+_ROOTS: dict[tuple[str, ...], Folder] = {}
+"""Folders that are open for blocks, by the parts of their paths."""
 _LOCK = threading.RLock()
 
 
@@ -186,10 +178,9 @@ def output_folder(folder: Path) -> Iterator[None]:
     # its place during the block, the next write is rejected.
     path = folder.absolute()
     with _LOCK:
-        root = _ROOTS.get(path.parts)
-        if root is None:
-            opened = open_folder(path)
-            root = _ROOTS[path.parts] = _Root(path, opened, _identity(opened))
+        if path.parts not in _ROOTS:
+            _ROOTS[path.parts] = open_folder(path)
+        root = _ROOTS[path.parts]
         root.blocks += 1
     try:
         yield
@@ -198,7 +189,7 @@ def output_folder(folder: Path) -> Iterator[None]:
             root.blocks -= 1
             if not root.blocks:
                 del _ROOTS[path.parts]
-                root.folder.close()
+                root.close()
 
 
 def is_below(path: Path) -> bool:
@@ -218,7 +209,7 @@ def open_folder(path: Path, make: bool = False) -> Folder:
         with found as above:
             found = _entered(above, path.parts[i], make)
         inner = _ROOTS.get(path.parts[: i + 1])
-        if inner is not None and _identity(found) != inner.identity:
+        if inner is not None and found.identity != inner.identity:
             found.close()
             raise _replaced(inner.path)
     return found
@@ -240,13 +231,13 @@ def _opened(name: str, more: int, at: int | None) -> int:
         return os.open(name, SEARCHED | more, dir_fd=at)
 
 
-def _outermost(path: Path) -> _Root | None:
+def _outermost(path: Path) -> Folder | None:
     """Return the outermost open folder that is the path or above it."""
     parts = path.parts
     return next((_ROOTS[parts[:i]] for i in range(1, len(parts) + 1) if parts[:i] in _ROOTS), None) if _ROOTS else None
 
 
-def _again(root: _Root) -> Folder:
+def _again(root: Folder) -> Folder:
     """Open an open folder again, after a check that its path still names this folder."""
     try:
         now = os.stat(root.path)
@@ -254,7 +245,7 @@ def _again(root: _Root) -> Folder:
         raise _replaced(root.path) from e
     if (now.st_dev, now.st_ino) != root.identity:
         raise _replaced(root.path)
-    return Folder(root.path, None if WINDOWS else _opened(".", 0, root.folder.descriptor))
+    return Folder(root.path, None if WINDOWS else _opened(".", 0, root.descriptor))
 
 
 def _entered(above: Folder, name: str, make: bool) -> Folder:
@@ -269,12 +260,6 @@ def _entered(above: Folder, name: str, make: bool) -> Folder:
     with contextlib.suppress(FileExistsError):  # of another process, just now
         above.mkdir(name)
     return above.folder(name)
-
-
-def _identity(folder: Folder) -> tuple[int, int]:
-    """Return the numbers that identify a folder to the system."""
-    found = os.stat(folder.path) if folder.descriptor is None else os.fstat(folder.descriptor)
-    return found.st_dev, found.st_ino
 
 
 def _link(path: Path) -> RefusedError:

@@ -22,8 +22,8 @@ from filelock import FileLock, Timeout, lock_descriptor
 
 from warpgs import schema
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
-from warpgs.files import LOCK, remove_leftovers, writing_into
-from warpgs.folders import NO_LOCKS, Folder, RefusedError, cache_home, open_folder, sweep_temporary_files
+from warpgs.files import LOCK, remove_leftovers, writable, writing_into
+from warpgs.folders import NO_LOCKS, Folder, cache_home, open_folder, sweep_temporary_files
 
 
 def open_to_others(folder: Path, depth: int = 0) -> Path | None:
@@ -159,15 +159,8 @@ def _held(folder: Folder) -> Iterator[bool]:
 
 def _open(folder: Folder) -> BinaryIO:
     """Open a lock file to read and write, made if it is missing."""
-    try:
+    with writable(folder.path, f"Its lock {LOCK} cannot be opened: make the folder writable, or choose another one"):
         return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
-    except RefusedError as e:
-        raise ResourceError(f"{folder.path}: cannot be written, as {e}") from e
-    except OSError as e:
-        raise ResourceError(
-            f"{folder.path}: cannot be written, as its lock {LOCK} cannot be opened ({e.strerror or e}); choose another "
-            "folder, or make this one writable"
-        ) from e
 
 
 def _lock(file: BinaryIO, folder: Path) -> bool:

@@ -217,14 +217,11 @@ def own_frame(error: BaseException) -> str:
 
 def module_of(where: str) -> ModuleType:
     """Import the module of a dotted name, or the .py file of a path, which runs its code; return the module."""
-    return _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
-
-
-def _import_module(name: str) -> ModuleType:
-    """Import a module by its full dotted name."""
-    if not name or name.startswith("."):
-        raise ImportError(f"{name!r} is not a full module name")
-    return importlib.import_module(name)
+    if where.endswith(".py"):
+        return _load_file(Path(where))
+    if not where or where.startswith("."):
+        raise ImportError(f"{where!r} is not a full module name")
+    return importlib.import_module(where)
 
 
 def _load_file(path: Path) -> ModuleType:

@@ -27,11 +27,6 @@ FITTING = ("fit", "farm", "compare", "ablate")
 """Commands that fit, and take the flags of a fit."""
 
 
-def report_no_memory(error: Exception, command: str) -> int:
-    """Print that the memory is exhausted, and the fix; return the exit code."""
-    return last_words(f"warpgs: {no_memory_message(error, fitting=command in FITTING)}", ResourceError.exit_code)
-
-
 def missing_package(error: Exception) -> str:
     """Return the package that an import of warpgs's own code did not find; empty for other errors."""
     name = error.name or "" if isinstance(error, ModuleNotFoundError) and not own_frame(error) else ""
@@ -110,11 +105,6 @@ SCENE = (
     "or photographs or a video; fit then finds the poses",
 )
 """Description of the positional argument."""
-
-
-def wants_help(arguments: list[str]) -> bool:
-    """Return whether the arguments after `fit` request the short help."""
-    return any(word in ("-h", "--help") for word in arguments)
 
 
 def help_lines(about: str) -> list[str]:
@@ -223,7 +213,7 @@ def _run(arguments: list[str]) -> int:
         if name not in COMMANDS:
             hint = did_you_mean(name, COMMANDS) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
-        if name == "fit" and wants_help(arguments[1:]):  # before the import, which costs seconds
+        if name == "fit" and {"-h", "--help"} & {*arguments}:  # before the import, which costs seconds
             for line in help_lines(COMMANDS[name]):
                 say(line)
             return 0
@@ -241,7 +231,9 @@ def _run(arguments: list[str]) -> int:
         with ignored_signals():
             return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
     except Exception as e:
-        return report_no_memory(e, name) if is_out_of_memory(e) else report_defect(e, arguments)
+        if is_out_of_memory(e):
+            return last_words(f"warpgs: {no_memory_message(e, fitting=name in FITTING)}", ResourceError.exit_code)
+        return report_defect(e, arguments)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -237,26 +237,10 @@ NOWHERE = "(choose one)"
 BOX, GIZMO = "/crop/box", "/crop"
 
 
-class Shown(Protocol):
-    """Methods of the window that the panel calls."""
-
-    def redraw(self) -> None:
-        """Send the current image."""
-
-    def step_into(self, name: str, client: Any) -> None:
-        """Move a browser's camera to the model's camera of that name."""
-
-    def reset(self, client: Any) -> None:
-        """Move a browser's camera back to where pages start."""
-
-    def camera_of(self, client: Any, side: int | None = None) -> Camera:
-        """Return a browser's camera."""
-
-
 class Panel:
     """Controls that all browsers share."""
 
-    def __init__(self, server: viser.ViserServer, content: Content, window: Shown, maps: bool):
+    def __init__(self, server: viser.ViserServer, content: Content, window: Window, maps: bool):
         """Make the controls that are useful for the model."""
         self.server, self.content, self.window = server, content, window
         self.keyframes: list[dict[str, Any]] = []

@@ -16,7 +16,7 @@ import numpy as np
 
 from warpgs import schema
 from warpgs.device import is_out_of_memory, no_memory_message
-from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError, WarpgsError
+from warpgs.errors import DataError, FolderHeldError, UsageError, WarpgsError
 from warpgs.files import (
     LOCK,
     appending,
@@ -26,6 +26,7 @@ from warpgs.files import (
     read_file,
     remove_file,
     remove_leftovers,
+    writable,
     write_bytes,
     writing_into,
 )
@@ -104,10 +105,8 @@ def _set_aside(folder: Path) -> Path:
     number = 1
     while os.path.lexists(target := folder.with_name(f"{folder.name}.old{number}")):
         number += 1
-    try:
+    with writable(folder, "Move it by hand", f"moved to {target.name}"):
         return move_folder(folder, target.name)
-    except OSError as e:
-        raise ResourceError(f"{folder}: cannot be moved to {target.name} ({e.strerror or e}); move it by hand") from e
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
@@ -208,10 +207,8 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
 @contextlib.contextmanager
 def _logged(path: Path) -> Iterator[None]:
     """Append all output of the block to a log, including that of native libraries."""
-    try:
+    with writable(path):
         file = appending(path)
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be written ({e.strerror or e}); write elsewhere, or free some disk space") from e
     with file, output_to(file.fileno()):
         yield
 
