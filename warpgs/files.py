@@ -133,11 +133,11 @@ def writable(path: Path, remedy: str = "", done: str = "written", amount: str = 
         raise ResourceError(f"{path}: cannot be {done}, as {e}") from e
     except OSError as e:
         fix = remedy or (
-            "Close the programs that have it open, or write elsewhere"
+            "close the programs that have it open, or write elsewhere"
             if WINDOWS and isinstance(e, PermissionError)
-            else "Free some disk space, or write elsewhere"
+            else "free some disk space, or write elsewhere"
         )
-        raise ResourceError(f"{path}: {amount}cannot be {done} ({e.strerror or e}){note}. {fix}") from e
+        raise ResourceError(f"{path}: {amount}cannot be {done} ({e.strerror or e}){note}; {fix}") from e
 
 
 @contextlib.contextmanager
@@ -286,7 +286,7 @@ def appending(path: Path) -> BinaryIO:
 
 def remove_file(path: Path) -> None:
     """Remove a file, or a link itself, if it is there."""
-    with writable(path, "Remove it by hand", "removed"), contextlib.suppress(FileNotFoundError):
+    with writable(path, "remove it by hand", "removed"), contextlib.suppress(FileNotFoundError):
         with open_folder(path.parent) as folder:
             folder.unlink(path.name)
 
@@ -301,7 +301,7 @@ def move_folder(folder: Path, name: str) -> Path:
 
 def make_folder(folder: Path) -> bool:
     """Make a folder and its missing parents; return False if the folder existed."""
-    with writable(folder, "Choose another folder, or free some disk space", "written, as the folder cannot be created"):
+    with writable(folder, "choose another folder, or free some disk space", "written, as the folder cannot be created"):
         made = not os.path.exists(folder)  # False where Path.exists would raise an error
         if is_below(folder):
             open_folder(folder, make=True).close()
@@ -315,7 +315,7 @@ def writing_into(folder: Path) -> Iterator[bool]:
     """Make a folder if it is missing, and follow no link below it in this block; yield whether it was missing."""
     made = make_folder(folder)
     with contextlib.ExitStack() as stack:
-        with writable(folder, "Choose another folder"):
+        with writable(folder, "choose another folder"):
             stack.enter_context(output_folder(folder))
         yield made
 

@@ -159,7 +159,7 @@ def _held(folder: Folder) -> Iterator[bool]:
 
 def _open(folder: Folder) -> BinaryIO:
     """Open a lock file to read and write, made if it is missing."""
-    with writable(folder.path, f"Its lock {LOCK} cannot be opened: make the folder writable, or choose another one"):
+    with writable(folder.path, f"make the folder and its lock {LOCK} writable, or choose another folder"):
         return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
 
 

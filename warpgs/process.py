@@ -240,35 +240,28 @@ def accept_all_letters() -> None:
 
 
 @contextlib.contextmanager
-def hidden_stderr() -> Iterator[None]:
-    """Hide the output to stderr in the block, also that of native libraries and other threads."""
+def output_to(descriptor: int, numbers: tuple[int, ...] = (1, 2)) -> Iterator[None]:
+    """Send stdout (1) and stderr (2) in the block to an open file, also for native libraries and other threads."""
     open_missing_descriptors()
-    _flush(2)
-    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 2)
+    _flush(*numbers)
+    saved = [os.dup(number) for number in numbers]
     try:
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
-
-
-@contextlib.contextmanager
-def output_to(descriptor: int) -> Iterator[None]:
-    """Send stdout and stderr in the block to an open file, also for native libraries and other threads."""
-    open_missing_descriptors()
-    _flush(1, 2)
-    saved = [os.dup(number) for number in (1, 2)]
-    try:
-        for number in (1, 2):
+        for number in numbers:
             os.dup2(descriptor, number)
         yield
     finally:
-        _flush(1, 2)
-        for number, old in zip((1, 2), saved, strict=True):
+        _flush(*numbers)
+        for number, old in zip(numbers, saved, strict=True):
             os.dup2(old, number)
             os.close(old)
+
+
+@contextlib.contextmanager
+def hidden_stderr() -> Iterator[None]:
+    """Hide the output to stderr in the block, also that of native libraries and other threads."""
+    open_missing_descriptors()  # the null device must not become stdout or stderr
+    with open(os.devnull, "wb") as null, output_to(null.fileno(), (2,)):
+        yield
 
 
 def _flush(*numbers: int) -> None:

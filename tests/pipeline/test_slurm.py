@@ -210,7 +210,7 @@ def test_commands_are_called_without_a_shell(tmp_path, monkeypatch, name):
     """Their environment names no folder to import from but the package's, and hides no jobs; a missing one is a failure."""
     monkeypatch.setenv("SQUEUE_STATES", "RUNNING")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert slurm._call(name).code == 1
+    assert slurm._call(name)[0] == 1
     (tmp_path / name).write_text('#!/bin/sh\nread -r line\necho "$1 $line $PYTHONSAFEPATH $SQUEUE_STATES."\n')
     (tmp_path / name).chmod(0o755)
-    assert slurm._call(name, "$(id)", script="text\n").output == "$(id) text 1 .\n"
+    assert slurm._call(name, "$(id)", script="text\n")[1] == "$(id) text 1 .\n"

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -153,34 +154,28 @@ def _choices() -> str:
     return "\n\n".join(listed(title, about) for title, about in lines.items())
 
 
-def _size() -> Any:
-    """Return the specification of a flag for a size in bytes, such as 2GiB."""
+def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
+    """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
     import tyro
 
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="SIZE", instance_from_str=lambda words: parse_bytes(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, int),
-        str_from_instance=lambda value: ["none" if value is None else f"{value}B"],
+        nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
     )  # fmt: skip
 
 
 def _names(parts: Parts) -> Any:
-    """Return the specification of a flag that names parts of a registry; their settings are flags of their own."""
-    import tyro
-
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(parts.values()),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda value: [",".join(t.name for t in value) or "none"],
-    )  # fmt: skip
+    """Return the rule of a flag that names parts of a registry; their settings are flags of their own."""
+    return _read_by("NAME,...", lambda _: tuple(parts.values()), tuple, lambda v: ",".join(t.name for t in v) or "none")
 
 
 def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
     import tyro
 
+    size = _read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
     special = {
-        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
+        "memory_limit": (size,), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
         "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
     }  # fmt: skip
     chosen = dataclasses.replace(base, loss_terms=tuple(terms.values()), view_modules=tuple(modules.values()))

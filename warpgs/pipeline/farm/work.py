@@ -105,7 +105,7 @@ def _set_aside(folder: Path) -> Path:
     number = 1
     while os.path.lexists(target := folder.with_name(f"{folder.name}.old{number}")):
         number += 1
-    with writable(folder, "Move it by hand", f"moved to {target.name}"):
+    with writable(folder, "move it by hand", f"moved to {target.name}"):
         return move_folder(folder, target.name)
 
 
