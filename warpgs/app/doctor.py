@@ -17,7 +17,7 @@ from typing import Literal
 
 from warpgs.app.flags import call
 from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
-from warpgs.errors import ResourceError, UsageError, install_extras
+from warpgs.errors import ResourceError, install_extras
 from warpgs.process import counted, fast_imports, hidden_stderr, printable
 from warpgs.report.progress import Stages, waiting
 
@@ -369,6 +369,4 @@ def run(arguments: list[str], about: str) -> int:
         stages.clear()
         return print_report(findings)
 
-    if any(a.partition("=")[0] == "--repeat" for a in arguments):
-        raise UsageError("--repeat was removed: the error of the fit itself names step, view, loss term and tensors")
     return call(doctor, arguments, "warpgs doctor", about)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 from warpgs.errors import UsageError, WarpgsError, field_docs
 from warpgs.process import say
 
-REMOVED: dict[str, str] = {}
+REMOVED = {"--repeat": "the error of the fit itself names step, view, loss term and tensors"}
 """What replaces flags that are gone, by their names with dashes."""
 MAX_THREADS = 4096
 """Most threads that a flag takes."""
