@@ -216,7 +216,7 @@ def test_mistakes_get_one_line_and_their_exit_code(scene, run, tmp_path, capsys)
     out = str(tmp_path / "new")
     assert "unknown command 'train'; choose one of demo" in failure(capsys, 2, "train")
     assert "unknown command 'rendr'; did you mean render?" in failure(capsys, 2, "rendr")
-    assert "--ouut" in (text := failure(capsys, 2, "mesh", str(run), "--ouut", out)) and "`warpgs mesh --help`" in text
+    assert "--ouut" in (text := failure(capsys, 2, "mesh", str(run), "--ouut", out)) and "`warpgs mesh --help-all`" in text
     assert "--views INT" in failure(capsys, 2, "demo", "d", "--viewz", "3")
     assert "--height must be a number from 32 to 8,192, not 16" in failure(capsys, 2, "demo", "d", "--height", "16")
     assert "--init.fill-px" in failure(capsys, 2, "fit", str(scene), "--out", out, "--init.fill_pz=3")

@@ -10,7 +10,7 @@ import pytest
 from warpgs.app import cli
 from warpgs.app.cli import COMMANDS, GROUPS, main
 from warpgs.app.fit import request_of
-from warpgs.app.flags import REMOVED
+from warpgs.app.flags import REMOVED, parse_flags
 from warpgs.io.folder import READERS, Reader
 from warpgs.io.load import SPECS
 from warpgs.kernels.cameras import CAMERA_MODELS, CameraModel
@@ -56,6 +56,27 @@ def test_the_help_of_a_command_is_that_of_the_parser(capsys):
                 main([*name.split(), word])
             text = capsys.readouterr().out
             assert end.value.code == 0 and [part for part in stated if part not in text] == [], name
+
+
+@dataclasses.dataclass(frozen=True)
+class Open:
+    """Settings that may be left open."""
+
+    switch: bool | None = True
+    whole: int | None = 1
+    number: float | None = 1.0
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("--switch none --whole none --number None", Open(None, None, None)),
+        ("--switch true --whole 3", Open(True, 3)),
+        ("--switch False --number 2", Open(False, 1, 2.0)),
+    ],
+)
+def test_open_settings_take_none_and_switches_in_any_case(words, found):
+    assert parse_flags(Open, words.split(), "warpgs fit", "") == found
 
 
 def test_a_removed_flag_names_what_replaces_it(capsys, monkeypatch):

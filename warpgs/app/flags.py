@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import io
 import traceback
+import types
 import typing
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeVar
@@ -33,6 +34,27 @@ def call(command: Callable[..., Any], arguments: list[str], program: str, descri
     return parse_flags(later, arguments, program, description)()
 
 
+def _open_value(info: Any) -> Any:
+    """Return tyro's rule for a number or switch that may be None, which takes none, true and false in any case."""
+    import tyro
+
+    kinds = typing.get_args(info.type)
+    kind = next((k for k in (int, float, bool) if set(kinds) == {k, types.NoneType}), None)
+    if kind is None:
+        return None
+    words = {"none": None} | ({"true": True, "false": False} if kind is bool else {})
+
+    def read(given: list[str]) -> Any:
+        if given[0].lower() not in words and kind is bool:
+            raise ValueError(f"expected true, false or none, got {given[0]!r}")
+        return words[given[0].lower()] if given[0].lower() in words else kind(given[0])
+
+    return tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1, metavar="|".join([*words, *([] if kind is bool else [kind.__name__.upper()])]), instance_from_str=read,
+        is_instance=lambda value: value is None or isinstance(value, (int, kind)), str_from_instance=lambda v: [str(v).lower()],
+    )  # fmt: skip
+
+
 def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, description: str) -> Any:
     """Return the instance of a dataclass of flags for the arguments of a command line."""
     import tyro
@@ -42,16 +64,17 @@ def parse_flags(kind: Callable[..., Any], arguments: list[str], program: str, de
         if flag in REMOVED:
             raise UsageError(f"{flag} was removed: {REMOVED[flag]}")
     words = ["--help" if word == "--help-all" else word for word in arguments]
-    complaint = io.StringIO()
+    complaint, registry = io.StringIO(), tyro.constructors.ConstructorRegistry()
+    registry.primitive_rule(_open_value)
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(kind, args=words, prog=program, description=description)
+            return tyro.cli(kind, args=words, prog=program, description=description, registry=registry)
     except SystemExit as e:
         if not e.code:  # after the help
             raise
     for line in complaint.getvalue().splitlines():
         say(line, error=True)
-    raise UsageError(f"wrong arguments, as shown above; `{program} --help` lists them")
+    raise UsageError(f"wrong arguments, as shown above; `{program} --help-all` lists them")
 
 
 def flags_of(kind: type, default: Any, special: Mapping[str, tuple[Any, ...]] | None = None) -> tuple[type, Any]:
