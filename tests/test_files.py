@@ -99,7 +99,7 @@ def test_windows_replaces_no_open_file_at_once(tmp_path, monkeypatch):
     write_bytes(path, b"new")
     assert path.read_bytes() == b"new" and waits == list(files.PAUSES[:2])
     monkeypatch.setattr(files.os, "replace", refuse(99))
-    with pytest.raises(ResourceError, match="Close the programs that have it open"):
+    with pytest.raises(ResourceError, match="close the programs that have it open"):
         write_bytes(path, b"newer")
     assert path.read_bytes() == b"new" and list(tmp_path.iterdir()) == [path]
 

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.folders import cache_home, private_folder
@@ -50,11 +50,7 @@ UNITS = {"B": 1} | {f"{p}{u}": b**i for i, p in enumerate("KMGT", 1) for u, b in
 
 
 def parse_bytes(text: str) -> int:
-    """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes.
-
-    Raises:
-        UsageError: The text is not a size, or the size is below one byte or not below 2^63.
-    """
+    """Return a size such as 2GiB, 512 MB or 1.5GiB in bytes."""
     found = re.fullmatch(r"\s*([0-9]+(?:\.[0-9]+)?|\.[0-9]+)\s*([A-Za-z]+)\s*", text)
     units = {u.lower(): b for u, b in UNITS.items()}
     if not found or found[2].lower() not in units:
@@ -149,11 +145,8 @@ NO_MEMORY = (
 """Parts of the messages of torch, Warp, OpenCV, ONNX Runtime, numpy and C++ on lack of memory, in lower case."""
 
 
-class Memory(NamedTuple):
-    """Installed and available bytes; cached files that the system would drop count as available."""
-
-    installed: int
-    available: int
+Memory = tuple[int, int]
+"""Installed and available bytes; cached files that the system would drop count as available."""
 
 
 def available_bytes(device: torch.device) -> int:
@@ -163,7 +156,7 @@ def available_bytes(device: torch.device) -> int:
 
         free, _ = torch.cuda.mem_get_info(device)
         return free + torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-    return _machine_or_assumed().available
+    return _machine_or_assumed()[1]
 
 
 def is_out_of_memory(error: BaseException) -> bool:
@@ -178,10 +171,7 @@ def is_out_of_memory(error: BaseException) -> bool:
 
 
 def no_memory_message(error: BaseException, purpose: str = "", *, fitting: bool = True) -> str:
-    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True.
-
-    ``purpose`` may state the use of the memory, such as " for step 3".
-    """
+    """Return the message for a lack of memory, with remedies; these name flags of the fit if ``fitting`` is True."""
     remedy = (
         "Reduce the memory of the fit with --memory-limit or --downscale, or end other programs; --resume continues from the "
         "last checkpoint"
@@ -199,7 +189,7 @@ def installed_bytes(device: torch.device) -> int:
         import torch
 
         return torch.cuda.get_device_properties(device).total_memory
-    return _machine_or_assumed().installed
+    return _machine_or_assumed()[0]
 
 
 def machine_memory() -> Memory | None:
@@ -207,21 +197,15 @@ def machine_memory() -> Memory | None:
     found = [m for m in (_system_memory(), container_memory()) if m is not None]
     if not found:
         return None
-    return Memory(min(m.installed for m in found), max(0, min(m.available for m in found)))
+    return (min(total for total, _ in found), max(0, min(free for _, free in found)))
 
 
 def container_memory(own: Path | None = None, mount: Path | None = None) -> Memory | None:
-    """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit.
-
-    Only Linux has control groups; on other systems, and without a limit, this is None. Both versions of control groups are
-    read, from the process's own group up to the root, since the limits of all of them apply (kernel documentation, cgroup-v2
-    "Memory" and cgroup-v1 "Memory Resource Controller"). Cached files that were not used lately count as free: the kernel drops
-    them first.
-
-    Args:
-        own: File that lists the process's groups; None for /proc/self/cgroup.
-        mount: Folder in which groups are mounted; None for /sys/fs/cgroup.
-    """
+    """Return the lowest memory limit of this process's control groups, and the least memory that is left below a limit."""
+    # Only Linux has control groups; on other systems, and without a limit, this is None. Both versions of control
+    # groups are read, from the process's own group up to the root, since the limits of all of them apply (kernel
+    # documentation, cgroup-v2 "Memory" and cgroup-v1 "Memory Resource Controller"). Cached files that were not used
+    # lately count as free: the kernel drops them first.
     limits, rooms = [], []
     for folder, limit_name, used_name, cache_name in _groups(own or OWN_CGROUPS, mount or CGROUPS):
         limit, used = _number(folder / limit_name), _number(folder / used_name)
@@ -229,7 +213,7 @@ def container_memory(own: Path | None = None, mount: Path | None = None) -> Memo
             continue
         limits.append(limit)
         rooms.append(limit if used is None else limit - max(0, used - _row(folder / "memory.stat", cache_name)))
-    return Memory(min(limits), min(rooms)) if limits else None
+    return (min(limits), min(rooms)) if limits else None
 
 
 def _groups(own: Path, mount: Path) -> Iterator[tuple[Path, str, str, str]]:
@@ -253,7 +237,7 @@ def _system_memory() -> Memory | None:
         import psutil
 
         found = psutil.virtual_memory()
-        return Memory(int(found.total), int(found.available))
+        return (int(found.total), int(found.available))
     except (ImportError, AttributeError, KeyError, OSError, RuntimeError, ValueError):
         return None
 
@@ -262,7 +246,7 @@ def _machine_or_assumed() -> Memory:
     found = machine_memory()
     if found is None:
         _say_assumed()
-        return Memory(ASSUMED_BYTES, ASSUMED_BYTES)
+        return (ASSUMED_BYTES, ASSUMED_BYTES)
     return found
 
 
@@ -301,54 +285,34 @@ def _row(path: Path, name: str) -> int:
 REMEDY = "Set WARP_CACHE_PATH to a folder of your own to keep compiled kernels"
 
 
-class KernelCache(NamedTuple):
-    """Folder of compiled kernels."""
-
-    folder: Path
-    """Folder, without the subfolder that names Warp's version."""
-    refused: str
-    """Reason why the usual folder is not used; empty if it is used."""
-
-
 @functools.cache
-def prepare_kernel_cache() -> KernelCache:
-    """Choose the folder, and set it in Warp's settings before `wp.init`; print a line on stderr if the folder is private.
-
-    Raises:
-        ResourceError: There is no writable folder.
-    """
+def prepare_kernel_cache() -> tuple[Path, str]:
+    """Choose the folder, and set it in Warp's settings before `wp.init`; print a line on stderr if the folder is private."""
     import warp
 
-    chosen = choose_kernel_cache(warp.config.kernel_cache_dir)
-    if chosen.refused:
+    folder, refused = choose_kernel_cache(warp.config.kernel_cache_dir)
+    if refused:
         say(
-            f"warpgs: {chosen.refused}; kernels are compiled into {chosen.folder} for this process only, which takes a "
+            f"warpgs: {refused}; kernels are compiled into {folder} for this process only, which takes a "
             f"minute or two. {REMEDY}",
             error=True,
         )
-    if chosen.refused or warp.config.kernel_cache_dir is None:
-        warp.config.kernel_cache_dir = str(chosen.folder)
-    return chosen
+    if refused or warp.config.kernel_cache_dir is None:
+        warp.config.kernel_cache_dir = str(folder)
+    return folder, refused
 
 
-def choose_kernel_cache(configured: str | None = None) -> KernelCache:
-    """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable.
-
-    Args:
-        configured: Value of ``warp.config.kernel_cache_dir``: set by the user's program, or by Warp once started.
-
-    Raises:
-        ResourceError: Neither the usual nor the private folder can be written.
-    """
+def choose_kernel_cache(configured: str | None = None) -> tuple[Path, str]:
+    """Choose ``configured``, else WARP_CACHE_PATH, else Warp's default; a private folder if the chosen one is unusable."""
     folder, refused = _usual(configured)
     if folder is not None:
         refused = _fault(folder)
         if not refused:
-            return KernelCache(folder, "")
+            return folder, ""
     try:
         own = private_folder() / "kernels"
         own.mkdir(exist_ok=True)
-        return KernelCache(own, refused)
+        return own, refused
     except (ResourceError, OSError) as e:
         raise ResourceError(f"no folder for compiled kernels can be written: {refused}, and {e}. {REMEDY}") from e
 

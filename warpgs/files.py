@@ -45,17 +45,7 @@ PIECE = 1 << 20
 
 
 def open_input(path: str | os.PathLike[str], below: Path | None = None) -> BinaryIO:
-    """Open a regular file for reading in binary mode.
-
-    Args:
-        path: The file.
-        below: Folder above the file, such as a run folder; no link between the two is followed. None for a file that the user
-            names, which may be a link.
-
-    Raises:
-        OSError: The file is missing, unreadable, a folder, a link that is not followed, or not a regular file (a pipe, a
-            socket, a device).
-    """
+    """Open a regular file for reading in binary mode."""
     if below is not None:
         return open_file(Path(path), below)
     path = os.fspath(path)
@@ -81,11 +71,7 @@ def _check_kind(mode: int, path: str) -> None:
 
 
 def read_input(path: str | os.PathLike[str], most: int = MAX_BYTES, below: Path | None = None) -> bytes:
-    """Return the contents of a regular file of at most ``most`` bytes; ``below`` as in `open_input`.
-
-    Raises:
-        OSError: The file cannot be opened or read, is not a regular file, or is larger than ``most``.
-    """
+    """Return the contents of a regular file of at most ``most`` bytes; ``below`` as in `open_input`."""
     with open_input(path, below) as file:
         size = os.fstat(file.fileno()).st_size
         if size > most:
@@ -101,21 +87,13 @@ def read_input(path: str | os.PathLike[str], most: int = MAX_BYTES, below: Path 
 
 
 def read_start(path: str | os.PathLike[str], count: int) -> bytes:
-    """Return the first bytes of a regular file, at most ``count``.
-
-    Raises:
-        OSError: The file cannot be opened or read, or is not a regular file.
-    """
+    """Return the first bytes of a regular file, at most ``count``."""
     with open_input(path) as file:
         return file.read(count)
 
 
 def input_digest(path: str | os.PathLike[str], below: Path | None = None) -> str:
-    """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`.
-
-    Raises:
-        OSError: The file cannot be opened or read, or is not a regular file.
-    """
+    """Return the SHA-256 of a regular file, hexadecimal; ``below`` as in `open_input`."""
     with open_input(path, below) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -147,24 +125,29 @@ DESCRIPTORS = Path("/proc/self/fd")
 
 
 @contextlib.contextmanager
+def writable(path: Path, remedy: str = "", done: str = "written", amount: str = "", note: str = "") -> Iterator[None]:
+    """Raise ResourceError where the block cannot write ``path``; it names what cannot be done with what amount, and the fix."""
+    try:
+        yield
+    except RefusedError as e:
+        raise ResourceError(f"{path}: cannot be {done}, as {e}") from e
+    except OSError as e:
+        fix = remedy or (
+            "close the programs that have it open, or write elsewhere"
+            if WINDOWS and isinstance(e, PermissionError)
+            else "free some disk space, or write elsewhere"
+        )
+        raise ResourceError(f"{path}: {amount}cannot be {done} ({e.strerror or e}){note}; {fix}") from e
+
+
+@contextlib.contextmanager
 def replacing(
     path: Path, check: Callable[[Path], object] | None = None, *, size: int | None = None, suffix: str = ""
 ) -> Iterator[Path]:
-    """Give the path of a temporary file beside ``path``; the block writes the file, which then replaces ``path``.
-
-    The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error, including one in
-    the block, the temporary file is removed and an old file stays unchanged. If ``path`` is a link, the link is replaced.
-
-    Args:
-        path: File to write or to replace.
-        check: Function that reads the temporary file back and raises where it is incomplete.
-        size: Number of bytes that must be in the file at the end; None if unknown.
-        suffix: End of the temporary file's name, for libraries that take the format from it: none, .mp4 or .webm.
-
-    Raises:
-        ResourceError: The disk is full, the folder is not writable or behind a link that is not followed, or the old file is
-            open in another program on Windows.
-    """
+    """Give the path of a temporary file beside ``path``; the block writes the file, which then replaces ``path``."""
+    # The temporary file is synced to the disk and checked first; the folder is synced afterwards. On any error,
+    # including one in the block, the temporary file is removed and an old file stays unchanged. If ``path`` is a link,
+    # the link is replaced.
     with _replaced(path, size, check, suffix) as (temporary, folder):
         yield _reachable(folder) / temporary.name
 
@@ -181,28 +164,21 @@ def _replaced(
     path: Path, size: int | None, check: Callable[[Path], object] | None = None, suffix: str = ""
 ) -> Iterator[tuple[TemporaryFile, Folder]]:
     """Give a temporary file and its folder; after the block the file is synced and checked, and replaces ``path``."""
-    try:
+    amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
+    with writable(path, amount=amount, note="; the old file is untouched"):
         with open_folder(path.parent) as folder:
             with TemporaryFile(folder, suffix) as temporary:
                 yield temporary, folder
                 os.fsync(temporary.descriptor)
                 written = os.fstat(temporary.descriptor)
-                found = written.st_size
                 if not os.path.samestat(written, folder.lstat(temporary.name)):
                     raise OSError(errno.EIO, "another file took the place of the temporary one")
-                if size is not None and found != size:  # some file systems report no error
-                    raise OSError(errno.EIO, f"only {found} of {size} bytes were written")
+                if size is not None and written.st_size != size:  # some file systems report no error
+                    raise OSError(errno.EIO, f"only {written.st_size} of {size} bytes were written")
                 if check is not None:
                     check(_reachable(folder) / temporary.name)
                 _replace(folder, temporary, path.name)
             _sync(folder)
-    except RefusedError as e:
-        raise ResourceError(f"{path}: cannot be written, as {e}") from e
-    except OSError as e:
-        amount = "" if size is None else f"{size / 2**20:.1f} MiB " if size >= 2**20 else f"{size:,} bytes "
-        raise ResourceError(
-            f"{path}: {amount}cannot be written ({e.strerror or e}); the old file is untouched. {_remedy(e)}"
-        ) from e
 
 
 def _reachable(folder: Folder) -> Path:
@@ -213,52 +189,26 @@ def _reachable(folder: Folder) -> Path:
 
 @contextlib.contextmanager
 def filling(folder: Path) -> Iterator[Path]:
-    """Give the path of a temporary folder beside ``folder``; the block fills it, and then it is renamed to ``folder``.
-
-    The temporary folder is locked during the block, and removed on any error, including one in the block. Temporary folders
-    that killed processes left beside ``folder`` are removed.
-
-    Args:
-        folder: Folder to make; it may exist if it is empty.
-
-    Raises:
-        ResourceError: The disk is full, or the folder above is not writable or behind a link that is not followed.
-        UsageError: The folder is the current directory of this process.
-    """
+    """Give the path of a temporary folder beside ``folder``; the block fills it, and then it is renamed to ``folder``."""
     target = folder.absolute() if is_below(folder) else Path(os.path.realpath(folder))
     if os.path.realpath(target) == os.path.realpath(Path.cwd()):
         raise UsageError(f"{folder}: refusing to replace the current directory; choose another path")
     make_folder(target.parent)
-    try:
+    with writable(folder, done="created"):
         above = open_folder(target.parent)
         sweep(above)
         temporary = TemporaryFolder(above)
-    except OSError as e:
-        raise _not_made(folder, e) from e
     with temporary:
         path = target.parent / temporary.name
         with output_folder(path):
             yield path
-        try:
+        with writable(folder, done="created"):
             if above.is_link(target.name) or target.is_dir():
-                _clear(above, target.name)
+                with above.folder(target.name) as inside:
+                    sweep(inside)  # leftovers of killed writers
+                above.rmdir(target.name)
             above.rename(temporary.name, target.name)
-        except OSError as e:
-            raise _not_made(folder, e) from e
         _sync(above)
-
-
-def _clear(above: Folder, name: str) -> None:
-    """Remove an empty folder, and leftovers of killed writers in it."""
-    with above.folder(name) as inside:
-        sweep(inside)
-    above.rmdir(name)
-
-
-def _not_made(folder: Path, error: OSError) -> ResourceError:
-    if isinstance(error, RefusedError):
-        return ResourceError(f"{folder}: cannot be created, as {error}")
-    return ResourceError(f"{folder}: cannot be created ({error.strerror or error}). {_remedy(error)}")
 
 
 def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
@@ -274,18 +224,8 @@ def _replace(folder: Folder, temporary: TemporaryFile, name: str) -> None:
     folder.replace(temporary.name, name)
 
 
-def _remedy(error: OSError) -> str:
-    if WINDOWS and isinstance(error, PermissionError):
-        return "Close the programs that have it open, or write elsewhere"
-    return "Free some disk space, or write elsewhere"
-
-
 def _sync(folder: Folder) -> None:
-    """Sync a folder to the disk, so that the names in it survive a power failure.
-
-    Raises:
-        ResourceError: The disk fails.
-    """
+    """Sync a folder to the disk, so that the names in it survive a power failure."""
     try:
         folder.sync()
     except OSError as e:
@@ -296,11 +236,7 @@ def _sync(folder: Folder) -> None:
 
 
 def write_bytes(path: Path, *chunks: bytes | memoryview) -> None:
-    """Replace a file by chunks of bytes, once all of them are on disk.
-
-    Raises:
-        ResourceError: The disk is full or the folder is not writable; an old file is unchanged.
-    """
+    """Replace a file by chunks of bytes, once all of them are on disk."""
     with writing(path, sum(map(len, chunks))) as f:
         for chunk in chunks:
             f.write(chunk)
@@ -334,15 +270,7 @@ def plain(value: object) -> object:
 
 
 def read_file(path: Path, below: Path) -> bytes:
-    """Return the contents of a file that a command has written, such as one of a run.
-
-    Args:
-        path: The file.
-        below: Folder that contains it; no link below that folder is followed.
-
-    Raises:
-        DataError: The file cannot be read, is a link, or is not a regular file.
-    """
+    """Return the contents of a file that a command has written, such as one of a run."""
     try:
         return read_input(path, below=below)
     except OSError as e:
@@ -350,35 +278,21 @@ def read_file(path: Path, below: Path) -> bytes:
 
 
 def appending(path: Path) -> BinaryIO:
-    """Open a file to append to, made if it is missing; a link is not followed.
-
-    Raises:
-        OSError: The file cannot be opened, is a link, or is not a regular file.
-    """
+    """Open a file to append to, made if it is missing; a link is not followed."""
     with open_folder(path.parent) as folder:
         descriptor = folder.open_regular(path.name, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     return open(descriptor, "ab")
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file, or a link itself, if it is there.
-
-    Raises:
-        ResourceError: The file cannot be removed.
-    """
-    try:
-        with contextlib.suppress(FileNotFoundError), open_folder(path.parent) as folder:
+    """Remove a file, or a link itself, if it is there."""
+    with writable(path, "remove it by hand", "removed"), contextlib.suppress(FileNotFoundError):
+        with open_folder(path.parent) as folder:
             folder.unlink(path.name)
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be removed ({e.strerror or e}); remove it by hand") from e
 
 
 def move_folder(folder: Path, name: str) -> Path:
-    """Rename a folder within its parent folder, and return the new path.
-
-    Raises:
-        OSError: The folder cannot be moved, or is a link.
-    """
+    """Rename a folder within its parent folder, and return the new path."""
     with open_folder(folder.parent) as above:
         above.folder(folder.name).close()
         above.rename(folder.name, name)
@@ -386,51 +300,28 @@ def move_folder(folder: Path, name: str) -> Path:
 
 
 def make_folder(folder: Path) -> bool:
-    """Make a folder and its missing parents; return False if the folder existed.
-
-    Raises:
-        ResourceError: The folder cannot be created, or is behind a link that is not followed.
-    """
-    try:
+    """Make a folder and its missing parents; return False if the folder existed."""
+    with writable(folder, "choose another folder, or free some disk space", "written, as the folder cannot be created"):
         made = not os.path.exists(folder)  # False where Path.exists would raise an error
         if is_below(folder):
             open_folder(folder, make=True).close()
         else:
             folder.mkdir(parents=True, exist_ok=True)
-    except RefusedError as e:
-        raise ResourceError(f"{folder}: cannot be written, as {e}") from e
-    except OSError as e:
-        raise ResourceError(
-            f"{folder}: cannot be written, as the folder cannot be created ({e.strerror or e}); "
-            f"{'free some disk space, or ' if e.errno in FULL else ''}choose another folder"
-        ) from e
     return made
 
 
 @contextlib.contextmanager
 def writing_into(folder: Path) -> Iterator[bool]:
-    """Make a folder if it is missing, and follow no link below it in this block; yield whether it was missing.
-
-    Raises:
-        ResourceError: The folder cannot be created or opened, or is behind a link that is not followed.
-    """
+    """Make a folder if it is missing, and follow no link below it in this block; yield whether it was missing."""
     made = make_folder(folder)
     with contextlib.ExitStack() as stack:
-        try:
+        with writable(folder, "choose another folder"):
             stack.enter_context(output_folder(folder))
-        except RefusedError as e:
-            raise ResourceError(f"{folder}: cannot be written, as {e}") from e
-        except OSError as e:
-            raise ResourceError(f"{folder}: cannot be written ({e.strerror or e}); choose another folder") from e
         yield made
 
 
 def is_empty(folder: Path) -> bool:
-    """Return whether a folder is empty, except for a lock and leftovers of interrupted writes.
-
-    Raises:
-        ResourceError: The folder cannot be listed.
-    """
+    """Return whether a folder is empty, except for a lock and leftovers of interrupted writes."""
     try:
         return all(p.name == LOCK or OWN_NAMES.fullmatch(p.name) for p in folder.iterdir())
     except OSError as e:
@@ -438,11 +329,7 @@ def is_empty(folder: Path) -> bool:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and folders of killed processes; those that a running process has locked stay.
-
-    Raises:
-        ResourceError: The folder is a link that is not followed.
-    """
+    """Remove temporary files and folders of killed processes; those that a running process has locked stay."""
     try:
         with open_folder(folder) as found:
             sweep(found)
@@ -453,11 +340,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def inside(path: Path, root: Path, noun: str) -> Path:
-    """Return a path after a check that no link in it points outside ``root``; ``noun`` is its name in messages.
-
-    Raises:
-        DataError: A link points outside.
-    """
+    """Return a path after a check that no link in it points outside ``root``; ``noun`` is its name in messages."""
     if not is_within(path, root):
         raise DataError(f"{path}: a link points outside {noun}; put the files inside of it, or pass --allow-outside")
     return path
@@ -475,12 +358,7 @@ MIN_FREE = 2**16
 
 
 def disk_is_full(folder: Path, said: str) -> bool:
-    """Return whether a process failed because the disk of a folder that it wrote into is full.
-
-    Args:
-        folder: The folder.
-        said: What the process wrote to stderr.
-    """
+    """Return whether a process failed because the disk of a folder that it wrote into is full."""
     if any(words in said for words in WORDS):
         return True
     try:

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -56,7 +55,9 @@ class Folder:
 
     def __init__(self, path: Path, descriptor: int | None):
         """Take the path of the folder and its descriptor, None where the system has no descriptors of folders."""
-        self.path, self.descriptor = path, descriptor
+        self.path, self.descriptor, self.blocks = path, descriptor, 0
+        status = os.stat(path) if descriptor is None else os.fstat(descriptor)
+        self.identity = status.st_dev, status.st_ino
 
     def __enter__(self) -> Folder:
         return self
@@ -91,11 +92,7 @@ class Folder:
         return _link(self.path / name) if self.is_link(name) else error
 
     def open(self, name: str, flags: int, mode: int = 0o666) -> int:
-        """Open a file, and return its descriptor.
-
-        Raises:
-            OSError: The file cannot be opened, or is a link.
-        """
+        """Open a file, and return its descriptor."""
         if WINDOWS and self.is_link(name):
             raise _link(self.path / name)
         try:
@@ -104,12 +101,7 @@ class Folder:
             raise self._explained(name, e) from e
 
     def open_regular(self, name: str, flags: int) -> int:
-        """Open a regular file, as `open` does.
-
-        Raises:
-            OSError: As for `open`.
-            RefusedError: The file is a pipe or a device; the call does not wait for it.
-        """
+        """Open a regular file, as `open` does."""
         try:
             descriptor = self.open(name, flags | getattr(os, "O_NONBLOCK", 0))
         except OSError as e:
@@ -122,12 +114,7 @@ class Folder:
         return descriptor
 
     def folder(self, name: str) -> Folder:
-        """Open a folder in this one.
-
-        Raises:
-            NotADirectoryError: The entry is a file.
-            OSError: The folder cannot be opened, or is a link.
-        """
+        """Open a folder in this one."""
         path = self.path / name
         if WINDOWS:
             if self.is_link(name):
@@ -179,36 +166,21 @@ class Folder:
                 raise
 
 
-@dataclass
-class _Root:
-    """A folder that is open for a block."""
-
-    path: Path
-    folder: Folder
-    identity: tuple[int, int]
-    blocks: int = 0
-
-
-_ROOTS: dict[tuple[str, ...], _Root] = {}
+_ROOTS: dict[tuple[str, ...], Folder] = {}
+"""Folders that are open for blocks, by the parts of their paths."""
 _LOCK = threading.RLock()
 
 
 @contextlib.contextmanager
 def output_folder(folder: Path) -> Iterator[None]:
-    """Let this block write below a folder only through its descriptor and without following links.
-
-    The path of the folder itself may contain links, unless it is below another open folder. If another folder takes its place
-    during the block, the next write is rejected.
-
-    Raises:
-        OSError: The folder is missing, or is behind a link below an open folder.
-    """
+    """Let this block write below a folder only through its descriptor and without following links."""
+    # The path of the folder itself may contain links, unless it is below another open folder. If another folder takes
+    # its place during the block, the next write is rejected.
     path = folder.absolute()
     with _LOCK:
-        root = _ROOTS.get(path.parts)
-        if root is None:
-            opened = open_folder(path)
-            root = _ROOTS[path.parts] = _Root(path, opened, _identity(opened))
+        if path.parts not in _ROOTS:
+            _ROOTS[path.parts] = open_folder(path)
+        root = _ROOTS[path.parts]
         root.blocks += 1
     try:
         yield
@@ -217,7 +189,7 @@ def output_folder(folder: Path) -> Iterator[None]:
             root.blocks -= 1
             if not root.blocks:
                 del _ROOTS[path.parts]
-                root.folder.close()
+                root.close()
 
 
 def is_below(path: Path) -> bool:
@@ -226,15 +198,7 @@ def is_below(path: Path) -> bool:
 
 
 def open_folder(path: Path, make: bool = False) -> Folder:
-    """Open a folder, to use its entries; links on the way are followed, except below an open `output_folder`.
-
-    Args:
-        path: The folder.
-        make: True to create the folder and its missing parents; used only below an open folder.
-
-    Raises:
-        OSError: The folder cannot be opened, or a parent folder is a link.
-    """
+    """Open a folder, to use its entries; links on the way are followed, except below an open `output_folder`."""
     path = path.absolute()
     with _LOCK:
         root = _outermost(path)
@@ -245,23 +209,14 @@ def open_folder(path: Path, make: bool = False) -> Folder:
         with found as above:
             found = _entered(above, path.parts[i], make)
         inner = _ROOTS.get(path.parts[: i + 1])
-        if inner is not None and _identity(found) != inner.identity:
+        if inner is not None and found.identity != inner.identity:
             found.close()
             raise _replaced(inner.path)
     return found
 
 
 def open_file(path: Path, below: Path) -> BinaryIO:
-    """Open a regular file for reading; the path from the folder ``below`` to the file must have no link.
-
-    Args:
-        path: The file.
-        below: Folder above the file, such as a run folder.
-
-    Raises:
-        OSError: The file cannot be opened, or is a link.
-        RefusedError: The file is not a regular file.
-    """
+    """Open a regular file for reading; the path from the folder ``below`` to the file must have no link."""
     with output_folder(below), open_folder(path.parent) as folder:
         return os.fdopen(folder.open_regular(path.name, os.O_RDONLY), "rb")
 
@@ -276,13 +231,13 @@ def _opened(name: str, more: int, at: int | None) -> int:
         return os.open(name, SEARCHED | more, dir_fd=at)
 
 
-def _outermost(path: Path) -> _Root | None:
+def _outermost(path: Path) -> Folder | None:
     """Return the outermost open folder that is the path or above it."""
     parts = path.parts
     return next((_ROOTS[parts[:i]] for i in range(1, len(parts) + 1) if parts[:i] in _ROOTS), None) if _ROOTS else None
 
 
-def _again(root: _Root) -> Folder:
+def _again(root: Folder) -> Folder:
     """Open an open folder again, after a check that its path still names this folder."""
     try:
         now = os.stat(root.path)
@@ -290,7 +245,7 @@ def _again(root: _Root) -> Folder:
         raise _replaced(root.path) from e
     if (now.st_dev, now.st_ino) != root.identity:
         raise _replaced(root.path)
-    return Folder(root.path, None if WINDOWS else _opened(".", 0, root.folder.descriptor))
+    return Folder(root.path, None if WINDOWS else _opened(".", 0, root.descriptor))
 
 
 def _entered(above: Folder, name: str, make: bool) -> Folder:
@@ -305,12 +260,6 @@ def _entered(above: Folder, name: str, make: bool) -> Folder:
     with contextlib.suppress(FileExistsError):  # of another process, just now
         above.mkdir(name)
     return above.folder(name)
-
-
-def _identity(folder: Folder) -> tuple[int, int]:
-    """Return the numbers that identify a folder to the system."""
-    found = os.stat(folder.path) if folder.descriptor is None else os.fstat(folder.descriptor)
-    return found.st_dev, found.st_ino
 
 
 def _link(path: Path) -> RefusedError:
@@ -346,10 +295,9 @@ _ROOTS_LOCK = threading.Lock()
 
 @contextlib.contextmanager
 def shared_locks() -> Iterator[tuple[int, ...]]:
-    """Give descriptors of all locks of temporary folders, for a child process to inherit (``pass_fds``).
-
-    The child may work in these folders. So the folders stay locked until it has ended, even if this process dies first.
-    """
+    """Give descriptors of all locks of temporary folders, for a child process to inherit (``pass_fds``)."""
+    # The child may work in these folders. So the folders stay locked until it has ended, even if this process dies
+    # first.
     with _ROOTS_LOCK:
         copies = tuple(map(os.dup, _HELD)) if sys.platform != "win32" else ()
     try:
@@ -363,15 +311,7 @@ class TemporaryFile:
     """A new file that its owner locks, and removes at the end unless it was renamed; use it with ``with``."""
 
     def __init__(self, folder: Folder, suffix: str = ""):
-        """Make the file.
-
-        Args:
-            folder: Open folder to make the file in.
-            suffix: End of its name: none, .mp4 or .webm.
-
-        Raises:
-            OSError: The file cannot be made.
-        """
+        """Make the file."""
         self._folder = folder
         self.name, self.descriptor = _own_file(folder, suffix, locks=sys.platform != "win32")
         self._open = True
@@ -399,16 +339,7 @@ class TemporaryFolder:
     """A new folder that its owner removes or renames; the lock beside it shows that the owner is running."""
 
     def __init__(self, above: Folder, prefix: str = ".warpgs-", mode: int = 0o777):
-        """Make the folder.
-
-        Args:
-            above: Open folder to make the folder in; closed by `remove`.
-            prefix: Beginning of its name.
-            mode: Rights of the folder.
-
-        Raises:
-            OSError: The folder cannot be made.
-        """
+        """Make the folder."""
         self._above, self._process = above, os.getpid()
         lock, self._descriptor = _own_file(above, LOCKED, locks=True, prefix=prefix, mode=0o600)
         self.name = lock.removesuffix(LOCKED)
@@ -443,13 +374,7 @@ class TemporaryFolder:
 
 
 def temporary_folder() -> TemporaryFolder:
-    """Make a folder that only this user can read or write, in the `system_folder`; use it with ``with``.
-
-    Leftovers of killed commands of this user are removed there.
-
-    Raises:
-        OSError: No folder for temporary files is writable.
-    """
+    """Make a folder that only this user can read or write, in the `system_folder`; use it with ``with``."""
     sweep_temporary_files()
     return TemporaryFolder(open_folder(system_folder()), "warpgs-", 0o700)
 
@@ -472,12 +397,7 @@ def system_folder() -> Path:
 
 
 def sweep(folder: Folder, own: bool = False) -> None:
-    """Remove unlocked temporary files and folders; those that cannot be removed or locked stay.
-
-    Args:
-        folder: Folder to remove them from.
-        own: True to remove only entries of this user.
-    """
+    """Remove unlocked temporary files and folders; those that cannot be removed or locked stay."""
     with contextlib.suppress(OSError):
         for name in filter(NAMES.fullmatch, folder.names()):
             with contextlib.suppress(OSError):
@@ -553,10 +473,7 @@ def _unlocked(folder: Folder, name: str, descriptor: int) -> None:
 
 
 def cache_home() -> Path | None:
-    """Return the system's folder for a user's caches; None without a home folder.
-
-    XDG_CACHE_HOME or ~/.cache, ~/Library/Caches on macOS, %LOCALAPPDATA% on Windows. Nothing is created.
-    """
+    """Return the system's folder for a user's caches; None without a home folder."""
     try:
         home = Path.home()
     except (RuntimeError, KeyError):  # HOME is not set, and the system does not know this user
@@ -575,11 +492,7 @@ def cache_home() -> Path | None:
 
 @functools.cache
 def private_folder() -> Path:
-    """Return a new folder that only this user can read or write (mode 0700), removed when Python ends; one for each process.
-
-    Raises:
-        ResourceError: No folder for temporary files can be written.
-    """
+    """Return a new folder that only this user can read or write (mode 0700), removed when Python ends; one for each process."""
     try:
         made = temporary_folder()
     except OSError as e:

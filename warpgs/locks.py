@@ -22,20 +22,14 @@ from filelock import FileLock, Timeout, lock_descriptor
 
 from warpgs import schema
 from warpgs.errors import FolderHeldError, ResourceError, UsageError
-from warpgs.files import LOCK, remove_leftovers, writing_into
-from warpgs.folders import NO_LOCKS, Folder, RefusedError, cache_home, open_folder, sweep_temporary_files
+from warpgs.files import LOCK, remove_leftovers, writable, writing_into
+from warpgs.folders import NO_LOCKS, Folder, cache_home, open_folder, sweep_temporary_files
 
 
 def open_to_others(folder: Path, depth: int = 0) -> Path | None:
-    """Return the first path through which another user can change a folder's contents, or None.
-
-    On Windows nothing is checked: mode bits have no meaning there, and the folder of a user's caches is private. Root is
-    trusted, as root may do anything, and so is the owner of the whole file system.
-
-    Args:
-        folder: An existing folder, without links in its path.
-        depth: Levels of the folder's contents that are checked as well.
-    """
+    """Return the first path through which another user can change a folder's contents, or None."""
+    # On Windows nothing is checked: mode bits have no meaning there, and the folder of a user's caches is private. Root
+    # is trusted, as root may do anything, and so is the owner of the whole file system.
     if not hasattr(os, "getuid"):
         return None
     trusted = {os.getuid(), 0, Path(folder.anchor).stat().st_uid}
@@ -86,24 +80,12 @@ MOST_LETTERS = 200
 
 @contextlib.contextmanager
 def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
-    """Lock a folder, and make it if it is missing, so that no other process writes into it during the block.
-
-    The system releases the lock when the process that holds it ends, even if it is killed. The lock also excludes processes in
-    other containers. The lock file names the holder. Leftovers of killed writers are removed from the folder and from the
-    system's temporary files. In the block nothing below the folder is written through a link (`output_folder`). If an error
-    ends the block, a folder that was made here is removed if it is still empty; other folders are never removed.
-
-    Args:
-        folder: The folder.
-        parts: Folders in it that are written under the same lock; none may be a link.
-
-    Returns:
-        A list with a note for the user if the file system has no locks, otherwise an empty list.
-
-    Raises:
-        FolderHeldError: Another process holds the folder.
-        ResourceError: The folder cannot be written.
-    """
+    """Lock a folder, and make it if it is missing, so that no other process writes into it during the block."""
+    # The system releases the lock when the process that holds it ends, even if it is killed. The lock also excludes
+    # processes in other containers. The lock file names the holder. Leftovers of killed writers are removed from the
+    # folder and from the system's temporary files. In the block nothing below the folder is written through a link
+    # (`output_folder`). If an error ends the block, a folder that was made here is removed if it is still empty; other
+    # folders are never removed.
     sweep_temporary_files()
     with writing_into(folder) as made:
         try:
@@ -121,24 +103,14 @@ def hold_folder(folder: Path, *parts: str) -> Iterator[list[str]]:
 
 @contextlib.contextmanager
 def hold_file(path: Path) -> Iterator[list[str]]:
-    """Hold the folder of a file that the block writes; see `hold_folder`.
-
-    Raises:
-        FolderHeldError: Another process holds the folder.
-        ResourceError: The folder cannot be written.
-        UsageError: The path is a folder, or too long.
-    """
+    """Hold the folder of a file that the block writes; see `hold_folder`."""
     check_file_path(path)
     with hold_folder(path.parent) as notes:
         yield notes
 
 
 def check_file_path(path: Path) -> None:
-    """Check, before the work, that a file can be written at a path: it is not a folder, and not too long.
-
-    Raises:
-        UsageError: The path is a folder, or too long.
-    """
+    """Check, before the work, that a file can be written at a path: it is not a folder, and not too long."""
     try:
         is_folder = stat.S_ISDIR(path.lstat().st_mode)
     except OSError as e:
@@ -150,11 +122,7 @@ def check_file_path(path: Path) -> None:
 
 
 def check_free(folder: Path) -> None:
-    """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free.
-
-    Raises:
-        FolderHeldError: Another process holds it.
-    """
+    """Check, without writing, that no process holds a folder; a folder that cannot be read counts as free."""
     with contextlib.suppress(OSError), open_folder(folder) as opened:
         with os.fdopen(opened.open_regular(LOCK, os.O_RDWR), "r+b", buffering=0) as file:
             _lock(file, folder)
@@ -191,24 +159,12 @@ def _held(folder: Folder) -> Iterator[bool]:
 
 def _open(folder: Folder) -> BinaryIO:
     """Open a lock file to read and write, made if it is missing."""
-    try:
+    with writable(folder.path, f"make the folder and its lock {LOCK} writable, or choose another folder"):
         return os.fdopen(folder.open_regular(LOCK, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
-    except RefusedError as e:
-        raise ResourceError(f"{folder.path}: cannot be written, as {e}") from e
-    except OSError as e:
-        raise ResourceError(
-            f"{folder.path}: cannot be written, as its lock {LOCK} cannot be opened ({e.strerror or e}); choose another "
-            "folder, or make this one writable"
-        ) from e
 
 
 def _lock(file: BinaryIO, folder: Path) -> bool:
-    """Lock an open file; return False where its file system has no locks.
-
-    Raises:
-        FolderHeldError: Another process holds it.
-        ResourceError: The file cannot be locked.
-    """
+    """Lock an open file; return False where its file system has no locks."""
     try:
         if lock_descriptor(file.fileno(), blocking=False):
             return True
@@ -261,17 +217,7 @@ WAIT_FOR_OTHERS = 60.0
 
 @contextlib.contextmanager
 def private_shared_folder(base: Path | None) -> Iterator[Path]:
-    """Make a new folder with a random name that only this user can enter (mode 0700), and remove it after the block.
-
-    Folders of killed farms, whose locks are free, are removed as well.
-
-    Args:
-        base: Parent of the new folder; None for ``warpgs/slurm`` in the user's cache.
-
-    Raises:
-        ResourceError: The folder cannot be written or locked.
-        UsageError: There is no home folder, or other users can write to ``base`` or to a folder above it.
-    """
+    """Make a new folder with a random name that only this user can enter (mode 0700), and remove it after the block."""
     home = cache_home()
     if base is None and home is None:
         raise UsageError("--engine slurm needs a home folder for its job files; name another folder with --slurm-folder")

@@ -130,15 +130,7 @@ class _Walk:
 
 
 def check_onnx(data: bytes, path: Path) -> None:
-    """Check that bytes are an ONNX model without external data and without custom operators.
-
-    Args:
-        data: The whole file.
-        path: Its name, for messages.
-
-    Raises:
-        DataError: The bytes are not an ONNX model, keep weights in another file (even if it exists), or use custom operators.
-    """
+    """Check that bytes are an ONNX model without external data and without custom operators."""
     try:
         model = _message(memoryview(data))
         graphs, functions = list(_parts(model, MODEL_GRAPH)), list(_parts(model, MODEL_FUNCTION))
@@ -163,11 +155,7 @@ MAX_MODEL_BYTES = 2**31
 
 
 def read_model(path: Path) -> bytes:
-    """Return the bytes of an ONNX file, checked to need no other files.
-
-    Raises:
-        DataError: The file cannot be read, is not an ONNX model, or needs other files or foreign operators.
-    """
+    """Return the bytes of an ONNX file, checked to need no other files."""
     try:
         data = read_input(path, MAX_MODEL_BYTES)
     except OSError as e:
@@ -183,18 +171,7 @@ def first_line(error: Exception) -> str:
 
 
 def start_session(data: bytes, path: Path, provider: str, threads: int) -> InferenceSession:
-    """Return a session for the bytes of a checked ONNX file.
-
-    Args:
-        data: The file, from `read_model`.
-        path: Its name, for messages.
-        provider: cpu or cuda.
-        threads: CPU threads; 0 for as many as the process may use.
-
-    Raises:
-        DataError: onnxruntime cannot load the model.
-        ResourceError: onnxruntime or the provider is missing.
-    """
+    """Return a session for the bytes of a checked ONNX file."""
     try:
         import onnxruntime as ort
     except ImportError as e:

@@ -13,11 +13,9 @@ SPINNING = "torch" in sys.modules and VARIABLE not in os.environ
 
 
 def let_idle_threads_sleep() -> None:
-    """Let OpenMP's idle threads sleep in this process, if torch is not imported yet, and in its children.
-
-    Between loops, OpenMP's threads spin on cores that our own launches need. On two busy cores a backward pass then took six
-    times as long. A variable that is already set is not changed.
-    """
+    """Let OpenMP's idle threads sleep in this process, if torch is not imported yet, and in its children."""
+    # Between loops, OpenMP's threads spin on cores that our own launches need. On two busy cores a backward pass then
+    # took six times as long. A variable that is already set is not changed.
     os.environ.setdefault(VARIABLE, "passive")
 
 

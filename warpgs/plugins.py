@@ -37,26 +37,13 @@ class Registry(Generic[T]):
     """
 
     def __init__(self, kind: str, base: type[T], package: str):
-        """Start without classes.
-
-        Args:
-            kind: Kind of the classes, for messages: strategy, loss term, view module, reader.
-            base: Class from which each class derives.
-            package: Dotted name of the package, or module, of the built-in classes.
-        """
+        """Start without classes."""
         self.kind, self.base, self.package = kind, base, package
         self._classes: dict[str, type[T]] = {}
         self._searched = False
 
     def register(self, name: str) -> Callable[[type[T]], type[T]]:
-        """Return a decorator that registers a class by a name and sets its ``name``.
-
-        A user's class replaces an earlier one of that name, for example when its file is loaded again. It cannot replace a
-        built-in class.
-
-        Raises:
-            UsageError: A built-in class has that name.
-        """
+        """Return a decorator that registers a class by a name and sets its ``name``."""
 
         def decorate(cls: type[T]) -> type[T]:
             before = self._classes.get(name)
@@ -80,11 +67,7 @@ class Registry(Generic[T]):
         return sorted(n for n in self._classes if ":" not in n)
 
     def name_of(self, cls: type[T]) -> str:
-        """Return the name of a class; a class without a name is registered as ``module:Class``.
-
-        Raises:
-            UsageError: The class is of another kind.
-        """
+        """Return the name of a class; a class without a name is registered as ``module:Class``."""
         self._checked(cls, cls.__name__)
         return cls.name if self.has(cls) else self.register(f"{cls.__module__}:{cls.__qualname__}")(cls).name
 
@@ -119,11 +102,7 @@ class Registry(Generic[T]):
         )
 
     def find(self, name: str | type[T]) -> type[T]:
-        """Return the class of a name, or the class itself.
-
-        Raises:
-            UsageError: No class has that name, or a user's own class was not loaded in this process.
-        """
+        """Return the class of a name, or the class itself."""
         if isinstance(name, type):
             return self._checked(name, name.__name__)
         if name in self._classes or name in self.names():
@@ -138,11 +117,7 @@ class Registry(Generic[T]):
         raise UsageError(f"unknown {self.kind} {name!r}; choose one of {', '.join(self.names())}, or give module:Class")
 
     def load(self, spec: str) -> type[T]:
-        """Return the class of a name; ``module:Class`` or ``path/to/file.py:Class`` is imported, which runs its code.
-
-        Raises:
-            UsageError: The module, file or class is missing, or the class is of another kind.
-        """
+        """Return the class of a name; ``module:Class`` or ``path/to/file.py:Class`` is imported, which runs its code."""
         if ":" not in spec or spec in self._classes:
             return self.find(spec)
         cls = self._checked(load_object(self.kind, spec), spec)
@@ -165,15 +140,7 @@ LOADED: set[str] = set()
 
 
 def load_object(kind: str, spec: str) -> object:
-    """Import ``module:NAME`` or ``path/to/file.py:NAME``, which runs its code; return the object.
-
-    Args:
-        kind: Kind of object, for messages.
-        spec: Place and name.
-
-    Raises:
-        UsageError: The module, file or object is missing.
-    """
+    """Import ``module:NAME`` or ``path/to/file.py:NAME``, which runs its code; return the object."""
     where, _, name = spec.rpartition(":")
     try:
         module = module_of(where)
@@ -191,10 +158,7 @@ def load_object(kind: str, spec: str) -> object:
 
 
 def own_code(classes: Iterable[type]) -> dict[str, str]:
-    """Return the SHA-256 of the source file of each class from outside warpgs, by its registered name.
-
-    A class without a file, such as one of a notebook, is left out.
-    """
+    """Return the SHA-256 of the source file of each class from outside warpgs, by its registered name."""
     digests = {str(getattr(c, "name", c.__qualname__)): _digest(c) for c in classes if not is_ours(c)}
     return {name: digest for name, digest in sorted(digests.items()) if digest}
 
@@ -252,20 +216,12 @@ def own_frame(error: BaseException) -> str:
 
 
 def module_of(where: str) -> ModuleType:
-    """Import the module of a dotted name, or the .py file of a path, which runs its code; return the module.
-
-    Raises:
-        ImportError: The module is missing.
-        OSError: The file is missing.
-    """
-    return _load_file(Path(where)) if where.endswith(".py") else _import_module(where)
-
-
-def _import_module(name: str) -> ModuleType:
-    """Import a module by its full dotted name."""
-    if not name or name.startswith("."):
-        raise ImportError(f"{name!r} is not a full module name")
-    return importlib.import_module(name)
+    """Import the module of a dotted name, or the .py file of a path, which runs its code; return the module."""
+    if where.endswith(".py"):
+        return _load_file(Path(where))
+    if not where or where.startswith("."):
+        raise ImportError(f"{where!r} is not a full module name")
+    return importlib.import_module(where)
 
 
 def _load_file(path: Path) -> ModuleType:

@@ -15,7 +15,7 @@ import threading
 import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO, TypeVar, cast
+from typing import Any, TextIO, TypeVar, cast
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.files import DESCRIPTORS, FULL, readable
@@ -31,10 +31,8 @@ NAMES = ("stdin", "stdout", "stderr")
 
 
 def open_missing_descriptors() -> None:
-    """Open the null device instead of a closed stdin, stdout or stderr.
-
-    Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
-    """
+    """Open the null device instead of a closed stdin, stdout or stderr."""
+    # Otherwise the next file that is opened gets the free descriptor, and output is written into that file.
     for number in range(len(NAMES)):
         try:
             os.fstat(number)
@@ -69,13 +67,7 @@ class CarefulStream:
     """A text stream that does not raise if it cannot be written: the first error is kept, and later writes are dropped."""
 
     def __init__(self, stream: TextIO | None, name: str, goes_on: bool = True):
-        """Wrap a stream.
-
-        Args:
-            stream: The stream; None for one whose descriptor was closed when Python started.
-            name: stdout or stderr.
-            goes_on: True to print on stderr at once that the command continues without this stream.
-        """
+        """Wrap a stream."""
         self.closed_at_start = stream is None
         self.stream: TextIO = io.StringIO() if stream is None else stream
         self.name, self.goes_on = name, goes_on
@@ -157,12 +149,7 @@ class CarefulOutput:
 
 @contextlib.contextmanager
 def careful_output(is_product: bool) -> Iterator[CarefulOutput]:
-    """Replace stdout and stderr by streams whose writes do not raise.
-
-    Args:
-        is_product: True if stdout is the command's only result. Then a failure to write fails the command,
-            unless the reader of a pipe has closed it. Otherwise the command continues with one line on stderr.
-    """
+    """Replace stdout and stderr by streams whose writes do not raise."""
     open_missing_descriptors()
     before = sys.stdout, sys.stderr
     streams = CarefulStream(before[0], "stdout", not is_product), CarefulStream(before[1], "stderr", False)
@@ -213,14 +200,7 @@ def be_quiet() -> None:
 
 
 def say(line: object = "", *, error: bool = False) -> None:
-    """Print one `printable` line at once, with codes for letters that the terminal does not have.
-
-    If stdout cannot be written, one line on stderr reports that, and the program continues.
-
-    Args:
-        line: The line.
-        error: True to print on stderr instead of stdout.
-    """
+    """Print one `printable` line at once, with codes for letters that the terminal does not have."""
     global _lost
     if _quiet and not error:
         return
@@ -233,11 +213,7 @@ def say(line: object = "", *, error: bool = False) -> None:
 
 
 def answer(line: object) -> None:
-    """Print one line to the process that started this one.
-
-    Raises:
-        OSError: The other process has ended, so the answer is not needed.
-    """
+    """Print one line to the process that started this one."""
     _print(line, False)
 
 
@@ -249,14 +225,7 @@ def _print(line: object, error: bool) -> None:
 
 
 def counted(items: Sequence[T], tell: Callable[[str], object], what: str, unit: str) -> Iterator[T]:
-    """Yield items; before each item, print how many are done: ``scoring: 3 of 12 views``.
-
-    Args:
-        items: The items.
-        tell: Function that takes a line.
-        what: Name of the work on the items.
-        unit: Plural word for the items.
-    """
+    """Yield items; before each item, print how many are done: ``scoring: 3 of 12 views``."""
     for done, item in enumerate(items):
         tell(f"{what}: {done} of {len(items)} {unit}")
         yield item
@@ -271,35 +240,28 @@ def accept_all_letters() -> None:
 
 
 @contextlib.contextmanager
-def hidden_stderr() -> Iterator[None]:
-    """Hide the output to stderr in the block, also that of native libraries and other threads."""
+def output_to(descriptor: int, numbers: tuple[int, ...] = (1, 2)) -> Iterator[None]:
+    """Send stdout (1) and stderr (2) in the block to an open file, also for native libraries and other threads."""
     open_missing_descriptors()
-    _flush(2)
-    saved, sink = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 2)
+    _flush(*numbers)
+    saved = [os.dup(number) for number in numbers]
     try:
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(sink)
-
-
-@contextlib.contextmanager
-def output_to(descriptor: int) -> Iterator[None]:
-    """Send stdout and stderr in the block to an open file, also for native libraries and other threads."""
-    open_missing_descriptors()
-    _flush(1, 2)
-    saved = [os.dup(number) for number in (1, 2)]
-    try:
-        for number in (1, 2):
+        for number in numbers:
             os.dup2(descriptor, number)
         yield
     finally:
-        _flush(1, 2)
-        for number, old in zip((1, 2), saved, strict=True):
+        _flush(*numbers)
+        for number, old in zip(numbers, saved, strict=True):
             os.dup2(old, number)
             os.close(old)
+
+
+@contextlib.contextmanager
+def hidden_stderr() -> Iterator[None]:
+    """Hide the output to stderr in the block, also that of native libraries and other threads."""
+    open_missing_descriptors()  # the null device must not become stdout or stderr
+    with open(os.devnull, "wb") as null, output_to(null.fileno(), (2,)):
+        yield
 
 
 def _flush(*numbers: int) -> None:
@@ -326,11 +288,9 @@ def is_utf8(text: str) -> bool:
 
 
 def use_utf8_names() -> None:
-    """Start this program again in Python's UTF-8 mode, with a note, if Python reads file names in another encoding.
-
-    File names in scene files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python cannot
-    open them.
-    """
+    """Start this program again in Python's UTF-8 mode, with a note, if Python reads file names in another encoding."""
+    # File names in scene files are UTF-8. Under LC_ALL=C with PYTHONUTF8=0, or in a locale of another encoding, Python
+    # cannot open them.
     encoding = sys.getfilesystemencoding()
     if sys.platform == "win32" or sys.flags.utf8_mode or encoding.lower().replace("-", "") == "utf8":
         return
@@ -344,14 +304,7 @@ def use_utf8_names() -> None:
 
 @contextlib.contextmanager
 def utf8_name(path: Path) -> Iterator[str]:
-    """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its open folder or of the file.
-
-    Args:
-        path: The file. A file to be written must have a UTF-8 name; its folder need not.
-
-    Raises:
-        UsageError: The name is not UTF-8, and this system has no other path to the file.
-    """
+    """Give a UTF-8 path to a file: its own path if possible, else one through a descriptor of its folder or of itself."""
     if is_utf8(str(path)):
         yield str(path)
         return
@@ -367,10 +320,7 @@ def utf8_name(path: Path) -> Iterator[str]:
 
 @contextlib.contextmanager
 def fast_imports() -> Iterator[None]:
-    """Switch garbage collection off for imports in the block, and exempt the imported objects from later collections.
-
-    Modules leave no garbage, and collection takes a fifth of the import time.
-    """
+    """Switch garbage collection off for imports in the block, and exempt the imported objects from later collections."""
     if "torch" in sys.modules or not gc.isenabled():
         yield
         return
@@ -388,10 +338,7 @@ AGAIN = 0.05
 
 
 def _heeded() -> list[signal.Signals]:
-    """Return the signals that end this process, without those that it was started to ignore (by nohup, or in the background).
-
-    The list is empty in other threads than the main thread, which alone may handle signals.
-    """
+    """Return the signals that end this process, without those that it was started to ignore, as by nohup."""
     if threading.current_thread() is not threading.main_thread():
         return []
     return [s for s in STOPPING if signal.getsignal(s) not in (signal.SIG_IGN, None)]
@@ -420,11 +367,9 @@ def _send(number: signal.Signals) -> None:
 
 @contextlib.contextmanager
 def interrupting_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt in the body when a signal comes.
-
-    Python discards an exception that is raised in a destructor or in a callback of a weak reference. A signal that comes there
-    is sent again.
-    """
+    """Raise KeyboardInterrupt in the body when a signal comes."""
+    # Python discards an exception that is raised in a destructor or in a callback of a weak reference. A signal that
+    # comes there is sent again.
     before = sys.unraisablehook
 
     def interrupt(*_: object) -> None:
@@ -451,10 +396,7 @@ def interrupting_signals() -> Iterator[None]:
 
 @contextlib.contextmanager
 def noted_signals() -> Iterator[Callable[[], bool]]:
-    """Note the first signal, so that the body can end normally; a second one raises KeyboardInterrupt in the body.
-
-    Yields a function that returns whether a signal came.
-    """
+    """Note the first signal, so that the body can end normally; a second one raises KeyboardInterrupt in the body."""
     came = False
 
     def note(*_: object) -> None:
@@ -502,20 +444,10 @@ def _stdin_until_our_end() -> Iterator[int]:
 def run_python(
     code: str, *arguments: str, timeout: float, environment: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run Python code in another process, and return its exit code and its output.
-
-    The process works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it nor its
-    children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene with a numpy.py.
-
-    Args:
-        code: The code.
-        arguments: Its ``sys.argv[1:]``; paths must be absolute.
-        timeout: Seconds until the process is ended.
-        environment: Variables in addition to those of this process.
-
-    Raises:
-        subprocess.TimeoutExpired: The process took too long.
-    """
+    """Run Python code in another process, and return its exit code and its output."""
+    # The process works in an empty folder that is removed afterwards, and ends when this process is killed. Neither it
+    # nor its children import modules from the current folder (``-P``, PYTHONSAFEPATH), which may be an untrusted scene
+    # with a numpy.py.
     with temporary_folder() as folder, shared_locks() as locks, _stdin_until_our_end() as stdin:
         return subprocess.run(
             [sys.executable, "-P", "-c", ENDS_WITH_PARENT + code, *arguments],
@@ -550,56 +482,21 @@ def _environment(more: dict[str, str] | None) -> dict[str, str]:
 
 
 def python_lines(module: str, *arguments: str, folder: Path, environment: dict[str, str] | None = None) -> Iterator[str]:
-    """Run a module of this package in another process, and yield the lines of its stdout as they come.
-
-    As in `run_python`, the process does not import modules from its folder. It ends when its output is no longer read.
-    The module calls `end_with_parent`, so that the process ends when this one is killed.
-
-    Args:
-        module: Full name of the module, run as ``__main__``.
-        arguments: Its ``sys.argv[1:]``; paths must be absolute.
-        folder: Folder to work in.
-        environment: Variables in addition to those of this process.
-
-    Raises:
-        ProcessFailed: The process ended with another exit code than 0.
-    """
-    with tempfile.TemporaryFile() as errors, shared_locks() as locks, _stdin_until_our_end() as stdin:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder,
-            stdin=stdin, stdout=subprocess.PIPE, stderr=errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
-        )  # fmt: skip
-        try:
-            assert process.stdout is not None
-            yield from process.stdout
-            if process.wait():
-                errors.seek(0)
-                raise ProcessFailed(process.returncode, errors.read().decode("utf-8", "replace").strip())
-        finally:
-            process.kill()
-            process.wait()
+    """Run a module of this package in ``folder``, yield the lines of its stdout, and end it once no more lines are read."""
+    # the module calls `end_with_parent`: its stdin ends when this process is killed
+    with shared_locks() as locks:
+        worker = PythonWorker(module, *arguments, folder=folder, environment=environment, locks=locks)
+    try:
+        yield from worker.lines()
+        code, errors = worker.end(None)
+        if code:
+            raise ProcessFailed(code, errors)
+    finally:
+        worker.end(0)
 
 
-class ProgramResult(NamedTuple):
-    """Outcome of a program."""
-
-    code: int
-    """Exit code; 1 if the program could not be run or took too long."""
-    output: str
-    errors: str
-    """Text of stderr, or the reason why the program could not be run or was ended."""
-
-
-def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> ProgramResult:
-    """Run a program that starts this package elsewhere, and return its outcome.
-
-    Args:
-        program: Name of the program, searched in PATH.
-        options: Its arguments.
-        stdin: Text for its stdin.
-        timeout: Seconds until the program is ended.
-        hidden: Prefix of the environment variables that are not passed on.
-    """
+def run_program(program: str, *options: str, stdin: str, timeout: float, hidden: str) -> tuple[int, str, str]:
+    """Run a program that starts this package elsewhere, and return its outcome."""
     environment = {k: v for k, v in _environment(None).items() if not k.startswith(hidden)}
     try:
         done = subprocess.run(
@@ -607,8 +504,12 @@ def run_program(program: str, *options: str, stdin: str, timeout: float, hidden:
             errors="replace", timeout=timeout, check=False,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as e:
-        return ProgramResult(1, "", str(e))
-    return ProgramResult(done.returncode, done.stdout, done.stderr)
+        return 1, "", str(e)
+    return done.returncode, done.stdout, done.stderr
+
+
+LAST_BYTES = 10_000
+"""Bytes at the end of a process's stderr that are kept."""
 
 
 class PythonWorker:
@@ -618,18 +519,16 @@ class PythonWorker:
     stops at the end of its stdin, which also ends if the parent is killed.
     """
 
-    def __init__(self, module: str, *arguments: str, environment: dict[str, str] | None = None):
-        """Start the process.
-
-        Args:
-            module: Full name of the module, run as ``__main__``.
-            arguments: Its ``sys.argv[1:]``.
-            environment: Variables in addition to those of this process.
-        """
+    def __init__(
+        self, module: str, *arguments: str, folder: Path | None = None, environment: dict[str, str] | None = None,
+        locks: tuple[int, ...] = (),
+    ):  # fmt: skip
+        """Start the process in ``folder``, with more ``environment`` variables and descriptors of ``locks`` to inherit."""
         self._errors = tempfile.TemporaryFile()  # closed by `end`
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", start_new_session=True,
+            [sys.executable, "-P", "-m", module, *arguments], env=_environment(environment), cwd=folder, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=self._errors, text=True, encoding="utf-8", errors="replace", pass_fds=locks,
+            start_new_session=True,
         )  # fmt: skip
 
     @property
@@ -652,11 +551,8 @@ class PythonWorker:
         assert self._process.stdout is not None
         yield from self._process.stdout
 
-    def end(self, seconds: float) -> tuple[int, str]:
-        """Close the stdin of the process, and kill it if it still runs after ``seconds``.
-
-        Returns its exit code, and the last 2000 bytes of its stderr as text.
-        """
+    def end(self, seconds: float | None) -> tuple[int, str]:
+        """Close stdin, kill the process if it still runs after ``seconds``; return its exit code and the end of its stderr."""
         with contextlib.suppress(OSError):
             if self._process.stdin is not None:
                 self._process.stdin.close()
@@ -669,5 +565,5 @@ class PythonWorker:
             return self._process.returncode, ""
         with self._errors:
             self._errors.seek(0, os.SEEK_END)
-            self._errors.seek(max(0, self._errors.tell() - 2000))
+            self._errors.seek(max(0, self._errors.tell() - LAST_BYTES))
             return self._process.returncode, self._errors.read().decode("utf-8", "replace").strip()

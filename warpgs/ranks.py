@@ -43,16 +43,7 @@ _PLAIN = re.compile(r"[A-Za-z0-9._/-]*")
 
 
 def loopback_socket(port: int, fix: str, host: str = HOST) -> socket.socket:
-    """Return a socket that is bound to the loopback address and does not listen yet.
-
-    Args:
-        port: Port; 0 for any free one.
-        fix: What the user can do where the port is taken.
-        host: 127.0.0.1 or ::1.
-
-    Raises:
-        UsageError: The port is taken, or is not a valid port.
-    """
+    """Return a socket that is bound to the loopback address and does not listen yet."""
     opened = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     # on Windows SO_REUSEADDR would let another program bind the same port beside us
     name = "SO_EXCLUSIVEADDRUSE" if sys.platform == "win32" else "SO_REUSEADDR"
@@ -78,11 +69,7 @@ def loopback_of(name: str) -> str | None:
 
 
 def loopback_interface(host: str = HOST) -> str:
-    """Return the name of the network interface that has a loopback address, such as lo.
-
-    Raises:
-        ResourceError: No interface has the address.
-    """
+    """Return the name of the network interface that has a loopback address, such as lo."""
     import psutil
 
     for name, addresses in psutil.net_if_addrs().items():
@@ -92,11 +79,7 @@ def loopback_interface(host: str = HOST) -> str:
 
 
 def listening_at(process: int | None = None) -> list[tuple[str, int]]:
-    """Return the addresses and ports at which a process listens, sorted; none where the system denies access.
-
-    Args:
-        process: Number of the process; None for this one.
-    """
+    """Return the addresses and ports at which a process listens, sorted; none where the system denies access."""
     import psutil
 
     try:
@@ -118,11 +101,7 @@ def listeners() -> list[tuple[str, str, int]]:
 
 
 def say_what_is_open(found: Sequence[tuple[str, str, int]]) -> None:
-    """Print in one line which of the found sockets other machines can reach, if any.
-
-    Args:
-        found: Program name, address and port of each listening socket.
-    """
+    """Print in one line which of the found sockets other machines can reach, if any."""
     reached = [f"{who} at {ip}, port {port}" for who, ip, port in found if not is_loopback(ip)]
     if reached:
         say(f"open to other machines, without encryption: {'; '.join(reached)}; use a network that you trust")
@@ -138,13 +117,7 @@ class Allowance:
     """Rate limit: a number of allowed messages that grows with time up to a maximum."""
 
     def __init__(self, per_second: float, most: float, clock: Callable[[], float] = time.monotonic):
-        """Start with the largest number of messages.
-
-        Args:
-            per_second: Messages that are added in a second.
-            most: Largest number of messages at once.
-            clock: Returns the time [s].
-        """
+        """Start with the largest number of messages."""
         self._per_second, self._most, self._clock = per_second, most, clock
         self._left, self._last = most, clock()
 
@@ -171,16 +144,7 @@ class WebGuard:
         return f"http://{HOST}:{port}/{self.token}/"
 
     def admitted_path(self, target: str, hosts: Sequence[str], origins: Sequence[str], upgrade: bool) -> str | None:
-        """Return the requested path below the token, or None if the request must be rejected.
-
-        Args:
-            target: Target of the request line. A target with a query is rejected: a foreign link must not choose parameters of
-                the page.
-            hosts: Values of all headers ``Host``. There must be one, with one of `NAMES`: a foreign name that resolves to
-                127.0.0.1 is rejected.
-            origins: Values of all headers ``Origin``. Each must be the server's own, and a websocket must have exactly one.
-            upgrade: True if a websocket is requested, which only exists at the top path.
-        """
+        """Return the requested path below the token, or None if the request must be rejected."""
         if len(hosts) != 1 or not _is_own(hosts[0]):
             return None
         if any(origin != f"http://{hosts[0]}" for origin in origins) or (upgrade and len(origins) != 1):
@@ -194,12 +158,7 @@ class WebGuard:
 
     @staticmethod
     def headers(host: str, nonce: str) -> dict[str, str]:
-        """Return the headers of every answer.
-
-        Args:
-            host: Value of the request's header ``Host``; any text for a rejected request.
-            nonce: Nonce of the scripts of the page; other scripts do not run.
-        """
+        """Return the headers of every answer."""
         # in Safari, 'self' covers http only; a foreign host must not get into the header
         sockets = f" ws://{host}" if _is_own(host) else ""
         policy = {
@@ -269,14 +228,7 @@ class RankWatch:
     """
 
     def __init__(self, rank: int, count: int, store: Store, own: Store):
-        """Give the first sign of life, and begin to watch.
-
-        Args:
-            rank: Number of this process.
-            count: Number of processes.
-            store: Store of the main thread.
-            own: Another connection to the store, for the thread.
-        """
+        """Give the first sign of life, and begin to watch."""
         self.rank, self.count, self.store = rank, count, store
         self.here = machine()
         self.leaving = threading.Event()
@@ -290,11 +242,7 @@ class RankWatch:
         self._own.set(f"beat/{self.rank}", f"{number}|{os.getpid()}|{self.here}")
 
     def meet(self, seconds: float) -> None:
-        """Wait until all processes have given a sign of life.
-
-        Raises:
-            ResourceError: A process has given none after ``seconds`` [s].
-        """
+        """Wait until all processes have given a sign of life."""
         until = time.monotonic() + seconds
         while missing := [r for r in range(self.count) if not self.store.check([f"beat/{r}"])]:
             if time.monotonic() > until:
@@ -421,19 +369,11 @@ class Ranks:
         return self.rank == 0
 
     def to_each(self, sent: torch.Tensor) -> torch.Tensor:
-        """Send ``sent[r]`` to each process r; return what this process receives, by rank; both have the shape [R, ...].
-
-        Raises:
-            ResourceError: A process is gone.
-        """
+        """Send ``sent[r]`` to each process r; return what this process receives, by rank; both have the shape [R, ...]."""
         return sent
 
     def gather(self, own: torch.Tensor, found: torch.Tensor) -> None:
-        """Concatenate the tensors ``own`` [S] of all processes into ``found`` [R * S].
-
-        Raises:
-            ResourceError: A process is gone.
-        """
+        """Concatenate the tensors ``own`` [S] of all processes into ``found`` [R * S]."""
         found.copy_(own)
 
     def texts(self, own: str) -> list[str]:
@@ -517,11 +457,7 @@ def _number(name: str, least: int, most: int, default: str | None = None) -> int
 
 
 def place() -> tuple[int, int]:
-    """Return the rank of this process and the number of processes, 0 and 1 for a single one.
-
-    Raises:
-        UsageError: The variables are not valid numbers.
-    """
+    """Return the rank of this process and the number of processes, 0 and 1 for a single one."""
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         return 0, 1
     count = _number("WORLD_SIZE", 1, 2**16)
@@ -600,13 +536,7 @@ def _take_gpu(rank: int, local: int) -> None:
 
 
 def _stay_home(address: str) -> str | None:
-    """Have gloo and NCCL listen at the loopback interface if all ranks are on this machine; return its address, else None.
-
-    Interfaces that the user has set are not changed.
-
-    Args:
-        address: Value of MASTER_ADDR.
-    """
+    """Have gloo and NCCL listen at the loopback interface if all ranks are on this machine; return its address, else None."""
     home = loopback_of(address)
     if home and sys.platform != "win32":  # gloo finds no interface by its name there
         for library in ("GLOO", "NCCL"):
@@ -615,10 +545,7 @@ def _stay_home(address: str) -> str | None:
 
 
 def last_words(line: str, code: int) -> int:
-    """Print why this process ends, and return its exit code.
-
-    In a group of processes, only the first to fail prints, and this call ends the process instead of returning.
-    """
+    """Print why this process ends, and return its exit code."""
     if _joined is None:
         if place_or_first()[0] == 0:
             say(line, error=True)

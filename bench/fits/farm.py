@@ -25,7 +25,7 @@ import torch
 from bench.lib import result_file
 from bench.lib.arguments import parse
 from warpgs.device import usable_cores
-from warpgs.pipeline.farm.farm import EngineRequest, JobStatus, LocalEngine, Slot, make_engine, run_farm
+from warpgs.pipeline.farm.farm import JobStatus, LocalEngine, Slot, make_engine, run_farm
 from warpgs.pipeline.farm.job import LOG, PLY, Engine, FarmJob, file_digest
 from warpgs.pipeline.run.request import FitRequest, SceneRequest
 from warpgs.pipeline.train.presets import PRESETS
@@ -122,16 +122,16 @@ def engines(scenes: int, steps: int, slots: int, work: Path) -> list[dict]:
     rows = [{"way": "one by one, warpgs fit", "slots": 1, "seconds": one_by_one(found, work / "single", steps)}]
     wanted = digests(work / "single", names)
     killed: list[str] = []
-    ways: dict[str, tuple[EngineRequest, Callable]] = {
-        "local": (EngineRequest("local", slots), lambda *_: None),
-        "local, 1 slot": (EngineRequest("local", 1), lambda *_: None),
-        "local, a worker killed": (EngineRequest("local", slots), kill_once(killed)),
-        "ray": (EngineRequest("ray", slots), lambda *_: None),
+    ways: dict[str, tuple[tuple[str, int | None], Callable]] = {
+        "local": (("local", slots), lambda *_: None),
+        "local, 1 slot": (("local", 1), lambda *_: None),
+        "local, a worker killed": (("local", slots), kill_once(killed)),
+        "ray": (("ray", slots), lambda *_: None),
     }
     for way, (request, show) in ways.items():
         out = work / way.replace(" ", "-").replace(",", "")
         out.mkdir()
-        row = timed(jobs_of(found, out, config), lambda: make_engine(request, "cpu"), show)  # noqa: B023
+        row = timed(jobs_of(found, out, config), lambda: make_engine("cpu", request[0], slots=request[1]), show)  # noqa: B023
         rows.append({"way": way, "slots": request.slots, **row, "same_bytes": digests(out, names) == wanted})
     row = shared(found, work / "scenes", work / "shared", steps)
     rows.append({"way": "two farms of 1 slot", "slots": 2, **row, "same_bytes": digests(work / "shared", names) == wanted})
@@ -179,7 +179,7 @@ def packing(a: Namespace, work: Path) -> Iterator[dict]:
 
     def measure(gpus: int, per_gpu: int) -> dict:
         threads = max(1, usable_cores() // (gpus * per_gpu))
-        slots = [Slot("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
+        slots = [("cuda", threads, {"CUDA_VISIBLE_DEVICES": str(i % gpus)}) for i in range(gpus * per_gpu)]
         out = work / f"{gpus}x{per_gpu}"
         out.mkdir()
         row = {"gpus": gpus, "per_gpu": per_gpu, "threads": threads, **pack(scene, config, out, slots, a.fits)}

@@ -14,7 +14,6 @@ from rich.console import Console
 from warpgs.app import doctor
 from warpgs.app.cli import main
 from warpgs.app.doctor import MISSING, NOTE, OK, Finding
-from warpgs.device import KernelCache
 from warpgs.errors import ResourceError
 from warpgs.pipeline.run import precompile
 from warpgs.report import progress
@@ -173,7 +172,7 @@ def test_a_cache_that_another_process_changes_has_a_size(monkeypatch, tmp_path):
 
 def test_a_kernel_cache_that_cannot_be_used(monkeypatch, tmp_path):
     """A private one is a note: a fit works, and compiles each time; none at all stops it."""
-    monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: KernelCache(tmp_path, "it cannot be written"))
+    monkeypatch.setattr(doctor, "prepare_kernel_cache", lambda: (tmp_path, "it cannot be written"))
     (f,) = doctor._kernel_cache()
     assert f.status == NOTE and "cannot be written" in f.detail and "WARP_CACHE_PATH" in f.remedy
 
@@ -222,7 +221,7 @@ def test_a_check_that_fails_is_a_finding(monkeypatch):
 
 def test_eighty_columns_keep_the_keys_whole():
     findings = [
-        *(Finding(p.distribution, OK, "1.2.3") for p in doctor.PACKAGES),
+        *(Finding(row[0], OK, "1.2.3") for row in doctor.PACKAGES),
         Finding("Kernel cache", MISSING, "/a/very/long/path" * 9, "set WARP_CACHE_PATH " + "so " * 40, True),
         Finding("CUDA", NOTE, "[bold]none[/bold] " + "word " * 30, "update"),
     ]

@@ -19,7 +19,6 @@ from tests.pipeline.test_table_files import cells
 from warpgs.app.cli import main
 from warpgs.errors import DataError, UsageError
 from warpgs.files import LOCK
-from warpgs.pipeline.farm.farm import EngineRequest
 from warpgs.pipeline.farm.job import Event, job_of
 from warpgs.pipeline.farm.work import ensure_run
 from warpgs.pipeline.metrics.lpips import NETS, convert_lpips
@@ -285,7 +284,7 @@ def test_several_scenes_are_averaged_by_seed(finished, scene, tmp_path):
 def test_a_study_on_a_farm_is_the_same_study(finished, tmp_path, monkeypatch):
     """Its runs are jobs; what failed there is a failed run, and is not fitted again in this process."""
     monkeypatch.setattr("warpgs.pipeline.farm.farm.LocalEngine", lambda slots: HereEngine(slots=len(slots)))
-    request = dataclasses.replace(finished[0], out=tmp_path / "out", seeds=1, engine=EngineRequest(slots=2))
+    request = dataclasses.replace(finished[0], out=tmp_path / "out", seeds=1, engine={"slots": 2})
     run_study(request)
     assert states(request) == ["fitted", "fitted"] and (request.out / "index.html").is_file()
     for variant in request.variants:

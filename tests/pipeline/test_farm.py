@@ -21,7 +21,7 @@ from warpgs.files import make_folder
 from warpgs.locks import hold_folder
 from warpgs.pipeline.farm import job as record
 from warpgs.pipeline.farm import work
-from warpgs.pipeline.farm.farm import LocalEngine, Slot, local_slots, run_farm
+from warpgs.pipeline.farm.farm import LocalEngine, local_slots, run_farm
 from warpgs.pipeline.farm.job import (
     CHECKED,
     LOG,
@@ -310,7 +310,7 @@ def test_slots(monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     with pytest.raises(UsageError, match="--slots and --per-gpu must be numbers from 1"):
         local_slots("cuda", 0, 2)
-    assert local_slots("cuda", None, 2) == [Slot("cuda", 2, {"CUDA_VISIBLE_DEVICES": n}) for n in "3535"]
+    assert local_slots("cuda", None, 2) == [("cuda", 2, {"CUDA_VISIBLE_DEVICES": n}) for n in "3535"]
 
 
 def test_the_command_fits_a_file_of_jobs_and_writes_its_index(scenes, tmp_path, capsys, monkeypatch):

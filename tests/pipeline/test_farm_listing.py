@@ -1,5 +1,7 @@
 """What a farm is given: folders, globs, and files of jobs that anybody may have written."""
 
+from pathlib import Path
+
 import pytest
 
 from tests.pipeline.farms import write_scenes
@@ -11,8 +13,8 @@ def test_folders_and_globs(tmp_path):
     """Each folder is a scene, hidden ones are not; equal names are told apart by the folders above."""
     for name in ("b/scene", "a/scene", ".hidden"):
         (tmp_path / name).mkdir(parents=True)
-    assert [(j.name, j.scene) for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
-    assert [j.name for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
+    assert [j[:2] for j in list_jobs(str(tmp_path))] == [("a", tmp_path / "a"), ("b", tmp_path / "b")]
+    assert [j[0] for j in list_jobs(f"{tmp_path}/*/scene")] == ["a-scene", "b-scene"]
     with pytest.raises(UsageError, match="no scene found"):
         list_jobs(f"{tmp_path}/*/nothing")
 
@@ -28,8 +30,8 @@ def test_lines_are_flags_of_fit(tmp_path):
     path = tmp_path / "jobs.jsonl"
     path.write_text('{"scene": "x", "steps": 5, "refine_poses": true, "method.pm": false}\n\n{"scene": "/y", "name": "z"}')
     first, second = list_jobs(str(path))
-    assert first.scene == tmp_path / "x" and first.flags == ("--steps=5", "--refine-poses", "--method.no-pm")
-    assert (second.name, second.flags) == ("z", ())
+    assert first == ("x", tmp_path / "x", ("--steps=5", "--refine-poses", "--method.no-pm"))
+    assert second == ("z", Path("/y"), ())
 
 
 @pytest.mark.parametrize(
@@ -66,8 +68,8 @@ def test_the_longest_name(tmp_path):
     """It is a folder, beside which one with a longer name can lie."""
     path = tmp_path / "jobs.jsonl"
     path.write_text('{"scene": "a", "name": "%s"}' % (66 * "写"), "utf-8")
-    (job,) = list_jobs(str(path))
-    (tmp_path / f"{job.name}.old1").mkdir()
+    ((name, _, _),) = list_jobs(str(path))
+    (tmp_path / f"{name}.old1").mkdir()
 
 
 def test_two_jobs_need_two_names(tmp_path):

@@ -14,10 +14,9 @@ from tests.pipeline.farms import jobs_of
 from warpgs.errors import ResourceError, UsageError
 from warpgs.locks import private_shared_folder
 from warpgs.pipeline.farm import slurm
-from warpgs.pipeline.farm.farm import EngineRequest, make_engine, run_farm
+from warpgs.pipeline.farm.farm import make_engine, run_farm
 from warpgs.pipeline.farm.job import Event, JobRecord, job_of, write_record
 from warpgs.pipeline.farm.slurm import SlurmEngine
-from warpgs.process import ProgramResult
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "getuid"), reason="Slurm runs on Linux")
 
@@ -31,13 +30,13 @@ class Cluster:
     def call(self, program, *options, script=""):
         self.calls.append((program, *options))
         if program in self.fail:
-            return ProgramResult(1, "", self.fail[program])
+            return 1, "", self.fail[program]
         if program == "sbatch":
             self.queue.append(str(len(self.scripts) + 70))
             self.scripts[self.queue[-1]] = shlex.split(script.splitlines()[1])
             self.logs[self.queue[-1]] = next(Path(o.partition("=")[2]) for o in options if o.startswith("--output="))
-            return ProgramResult(0, f"{self.queue[-1]};here\n", "")
-        return ProgramResult(0, "\n".join(self.queue), "")
+            return 0, f"{self.queue[-1]};here\n", ""
+        return 0, "\n".join(self.queue), ""
 
     def end(self, number, answer=None, log=""):
         """End a job, with an answer or without."""
@@ -133,7 +132,7 @@ def test_a_folder_that_others_can_write_to_is_refused(cluster, tmp_path):
     for folder in (base, base.parent):
         folder.chmod(0o777)
         with pytest.raises(UsageError, match=r"other users can write to .*--slurm-folder"):
-            make_engine(EngineRequest("slurm", slurm_folder=base), "cpu")
+            make_engine("cpu", "slurm", slurm_folder=base)
         folder.chmod(0o700)
     (tmp_path / "file").touch()
     with pytest.raises(ResourceError, match="--slurm-folder"), private_shared_folder(tmp_path / "file"):
@@ -211,7 +210,7 @@ def test_commands_are_called_without_a_shell(tmp_path, monkeypatch, name):
     """Their environment names no folder to import from but the package's, and hides no jobs; a missing one is a failure."""
     monkeypatch.setenv("SQUEUE_STATES", "RUNNING")
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert slurm._call(name).code == 1
+    assert slurm._call(name)[0] == 1
     (tmp_path / name).write_text('#!/bin/sh\nread -r line\necho "$1 $line $PYTHONSAFEPATH $SQUEUE_STATES."\n')
     (tmp_path / name).chmod(0o755)
-    assert slurm._call(name, "$(id)", script="text\n").output == "$(id) text 1 .\n"
+    assert slurm._call(name, "$(id)", script="text\n")[1] == "$(id) text 1 .\n"

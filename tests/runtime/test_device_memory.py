@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from warpgs import device
-from warpgs.device import Memory, available_bytes, container_memory, installed_bytes, machine_memory
+from warpgs.device import available_bytes, container_memory, installed_bytes, machine_memory
 
 CPU, GIB = torch.device("cpu"), 2**30
 
@@ -56,7 +56,7 @@ def test_this_machine():
 
 def test_without_control_groups(elsewhere):
     """As on macOS and Windows: what psutil says."""
-    assert container_memory() is None and machine_memory() == Memory(16 * GIB, 10 * GIB)
+    assert container_memory() is None and machine_memory() == (16 * GIB, 10 * GIB)
     assert (installed_bytes(CPU), available_bytes(CPU)) == (16 * GIB, 10 * GIB)
 
 
@@ -66,11 +66,11 @@ def test_limits_of_version_2(elsewhere):
     group(elsewhere, "", memory__stat="anon 5")  # the root has no limit file
     group(elsewhere, "a", memory__max=4 * GIB, memory__current=3 * GIB, memory__stat=f"anon 1\ninactive_file {GIB}")
     group(elsewhere, "a/b", memory__max="max", memory__current=1)
-    assert container_memory() == machine_memory() == Memory(4 * GIB, 2 * GIB)
+    assert container_memory() == machine_memory() == (4 * GIB, 2 * GIB)
     group(elsewhere, "a/b", memory__max=3 * GIB, memory__current=GIB, memory__stat="")
-    assert machine_memory() == Memory(3 * GIB, 2 * GIB)
+    assert machine_memory() == (3 * GIB, 2 * GIB)
     group(elsewhere, "a", memory__current=6 * GIB)
-    assert machine_memory() == Memory(3 * GIB, 0)
+    assert machine_memory() == (3 * GIB, 0)
 
 
 @pytest.mark.parametrize("own", ["0::/\n", "0::/../elsewhere\n", "", "odd\n0::\n", None])
@@ -79,7 +79,7 @@ def test_the_root_of_a_container_is_its_own_group(elsewhere, own):
     if own is not None:
         (elsewhere / "proc").write_text(own, "utf-8")
     group(elsewhere, "", memory__max=GIB, memory__current=2**20)
-    assert machine_memory() == Memory(GIB, GIB - 2**20)
+    assert machine_memory() == (GIB, GIB - 2**20)
 
 
 def test_limits_of_version_1(elsewhere):
@@ -89,15 +89,15 @@ def test_limits_of_version_1(elsewhere):
     group(elsewhere, "memory", **none)
     assert container_memory() is None
     group(elsewhere, "memory", memory__limit_in_bytes=2 * GIB, memory__stat=f"total_inactive_file {GIB // 2}")
-    assert machine_memory() == Memory(2 * GIB, 3 * GIB // 2)
+    assert machine_memory() == (2 * GIB, 3 * GIB // 2)
     group(elsewhere, "memory/docker/x", memory__limit_in_bytes=GIB)  # what is used is not said
-    assert machine_memory() == Memory(GIB, GIB)
+    assert machine_memory() == (GIB, GIB)
 
 
 def test_a_limit_above_the_machine_changes_nothing(elsewhere):
     """Nor does a file of nonsense."""
     group(elsewhere, "", memory__max=64 * GIB, memory__current=0)
-    assert machine_memory() == Memory(16 * GIB, 10 * GIB)
+    assert machine_memory() == (16 * GIB, 10 * GIB)
     group(elsewhere, "", memory__max="-7 or so")
     assert container_memory() is None
 

@@ -34,7 +34,7 @@ from warpgs.device import prepare_kernel_cache
 os.setgroups([])
 os.setgid(54321)
 os.setuid(54321)  # after the imports: where Python lies may not be for everyone
-folder = prepare_kernel_cache().folder
+folder = prepare_kernel_cache()[0]
 print(folder / "version", oct(os.stat(os.path.dirname(folder)).st_mode & 0o777))
 """
 
@@ -189,7 +189,7 @@ def test_no_folder_is_ever_called_tilde(monkeypatch, tmp_path):
         assert "an unknown home folder" in chosen(monkeypatch, "~/k")[1]
         monkeypatch.delenv("WARP_CACHE_PATH")
         monkeypatch.delenv("LOCALAPPDATA", raising=False)
-        assert folders.cache_home() is None and "no home" in choose_kernel_cache().refused
+        assert folders.cache_home() is None and "no home" in choose_kernel_cache()[1]
     from warpgs.priors.networks import cache_folder
 
     for name in ("HOME", "USERPROFILE"):

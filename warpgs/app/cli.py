@@ -27,11 +27,6 @@ FITTING = ("fit", "farm", "compare", "ablate")
 """Commands that fit, and take the flags of a fit."""
 
 
-def report_no_memory(error: Exception, command: str) -> int:
-    """Print that the memory is exhausted, and the fix; return the exit code."""
-    return last_words(f"warpgs: {no_memory_message(error, fitting=command in FITTING)}", ResourceError.exit_code)
-
-
 def missing_package(error: Exception) -> str:
     """Return the package that an import of warpgs's own code did not find; empty for other errors."""
     name = error.name or "" if isinstance(error, ModuleNotFoundError) and not own_frame(error) else ""
@@ -40,10 +35,7 @@ def missing_package(error: Exception) -> str:
 
 
 def report_defect(error: Exception, arguments: list[str]) -> int:
-    """Store the traceback in a file for a bug report, and print one line; return the exit code.
-
-    An uninstalled dependency is not a defect of warpgs: the line then only names the package.
-    """
+    """Store the traceback in a file for a bug report, and print one line; return the exit code."""
     import tempfile
     import traceback
 
@@ -115,17 +107,8 @@ SCENE = (
 """Description of the positional argument."""
 
 
-def wants_help(arguments: list[str]) -> bool:
-    """Return whether the arguments after `fit` request the short help."""
-    return any(word in ("-h", "--help") for word in arguments)
-
-
 def help_lines(about: str) -> list[str]:
-    """Return the help of `warpgs fit` in at most 45 lines of 80 columns.
-
-    Args:
-        about: Description of the command.
-    """
+    """Return the help of `warpgs fit` in at most 45 lines of 80 columns."""
 
     def rows(pairs: list[tuple[str, str]]) -> list[str]:
         width = max(len(left) for left, _ in pairs)
@@ -198,11 +181,7 @@ def _help() -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted.
-
-    Raises:
-        SystemExit: A command has printed its help.
-    """
+    """Run one command; returns its exit code: 0 done, 2 usage, 3 data, 4 resources, 5 defect or NaN, 130 interrupted."""
     if arguments is None:
         use_utf8_names()
     with contextlib.suppress(OSError):  # no folder for temporary files: a command that needs one raises the error
@@ -234,17 +213,17 @@ def _run(arguments: list[str]) -> int:
         if name not in COMMANDS:
             hint = did_you_mean(name, COMMANDS) or f"choose one of {', '.join(COMMANDS)}"
             raise UsageError(f"unknown command {name!r}; {hint}")
-        if name == "fit" and wants_help(arguments[1:]):  # before the import, which costs seconds
+        if name == "fit" and {"-h", "--help"} & {*arguments}:  # before the import, which costs seconds
             for line in help_lines(COMMANDS[name]):
                 say(line)
             return 0
         with waiting() as wait:
             if not ASKING & {*arguments} and os.environ.get("RANK", "0") == "0":  # until the command reports its own progress
                 wait(f"starting {name}")
+            own = name in OWN_FILES
             with fast_imports():
-                module = importlib.import_module(f"warpgs.app.{name if name in OWN_FILES else 'commands'}")
-            command = getattr(module, f"run_{name.replace('-', '_')}")
-            code: int = command(arguments[1:], COMMANDS[name])
+                module = importlib.import_module(f"warpgs.app.{name if own else 'commands'}")
+            code: int = module.run(*(() if own else (name,)), arguments[1:], COMMANDS[name])
         return code
     except WarpgsError as e:
         return last_words(f"warpgs: {e}", e.exit_code)
@@ -252,7 +231,9 @@ def _run(arguments: list[str]) -> int:
         with ignored_signals():
             return last_words("; ".join(["warpgs: interrupted", *map(str, e.args)]), 130)
     except Exception as e:
-        return report_no_memory(e, name) if is_out_of_memory(e) else report_defect(e, arguments)
+        if is_out_of_memory(e):
+            return last_words(f"warpgs: {no_memory_message(e, fitting=name in FITTING)}", ResourceError.exit_code)
+        return report_defect(e, arguments)
 
 
 if __name__ == "__main__":

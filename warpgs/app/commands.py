@@ -1,519 +1,381 @@
-"""Commands: each parses its flags, calls and prints; no logic."""
+"""Commands: each is a function whose arguments are its flags and whose docstring is its help; it calls and prints, no logic."""
 
 import functools
 import shlex
+from collections.abc import Callable
 from dataclasses import dataclass, field, make_dataclass
+from math import radians
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Literal
 
-from warpgs.app.flags import MAX_THREADS, check_range, listed, load_own, parse_flags, word_after
+from tyro.conf import OmitArgPrefixes, Positional, arg  # noqa: TID253 - flags are annotations, and only a command imports this file
+
+from warpgs.app.flags import MAX_THREADS, call, check_range, listed, load_own
 from warpgs.errors import UsageError
 from warpgs.io.images import MAX_PIXELS
 from warpgs.process import say
-from warpgs.report.progress import waiting
-
-# `warpgs demo`: write a synthetic scene. Parses, calls, prints; no logic.
+from warpgs.report.progress import Stages, waiting
 
 
-def run_demo(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help.
+def demo(
+    folder: Positional[Path], *, views: int = 24, width: int = 320, height: int = 240, seed: int = 0, object: bool = False,
+    format: Literal["transforms", "colmap"] | None = None,
+) -> None:  # fmt: skip
+    """Write a synthetic scene.
 
-    Raises:
-        UsageError: Flags exclude each other, or a value is invalid.
+    Args:
+        folder: Folder to write; new or empty.
+        views: Number of photographs.
+        width: Image width [px].
+        height: Image height [px].
+        seed: Seed of the textures, and of the shape of an object.
+        object: Write a single object instead of a still life; eight of the views are for training.
+        format: Format of --object: transforms (transforms.json with RGBA images; default) or colmap (RGB images with masks).
     """
-    import tyro
-
-    @dataclass(frozen=True)
-    class Demo:
-        folder: tyro.conf.Positional[Path]
-        """Folder to write; new or empty."""
-        views: int = 24
-        """Number of photographs."""
-        width: int = 320
-        """Image width [px]."""
-        height: int = 240
-        """Image height [px]."""
-        seed: int = 0
-        """Seed of the textures, and of the shape of an object."""
-        object: bool = False
-        """Write a single object instead of a still life; eight of the views are for training."""
-        format: str = "transforms"
-        """Format of --object: transforms (transforms.json with RGBA images) or colmap (RGB images with cut-out masks)."""
-
-    a = parse_flags(Demo, arguments, "warpgs demo", about)
-    check_range("--views", a.views, 8, 10_000)
-    check_range("--width", a.width, 32, 8192)
-    check_range("--height", a.height, 32, 8192)
-    check_range("--seed", a.seed, 0, 2**31 - 1)
-    if a.format not in ("transforms", "colmap"):
-        raise UsageError(f"--format must be transforms or colmap, not {a.format!r}")
-    if a.format != "colmap" and not a.object and word_after(arguments, "--format") is not None:
+    check_range("--views", views, 8, 10_000)
+    check_range("--width", width, 32, 8192)
+    check_range("--height", height, 32, 8192)
+    check_range("--seed", seed, 0, 2**31 - 1)
+    if format is not None and not object:
         raise UsageError("--format requires --object: the still life is always written as COLMAP")
-    size = {"views": a.views, "width": a.width, "height": a.height, "seed": a.seed}
-    if a.object:
-        from warpgs.synthetic.demo import write_object
+    from warpgs.synthetic.demo import write_demo, write_object
 
-        write_object(a.folder, form=a.format, **size, tell=waiting())
-        flags = "--split llff:8" + (" --masks cutout" if a.format == "colmap" else "")
+    sizes = {"views": views, "width": width, "height": height, "seed": seed}
+    if object:
+        write_object(folder, form=format or "transforms", **sizes, tell=waiting())
+        flags = "--split llff:8" + (" --masks cutout" if format == "colmap" else "")
     else:
-        from warpgs.synthetic.demo import write_demo
-
-        write_demo(a.folder, **size, tell=waiting())
+        write_demo(folder, **sizes, tell=waiting())
         flags = "--split every:8"
-    form = "transforms.json" if a.object and a.format == "transforms" else "COLMAP"
-    say(f"{a.folder}: {a.views} views of {a.width} x {a.height} px as a {form} folder")
-    say(f"next: warpgs fit {shlex.quote(str(a.folder))} {flags} --out run")
-    return 0
+    form = "transforms.json" if object and format != "colmap" else "COLMAP"
+    say(f"{folder}: {views} views of {width} x {height} px as a {form} folder")
+    say(f"next: warpgs fit {shlex.quote(str(folder))} {flags} --out run")
 
 
-# `warpgs poses`: find the poses of photographs or of a video. Parses, calls, prints; no logic.
+def poses(
+    photographs: Positional[Path], *, out: Path, frames: int | None = None, threads: int = 0, max_pixels: int = MAX_PIXELS,
+    allow_outside: bool = False, matcher: Path | None = None,
+) -> None:  # fmt: skip
+    """Find the poses of photographs or of a video.
 
+    Args:
+        photographs: Folder of photographs, or a video file.
+        out: Scene folder to write; new or empty.
+        frames: Frames to take from a video, evenly spaced and sharp. Default: 60.
+        threads: CPU threads; 0 for as many as there are cores.
+        max_pixels: Largest number of pixels that an image may have.
+        allow_outside: Allow links to photographs outside the folder.
+        matcher: ONNX file of `warpgs priors export --model xfeat`; finds matches where SIFT leaves photographs without a pose.
+    """
+    from warpgs.poses.find import FRAMES, TEXT, find_poses, report_lines
 
-def run_poses(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
-    from warpgs.poses.find import FRAMES, find_poses
-
-    @dataclass(frozen=True)
-    class Poses:
-        photographs: tyro.conf.Positional[Path]
-        """Folder of photographs, or a video file."""
-        out: Path
-        """Scene folder to write; new or empty."""
-        frames: int = FRAMES
-        """Frames to take from a video, evenly spaced and sharp."""
-        threads: int = 0
-        """CPU threads; 0 for as many as there are cores."""
-        max_pixels: int = MAX_PIXELS
-        """Largest number of pixels that an image may have."""
-        allow_outside: bool = False
-        """Allow links to photographs outside the folder."""
-
-        matcher: Path | None = None
-        """ONNX file of `warpgs priors export --model xfeat`; finds matches where SIFT leaves photographs without a pose."""
-
-    a = parse_flags(Poses, arguments, "warpgs poses", about)
-    check_range("--frames", a.frames, 3, 1000)
-    check_range("--threads", a.threads, 0, MAX_THREADS)
-    check_range("--max-pixels", a.max_pixels, 1, 2**40)
-    from warpgs.poses.find import TEXT, report_lines
-    from warpgs.report.progress import Stages
-
+    frames = FRAMES if frames is None else frames
+    check_range("--frames", frames, 3, 1000)
+    check_range("--threads", threads, 0, MAX_THREADS)
+    check_range("--max-pixels", max_pixels, 1, 2**40)
     record = find_poses(
-        a.photographs, a.out, frames=a.frames, threads=a.threads, max_pixels=a.max_pixels, allow_outside=a.allow_outside,
-        matcher=a.matcher, progress=Stages(),
+        photographs, out, frames=frames, threads=threads, max_pixels=max_pixels, allow_outside=allow_outside, matcher=matcher,
+        progress=Stages(),
     )  # fmt: skip
     for line in report_lines(record):
         say(line)
-    say(f"{a.out}: a COLMAP scene; the lines above are also in {a.out / TEXT}")
-    say(f"next: warpgs fit {shlex.quote(str(a.out))} --out run")
-    return 0
+    say(f"{out}: a COLMAP scene; the lines above are also in {out / TEXT}")
+    say(f"next: warpgs fit {shlex.quote(str(out))} --out run")
 
 
-# `warpgs view`: look at a model in a browser. Parses, calls, prints; no logic.
+def view(run: Positional[Path], *, port: int = 8080, device: str = "auto", reader: str | None = None) -> None:
+    """Look at a model in a browser.
 
-
-def run_view(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
-    @dataclass(frozen=True)
-    class View:
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`, also during the fit; or a file of Gaussians, in a format of `warpgs convert`."""
-        port: int = 8080
-        """Port of the viewer on this machine; 0 for any free one."""
-        device: str = "auto"
-        """Device that renders depth, coverage and error: auto, cpu or cuda."""
-        reader: str | None = None
-        """User-defined reader, as for `warpgs fit --reader`."""
-
-    a = parse_flags(View, arguments, "warpgs view", about)
-    check_range("--port", a.port, 0, 65535)
-    from warpgs.viewer.watch import view
-
-    view(a.run, a.port, a.device, a.reader)
-    return 0
-
-
-# `warpgs render`: render a run. Parses, calls, prints; no logic.
-
-
-def run_render(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help.
-
-    Raises:
-        UsageError: Cameras, a rule or antialiasing are given for a run.
+    Args:
+        run: Run folder of `warpgs fit`, also during the fit; or a file of Gaussians, in a format of `warpgs convert`.
+        port: Port of the viewer on this machine; 0 for any free one.
+        device: Device that renders depth, coverage and error: auto, cpu or cuda.
+        reader: User-defined reader, as for `warpgs fit --reader`.
     """
-    import tyro
+    check_range("--port", port, 0, 65535)
+    from warpgs.viewer.watch import view as show
 
-    @dataclass(frozen=True)
-    class Render:
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`, or a file of Gaussians from any program, in a format of `warpgs convert`."""
-        cameras: Path | None = None
-        """Cameras for a file of Gaussians: cameras.json, transforms.json, a COLMAP folder, or a scene."""
-        rule: str | None = None
-        """Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact."""
-        antialiased: bool = False
-        """Render a file of Gaussians with antialiasing. Needed for antialiased models (gsplat's rasterize_mode antialiased) if
-        the file does not declare this."""
-        path: str = "auto"
-        """auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views
-        (every view of the scene), or a .json file of keyframes."""
-        out: Path | None = None
-        """Folder for the images and film.mp4; or a file for the film alone: .mp4, .webm, .webp or .gif. Existing files are
-        replaced. Default: path-PATH in the run folder, or beside the file of Gaussians."""
-        seconds: float | None = None
-        """Duration of the film [s]. Default: chosen by the path."""
-        fps: int = 30
-        """Frames per second of the film."""
-        frames: int | None = None
-        """Number of frames. Default: seconds times fps."""
-        size: tuple[int, int] | None = None
-        """Width and height of the frames [px]. Default: those of the photographs."""
-        fov: float | None = None
-        """Vertical field of view [deg]. Default: that of the photographs."""
-        background: str = "auto"
-        """auto (the fit's colour; images of cut-out objects are transparent PNGs), black, white, #rrggbb or r,g,b in [0, 1]."""
-        sheet: bool = False
-        """Also write six frames in one image: sheet.png."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-        coverage: bool = False
-        """Also write images of the coverage by training views, into the subfolder coverage."""
+    show(run, port, device, reader)
 
-    a = parse_flags(Render, arguments, "warpgs render", about)
-    check_range("--fps", a.fps, 1, 1000)
-    from math import radians
 
-    from warpgs.pipeline.films.film import FilmSettings
-    from warpgs.pipeline.run.commands import render
+def render(
+    run: Positional[Path], *, cameras: Path | None = None, rule: str | None = None, antialiased: bool = False,
+    path: str = "auto", out: Path | None = None, seconds: float | None = None, fps: int = 30, frames: int | None = None,
+    size: tuple[int, int] | None = None, fov: float | None = None, background: str = "auto", sheet: bool = False,
+    device: str = "auto", coverage: bool = False,
+) -> list[str]:  # fmt: skip
+    """Render a run or a file of Gaussians.
 
-    settings = FilmSettings(a.frames, a.seconds, a.fps, a.size, None if a.fov is None else radians(a.fov))
-    if a.run.is_dir() and (a.cameras is not None or a.rule is not None or a.antialiased):
+    Args:
+        run: Run folder of `warpgs fit`, or a file of Gaussians from any program, in a format of `warpgs convert`.
+        cameras: Cameras for a file of Gaussians: cameras.json, transforms.json, a COLMAP folder, or a scene.
+        rule: Cut-offs with which a file of Gaussians was trained: inria (default), gsplat-1.6, gsplat-1.5 or exact.
+        antialiased: Render a file of Gaussians with antialiasing. Needed for antialiased models (gsplat's rasterize_mode
+            antialiased) if the file does not declare this.
+        path: auto (chosen from the cameras), turntable, spiral, interpolate (through the training views), views (every view of
+            the scene), or a .json file of keyframes.
+        out: Folder for the images and film.mp4; or a file for the film alone: .mp4, .webm, .webp or .gif. Existing files are
+            replaced. Default: path-PATH in the run folder, or beside the file of Gaussians.
+        seconds: Duration of the film [s]. Default: chosen by the path.
+        fps: Frames per second of the film.
+        frames: Number of frames. Default: seconds times fps.
+        size: Width and height of the frames [px]. Default: those of the photographs.
+        fov: Vertical field of view [deg]. Default: that of the photographs.
+        background: auto (the fit's colour; images of cut-out objects are transparent PNGs), black, white, #rrggbb or r,g,b in
+            [0, 1].
+        sheet: Also write six frames in one image: sheet.png.
+        device: auto, cpu or cuda.
+        coverage: Also write images of the coverage by training views, into the subfolder coverage.
+    """
+    check_range("--fps", fps, 1, 1000)
+    if run.is_dir() and (cameras is not None or rule is not None or antialiased):
         raise UsageError("--cameras, --rule and --antialiased are for files of Gaussians; leave them out for a run")
-    given = (a.cameras, a.rule) if a.run.is_file() or a.cameras is not None else None
-    for line in render(
-        a.run, a.path, a.out, settings, a.device,
-        background=a.background, coverage=a.coverage, sheet=a.sheet, file_of=given, antialiased=a.antialiased,
-    ):  # fmt: skip
+    from warpgs.pipeline.films.film import FilmSettings
+    from warpgs.pipeline.run import commands
+
+    settings = FilmSettings(frames, seconds, fps, size, None if fov is None else radians(fov))
+    return commands.render(
+        run, path, out, settings, device, background=background, coverage=coverage, sheet=sheet,
+        file_of=(cameras, rule) if run.is_file() or cameras is not None else None, antialiased=antialiased,
+    )  # fmt: skip
+
+
+def plot(
+    run: Positional[Path], *, out: Path | None = None, points: str = "gaussians", color: str = "own",
+    background: str = "white", size: tuple[int, int] = (1600, 1000), cameras: bool = True, device: str = "auto",
+) -> list[str]:  # fmt: skip
+    """Plot a run's cameras and Gaussians.
+
+    Args:
+        run: Run folder of `warpgs fit`.
+        out: PNG file to write. Default: plot.png in the run folder.
+        points: gaussians, or start (the points of the scene's reconstruction).
+        color: own (colour of the Gaussian or point), or coverage (how many training views see each Gaussian).
+        background: white or black.
+        size: Width and height [px].
+        cameras: Show the cameras.
+        device: auto, cpu or cuda.
+    """
+    from warpgs.pipeline.run import commands
+
+    return commands.plot(run, out, commands.PlotSettings(points, color, background, size, cameras), device)
+
+
+def mesh(
+    run: Positional[Path], *, out: Path, voxel: float | None = None, resolution: int | None = None, max_faces: int = 200_000,
+    depth: str = "median", device: str = "auto",
+) -> list[str]:  # fmt: skip
+    """Make a mesh of a run.
+
+    Args:
+        run: Run folder of `warpgs fit`.
+        out: File to write: .ply, or .glb (glTF).
+        voxel: Side of a voxel, in units of the scene's files; smaller voxels show more detail and more noise.
+        resolution: Voxels along the longest side of the mesh, instead of --voxel. Default: 256, or fewer for small images.
+        max_faces: Largest number of triangles; larger meshes are simplified.
+        depth: Rendered depth to fuse: median, or mean, which is less accurate at edges.
+        device: auto, cpu or cuda.
+    """
+    from warpgs.mesh.fuse import MeshOptions
+    from warpgs.pipeline.run import export
+
+    return export.mesh(run, out, MeshOptions(voxel, resolution, max_faces, depth), device, stage=Stages(), say=say)
+
+
+def prune(
+    run: Positional[Path], *, keep_psnr: float = 0.1, out: Path | None = None, device: str = "auto", reader: str | None = None
+) -> list[str]:
+    """Shrink a finished model.
+
+    Args:
+        run: Run folder of `warpgs fit`; it is not changed.
+        keep_psnr: Largest drop of the mean PSNR over the training views [dB].
+        out: Run folder to write; must not exist yet. Default: RUN-pruned.
+        device: auto, cpu or cuda.
+        reader: User-defined reader, as for `warpgs fit --reader`.
+    """
+    from warpgs.pipeline.run import commands
+
+    return commands.prune(run, keep_psnr, out, device, reader, Stages())
+
+
+def evaluate(
+    run: Positional[Path], *, device: str = "auto", lpips_weights: Path | None = None, reader: str | None = None,
+    by_coverage: bool = False,
+) -> list[str]:  # fmt: skip
+    """Score a run again.
+
+    Args:
+        run: Run folder of `warpgs fit`.
+        device: auto, cpu or cuda.
+        lpips_weights: File of `warpgs convert-lpips`; without it LPIPS is not measured.
+        reader: User-defined reader, as for `warpgs fit --reader`.
+        by_coverage: Split the scores by the number of training views that saw each pixel's surface: none, one, two or more.
+    """
+    from warpgs.pipeline.run import commands
+
+    return commands.evaluate(run, device, lpips_weights, reader, by_coverage)
+
+
+def convert_lpips(*, backbone: Path, heads: Path, out: Path) -> list[str]:
+    """Join published LPIPS weights.
+
+    Args:
+        backbone: torchvision's state dict of vgg16 or alexnet (.pth).
+        heads: vgg.pth or alex.pth of PerceptualSimilarity, folder lpips/weights/v0.1.
+        out: File to write (.safetensors).
+    """
+    from warpgs.pipeline.metrics import lpips
+
+    return lpips.convert_lpips(backbone, heads, out)
+
+
+COMMANDS: dict[str, Callable[..., Any]] = {
+    "demo": demo, "poses": poses, "view": view, "render": render, "plot": plot, "mesh": mesh, "prune": prune,
+    "eval": evaluate, "convert-lpips": convert_lpips,
+}  # fmt: skip
+"""Commands with the same flags at every call."""
+
+
+def run(name: str, arguments: list[str], about: str) -> int:
+    """Run a command, print the lines that it returns, and return its exit code; ``about`` describes it in its help."""
+    if name == "priors":
+        if arguments[:1] in (["-h"], ["--help"], ["--help-all"]):
+            for line in (f"warpgs priors: {about}", "", *PRIORS):
+                say(line)
+            return 0
+        if arguments[:1] not in (["show"], ["export"]):
+            raise UsageError("priors: give show or export; `warpgs priors --help` shows how")
+        command, about = show_priors() if arguments[0] == "show" else export_network()
+        name, arguments = f"priors {arguments[0]}", arguments[1:]
+    elif name in COMMANDS:
+        command = COMMANDS[name]
+    else:
+        command, more = {"export": export, "convert": convert, "compare": compare, "ablate": ablate}[name](arguments)
+        about = f"{about}\n\n{more}"
+    for line in call(command, arguments, f"warpgs {name}", about) or ():
         say(line)
     return 0
 
 
-# `warpgs plot`: plot a run's cameras and Gaussians. Parses, calls, prints; no logic.
+# Commands whose flags depend on the words of the command line, or on modules that take long to import. Each function
+# returns the command and a text for its help.
 
-
-def run_plot(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
-    @dataclass(frozen=True)
-    class Plot:
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`."""
-        out: Path | None = None
-        """PNG file to write. Default: plot.png in the run folder."""
-        points: str = "gaussians"
-        """gaussians, or start (the points of the scene's reconstruction)."""
-        color: str = "own"
-        """own (colour of the Gaussian or point), or coverage (how many training views see each Gaussian)."""
-        background: str = "white"
-        """white or black."""
-        size: tuple[int, int] = (1600, 1000)
-        """Width and height [px]."""
-        cameras: bool = True
-        """Show the cameras."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-
-    a = parse_flags(Plot, arguments, "warpgs plot", about)
-    from warpgs.pipeline.run.commands import PlotSettings, plot
-
-    for line in plot(a.run, a.out, PlotSettings(a.points, a.color, a.background, a.size, a.cameras), a.device):
-        say(line)
-    return 0
-
-
-# `warpgs priors`: show depth and saliency before a fit, or write networks as ONNX. Parses, calls, prints; no logic.
-
-USAGE = (
+PRIORS = (
     "usage: warpgs priors show SCENE --out DIR [flags]",
     "       warpgs priors export --model MODEL --out FILE.onnx [flags]",
     "",
     "`warpgs priors show --help` and `warpgs priors export --help` list their flags.",
 )
+Command = tuple[Callable[..., Any], str]
 
 
-def run_priors(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help.
-
-    Raises:
-        UsageError: The first argument is neither show nor export.
-    """
-    kinds = {"show": _show, "export": _export}
-    if not arguments or arguments[0] not in kinds:
-        if arguments and arguments[0] in ("-h", "--help", "--help-all"):
-            for line in (f"warpgs priors: {about}", "", *USAGE):
-                say(line)
-            return 0
-        raise UsageError("priors: give show or export; `warpgs priors --help` shows how")
-    return kinds[arguments[0]](arguments[1:])
-
-
-def _show(arguments: list[str]) -> int:
-    import tyro
-
-    from warpgs.io.images import MAX_PIXELS
+def show_priors() -> Command:
+    """Return `warpgs priors show`."""
+    from warpgs.pipeline.run import commands
+    from warpgs.pipeline.run.request import SceneRequest
     from warpgs.priors.views import PriorConfig
 
-    @dataclass(frozen=True)
-    class Show:
-        scene: tyro.conf.Positional[Path]
-        """Scene folder."""
-        out: Path
-        """Folder for PNG sheets, one for each training view."""
-        split: str | None = None
-        """Split, as for `warpgs fit`."""
-        downscale: int | None = None
-        """Factor by which both image sides shrink; if given, --max-side has no default limit."""
-        max_side: int | None = None
-        """Largest image side [px], 0 for no limit. Default: 1600 without --downscale."""
-        allow_outside: bool = False
-        """Allow names and links that point to files outside the scene folder."""
-        max_pixels: int = MAX_PIXELS
-        """Largest number of pixels that an image or a mask may have as stored."""
-        threads: int = 0
-        """CPU threads of the networks; 0 for as many as there are cores."""
-        source: str = "sweep"
-        """Method of depth estimation without a network: sweep or flow, as for --init.source of a fit."""
-        priors: tyro.conf.OmitArgPrefixes[PriorConfig] = field(default_factory=PriorConfig)
+    def show(
+        scene: Positional[Path], *, out: Path, split: str | None = None, downscale: int | None = None,
+        max_side: int | None = None, allow_outside: bool = False, max_pixels: int = MAX_PIXELS, threads: int = 0,
+        source: str = "sweep", priors: OmitArgPrefixes[PriorConfig],
+    ) -> list[str]:  # fmt: skip
+        """Write depth and saliency.
 
-    a = parse_flags(Show, arguments, "warpgs priors show", "write depth and saliency of each training view as images")
-    from warpgs.pipeline.run.commands import show_priors
-    from warpgs.pipeline.run.request import SceneRequest
+        Args:
+            scene: Scene folder.
+            out: Folder for PNG sheets, one for each training view.
+            split: Split, as for `warpgs fit`.
+            downscale: Factor by which both image sides shrink; if given, --max-side has no default limit.
+            max_side: Largest image side [px], 0 for no limit. Default: 1600 without --downscale.
+            allow_outside: Allow names and links that point to files outside the scene folder.
+            max_pixels: Largest number of pixels that an image or a mask may have as stored.
+            threads: CPU threads of the networks; 0 for as many as there are cores.
+            source: Method of depth estimation without a network: sweep or flow, as for --init.source of a fit.
+            priors: Networks.
+        """
+        check_range("--threads", threads, 0, MAX_THREADS)
+        request = SceneRequest(
+            str(scene), split, downscale, allow_outside=allow_outside, max_pixels=max_pixels, max_side=max_side
+        )
+        return commands.show_priors(request, priors, source, out, threads)
 
-    check_range("--threads", a.threads, 0, MAX_THREADS)
-    scene = SceneRequest(
-        str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels, max_side=a.max_side
-    )
-    for line in show_priors(scene, a.priors, a.source, a.out, a.threads):
-        say(line)
-    return 0
+    return show, "write depth and saliency of each training view as images"
 
 
-def _export(arguments: list[str]) -> int:
-    import tyro
+def export_network() -> Command:
+    """Return `warpgs priors export`."""
+    from warpgs.priors import export as networks
 
-    from warpgs.priors.export import ExportRequest
+    def write(request: OmitArgPrefixes[networks.ExportRequest], *, out: Path) -> list[str]:
+        """Write a network.
 
-    @dataclass(frozen=True)
-    class Export:
-        request: tyro.conf.OmitArgPrefixes[ExportRequest]
-        out: Path
-        """ONNX file to write; FILE.onnx.json beside it describes its input."""
+        Args:
+            request: The network.
+            out: ONNX file to write; FILE.onnx.json beside it describes its input.
+        """
+        return networks.export_network(request, out)
 
-    a = parse_flags(Export, arguments, "warpgs priors export", "write a network as an ONNX file")
-    from warpgs.priors.export import export_network
-
-    for line in export_network(a.request, a.out):
-        say(line)
-    return 0
+    return write, "write a network as an ONNX file"
 
 
-# `warpgs export`: write a run's Gaussians, or its cameras, to a file. Parses, calls, prints; no logic.
-
-
-def run_export(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
+def export(arguments: list[str]) -> Command:
+    """Return `warpgs export`."""
     from warpgs.app.format_flags import chosen_formats, filters_of, format_flags, format_lines
 
-    base = format_flags(arguments)
+    def write(run: Positional[Path], *, to: Path, flags: Annotated[format_flags(arguments), arg(name="")]) -> list[str]:
+        """Write a run's Gaussians or cameras.
 
-    @dataclass(frozen=True, kw_only=True)
-    class Export(base):
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`."""
-        to: Path
-        """File to write; its suffix chooses the format. For cameras: cameras.json, transforms.json, or sparse (COLMAP)."""
+        Args:
+            run: Run folder of `warpgs fit`.
+            to: File to write; its suffix chooses the format. For cameras: cameras.json, transforms.json, or sparse (COLMAP).
+            flags: Filters and options of formats.
+        """
+        formats, filters = chosen_formats(flags, to), filters_of(flags)
+        waiting()(f"writing {to.name}")
+        if to.suffix.lower() == ".html" and not formats:
+            from warpgs.viewer.html import export_html
 
-    page = "  .html: a page that shows the model in any browser"
-    a = parse_flags(Export, arguments, "warpgs export", f"{about}\n\n{format_lines()}\n{page}")
-    formats, filters = chosen_formats(a, a.to), filters_of(a)
-    waiting()(f"writing {a.to.name}")
-    if a.to.suffix.lower() == ".html" and not formats:
-        from warpgs.viewer.html import export_html
+            return export_html(run, to, filters)
+        from warpgs.pipeline.run import export
 
-        lines = export_html(a.run, a.to, filters)
-    else:
-        from warpgs.pipeline.run.export import export
+        return export.export(run, to, filters, formats[0] if formats else None)
 
-        lines = export(a.run, a.to, filters, formats[0] if formats else None)
-    for line in lines:
-        say(line)
-    return 0
+    return write, f"{format_lines()}\n  .html: a page that shows the model in any browser"
 
 
-# `warpgs convert`: write a file of Gaussians, or of cameras, in another format. Parses, calls, prints; no logic.
-
-
-def run_convert(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
+def convert(arguments: list[str]) -> Command:
+    """Return `warpgs convert`."""
     from warpgs.app.format_flags import chosen_formats, filters_of, format_flags, format_lines
 
-    base = format_flags(arguments)
+    def write(
+        source: Positional[Path], target: Positional[Path], flags: Annotated[format_flags(arguments), arg(name="")]
+    ) -> list[str]:
+        """Write a file of Gaussians or cameras in another format.
 
-    @dataclass(frozen=True, kw_only=True)
-    class Convert(base):
-        source: tyro.conf.Positional[Path]
-        """File of Gaussians to read; or cameras: cameras.json, transforms.json, or a COLMAP folder."""
-        target: tyro.conf.Positional[Path]
-        """File to write. For cameras: cameras.json, transforms.json, or sparse (COLMAP)."""
+        Args:
+            source: File of Gaussians to read; or cameras: cameras.json, transforms.json, or a COLMAP folder.
+            target: File to write. For cameras: cameras.json, transforms.json, or sparse (COLMAP).
+            flags: Filters and options of formats.
+        """
+        from warpgs.pipeline.run import export
 
-    a = parse_flags(Convert, arguments, "warpgs convert", f"{about}\n\n{format_lines()}")
-    from warpgs.pipeline.run.export import convert
+        waiting()(f"writing {target.name}")
+        return export.convert(source, target, filters_of(flags), chosen_formats(flags, target))
 
-    waiting()(f"writing {a.target.name}")
-    for line in convert(a.source, a.target, filters_of(a), chosen_formats(a, a.target)):
-        say(line)
-    return 0
-
-
-# `warpgs mesh`: make a mesh of a run. Parses, calls, prints; no logic.
-
-
-def run_mesh(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
-    @dataclass(frozen=True)
-    class Mesh:
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`."""
-        out: Path
-        """File to write: .ply, or .glb (glTF)."""
-        voxel: float | None = None
-        """Side of a voxel, in units of the scene's files; smaller voxels show more detail and more noise."""
-        resolution: int | None = None
-        """Voxels along the longest side of the mesh, instead of --voxel. Default: 256, or fewer for small images."""
-        max_faces: int = 200_000
-        """Largest number of triangles; larger meshes are simplified."""
-        depth: str = "median"
-        """Rendered depth to fuse: median, or mean, which is less accurate at edges."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-
-    a = parse_flags(Mesh, arguments, "warpgs mesh", about)
-    from warpgs.mesh.fuse import MeshOptions
-    from warpgs.pipeline.run.export import mesh
-    from warpgs.report.progress import Stages
-
-    options = MeshOptions(a.voxel, a.resolution, a.max_faces, a.depth)
-    for line in mesh(a.run, a.out, options, a.device, stage=Stages(), say=say):
-        say(line)
-    return 0
-
-
-# `warpgs prune`: shrink a finished model. Parses, calls, prints; no logic.
-
-
-def run_prune(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
-    @dataclass(frozen=True)
-    class Prune:
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`; it is not changed."""
-        keep_psnr: float = 0.1
-        """Largest drop of the mean PSNR over the training views [dB]."""
-        out: Path | None = None
-        """Run folder to write; must not exist yet. Default: RUN-pruned."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-        reader: str | None = None
-        """User-defined reader, as for `warpgs fit --reader`."""
-
-    a = parse_flags(Prune, arguments, "warpgs prune", about)
-    from warpgs.pipeline.run.commands import prune
-    from warpgs.report.progress import Stages
-
-    for line in prune(a.run, a.keep_psnr, a.out, a.device, a.reader, Stages()):
-        say(line)
-    return 0
-
-
-# `warpgs eval`: score a run again. Parses, calls, prints; no logic.
-
-
-def run_eval(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    import tyro
-
-    @dataclass(frozen=True)
-    class Eval:
-        run: tyro.conf.Positional[Path]
-        """Run folder of `warpgs fit`."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-        lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
-        reader: str | None = None
-        """User-defined reader, as for `warpgs fit --reader`."""
-        by_coverage: bool = False
-        """Split the scores by the number of training views that saw each pixel's surface: none, one, two or more."""
-
-    a = parse_flags(Eval, arguments, "warpgs eval", about)
-    from warpgs.pipeline.run.commands import evaluate
-
-    for line in evaluate(a.run, a.device, a.lpips_weights, a.reader, a.by_coverage):
-        say(line)
-    return 0
-
-
-# `warpgs convert-lpips`: join published LPIPS weights. Parses, calls, prints; no logic.
-
-
-def run_convert_lpips(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-
-    @dataclass(frozen=True)
-    class ConvertLpips:
-        backbone: Path
-        """torchvision's state dict of vgg16 or alexnet (.pth)."""
-        heads: Path
-        """vgg.pth or alex.pth of PerceptualSimilarity, folder lpips/weights/v0.1."""
-        out: Path
-        """File to write (.safetensors)."""
-
-    a = parse_flags(ConvertLpips, arguments, "warpgs convert-lpips", about)
-    from warpgs.pipeline.metrics.lpips import convert_lpips as convert
-
-    for line in convert(a.backbone, a.heads, a.out):
-        say(line)
-    return 0
-
-
-# `warpgs compare` and `warpgs ablate`: their common part. Parses, calls, prints; no logic.
+    return write, format_lines()
 
 
 def study_flags() -> type:
     """Return the dataclass of the flags that `compare` and `ablate` share."""
-    import tyro
-
     from warpgs.app.fit import scene_flags
 
     reading, unread = scene_flags(positional=False)
 
     @dataclass(frozen=True, kw_only=True)
     class Study:
-        scenes: tyro.conf.Positional[tuple[Path, ...]]
+        scenes: Positional[tuple[Path, ...]]
         """Scene folders."""
         out: Path
         """Folder of the study; repeat the command to continue an interrupted study."""
@@ -531,67 +393,54 @@ def study_flags() -> type:
         lpips_weights: Path | None = None
         """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
 
-    hint = Annotated[reading, tyro.conf.arg(name="")]
+    hint = OmitArgPrefixes[reading]
     return make_dataclass("Study", [("reading", hint, field(default=unread))], bases=(Study,), frozen=True, kw_only=True)
 
 
-def run_study_of(a, variants: dict, marks: dict) -> int:
-    """Run the study of parsed flags."""
+def run_study_of(a: Any, variants: dict, marks: dict) -> list[str]:
+    """Run the study of parsed flags; return lines for the user."""
     from warpgs.app.fit import scene_of
-    from warpgs.pipeline.farm.farm import EngineRequest
     from warpgs.pipeline.study.study import StudyRequest, run_study
 
     scenes = tuple(scene_of(a.reading, str(s)) for s in a.scenes)
-    farm = (
-        None
-        if a.slots is None and a.per_gpu is None
-        else EngineRequest(slots=a.slots, per_gpu=1 if a.per_gpu is None else a.per_gpu)
-    )
-    for line in run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, farm, marks)):
-        say(line)
-    return 0
+    apart = a.slots is not None or a.per_gpu is not None
+    engine = {"slots": a.slots, "per_gpu": 1 if a.per_gpu is None else a.per_gpu} if apart else None
+    return run_study(StudyRequest(scenes, variants, a.seeds, a.out, a.device, a.lpips_weights, engine, marks))
 
 
-# `warpgs compare`: presets against each other. Parses, calls, prints; no logic.
-
-
-def run_compare(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
-    from warpgs.pipeline.train.presets import PRESETS
-
-    base = study_flags()
-
-    @dataclass(frozen=True, kw_only=True)
-    class Compare(base):
-        presets: str = ",".join(PRESETS)
-        """Presets as for `warpgs fit --preset`, separated by commas; the others are compared with the first."""
-
-    a = parse_flags(Compare, arguments, "warpgs compare", f"{about}\n\n{listed('presets', PRESETS.described())}")
+def compare(arguments: list[str]) -> Command:
+    """Return `warpgs compare`."""
     from warpgs.pipeline.study.study import preset_variants
-    from warpgs.pipeline.train.presets import preset_settings
+    from warpgs.pipeline.train.presets import PRESETS, preset_settings
 
-    names = [n.strip() for n in a.presets.split(",") if n.strip()]
-    for name in names:  # so that an error names its preset
-        load_own("preset", name, functools.partial(preset_settings, name))
-    return run_study_of(a, preset_variants(names, a.steps), {})
+    def study(flags: OmitArgPrefixes[study_flags()], *, presets: str = ",".join(PRESETS)) -> list[str]:
+        """Fit presets to scenes.
+
+        Args:
+            flags: Scenes and runs.
+            presets: Presets as for `warpgs fit --preset`, separated by commas; the others are compared with the first.
+        """
+        names = [n.strip() for n in presets.split(",") if n.strip()]
+        for name in names:  # so that an error names its preset
+            load_own("preset", name, functools.partial(preset_settings, name))
+        return run_study_of(flags, preset_variants(names, flags.steps), {})
+
+    return study, listed("presets", PRESETS.described())
 
 
-# `warpgs ablate`: a preset with one part changed at a time. Parses, calls, prints; no logic.
-
-
-def run_ablate(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help."""
+def ablate(arguments: list[str]) -> Command:
+    """Return `warpgs ablate`."""
+    from warpgs.pipeline.study.study import ablation_variants, preset_variants
     from warpgs.pipeline.train.presets import DEFAULT_PRESET, PRESETS
 
-    base = study_flags()
+    def study(flags: OmitArgPrefixes[study_flags()], *, preset: str = DEFAULT_PRESET) -> list[str]:
+        """Fit a preset with one part changed at a time.
 
-    @dataclass(frozen=True, kw_only=True)
-    class Ablate(base):
-        preset: str = DEFAULT_PRESET
-        """Preset, as for `warpgs fit --preset`; one part is changed at a time."""
+        Args:
+            flags: Scenes and runs.
+            preset: Preset, as for `warpgs fit --preset`; one part is changed at a time.
+        """
+        (config,) = load_own("preset", preset, lambda: preset_variants([preset], flags.steps)).values()
+        return run_study_of(flags, *ablation_variants(config))
 
-    a = parse_flags(Ablate, arguments, "warpgs ablate", f"{about}\n\n{listed('presets', PRESETS.described())}")
-    from warpgs.pipeline.study.study import ablation_variants, preset_variants
-
-    (config,) = load_own("preset", a.preset, lambda: preset_variants([a.preset], a.steps)).values()
-    return run_study_of(a, *ablation_variants(config))
+    return study, listed("presets", PRESETS.described())

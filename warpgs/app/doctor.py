@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from warpgs.app.flags import parse_flags
+from warpgs.app.flags import call
 from warpgs.device import ASSUMED_BYTES, format_bytes, machine_memory, prepare_kernel_cache, processor_name, usable_cores
-from warpgs.errors import ResourceError, UsageError, install_extras
-from warpgs.process import counted, fast_imports, hidden_stderr, printable, say
+from warpgs.errors import ResourceError, install_extras
+from warpgs.process import counted, fast_imports, hidden_stderr, printable
 from warpgs.report.progress import Stages, waiting
 
 OK, MISSING, NOTE = "ok", "missing", "note"
@@ -43,35 +43,22 @@ class Finding:
     """True if a fit needs what was checked."""
 
 
-@dataclass(frozen=True)
-class Package:
-    """A package that warpgs uses."""
-
-    distribution: str
-    """Name in the package index."""
-    module: str
-    """Module to import."""
-    required: bool
-    """True if a fit needs the package."""
-    use: str
-    """Feature that does not work without the package."""
-    imported: bool = True
-    """False if another check imports it in a subprocess; here it is only located."""
-
-
 PACKAGES = (
-    Package("torch", "torch", True, "tensors and gradients"),
-    Package("warp-lang", "warp", True, "the rasterizer's kernels"),
-    Package("numpy", "numpy", True, "reading scenes"),
-    Package("scipy", "scipy", True, "rotations and neighbours"),
-    Package("scikit-image", "skimage", True, "metrics"),
-    Package("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
-    Package("psutil", "psutil", False, "free memory"),
-    Package("safetensors", "safetensors", True, "checkpoints"),
-    Package("onnxruntime", "onnxruntime", False, "depth and feature networks"),
-    Package("pyvista", "pyvista", False, "3D overviews in reports", imported=False),
-    Package("vtk", "vtk", False, "3D overviews in reports", imported=False),
+    ("torch", "torch", True, "tensors and gradients"),
+    ("warp-lang", "warp", True, "the rasterizer's kernels"),
+    ("numpy", "numpy", True, "reading scenes"),
+    ("scipy", "scipy", True, "rotations and neighbours"),
+    ("scikit-image", "skimage", True, "metrics"),
+    ("opencv-contrib-python-headless", "cv2", True, "images, matches, video"),
+    ("psutil", "psutil", False, "free memory"),
+    ("safetensors", "safetensors", True, "checkpoints"),
+    ("onnxruntime", "onnxruntime", False, "depth and feature networks"),
+    ("pyvista", "pyvista", False, "3D overviews in reports"),
+    ("vtk", "vtk", False, "3D overviews in reports"),
 )
+"""Packages: name in the package index, module, whether a fit needs it, and the feature that does not work without it."""
+ONLY_LOCATED = ("pyvista", "vtk")
+"""Modules that another check imports in a subprocess, because importing VTK takes long."""
 EXTRAS = {
     "poses": ("pycolmap", "photographs without cameras"),
     "view": ("viser", "the viewer and HTML pages of models"),
@@ -98,39 +85,30 @@ def _python() -> Iterable[Finding]:
     yield Finding("System", OK, f"{platform.system()} {platform.release()} on {platform.machine()}")
 
 
-def _find(name: str) -> object:
-    """Look for a module without importing it, because importing VTK takes long; ModuleNotFoundError where it is missing."""
-    spec = importlib.util.find_spec(name)
-    if spec is None:
-        raise ModuleNotFoundError(f"No module named {name!r}")
-    return spec
-
-
-def _package(package: Package) -> Finding:
+def _package(distribution: str, name: str, required: bool, use: str) -> Finding:
     """Import a package, since an installed package may still lack a system library."""
     try:
-        module = importlib.import_module(package.module) if package.imported else _find(package.module)
+        if name in ONLY_LOCATED and importlib.util.find_spec(name) is None:
+            raise ModuleNotFoundError(f"No module named {name!r}")
+        module = None if name in ONLY_LOCATED else importlib.import_module(name)
     except Exception as e:
-        status = MISSING if package.required else NOTE
-        wanted = package.distribution
-        remedy = f"pip install {wanted}"
+        remedy = f"pip install {distribution}"
         if not isinstance(e, ModuleNotFoundError):
-            remedy = f"pip install --force-reinstall {wanted}, or install the system library that the message names"
-        without = "a fit needs it" if package.required else "a fit runs without it"
-        return Finding(wanted, status, f"{_reason(e)} ({package.use}; {without})", remedy, package.required)
+            remedy = f"pip install --force-reinstall {distribution}, or install the system library that the message names"
+        without = "a fit needs it" if required else "a fit runs without it"
+        return Finding(distribution, MISSING if required else NOTE, f"{_reason(e)} ({use}; {without})", remedy, required)
     try:
-        version = importlib.metadata.version(package.distribution)
+        detail = importlib.metadata.version(distribution)
     except importlib.metadata.PackageNotFoundError:  # built from source, or another build of the same module
-        version = str(getattr(module, "__version__", "of unknown version"))
-    detail = version
-    if package.module == "onnxruntime":
+        detail = str(getattr(module, "__version__", "of unknown version"))
+    if module is not None and name == "onnxruntime":
         names = [n.removesuffix("ExecutionProvider") for n in module.get_available_providers()]
         detail += f", providers: {', '.join(names)}"
-    return Finding(package.distribution, OK, detail, required=package.required)
+    return Finding(distribution, OK, detail, required=required)
 
 
 def _packages() -> Iterable[Finding]:
-    return map(_package, PACKAGES)
+    return (_package(*row) for row in PACKAGES)
 
 
 def _extras() -> Iterable[Finding]:
@@ -245,7 +223,7 @@ def _kernel_cache() -> Iterable[Finding]:
     topic = "Kernel cache"
     try:
         folder = Path(_quiet_warp().config.kernel_cache_dir)
-        refused = prepare_kernel_cache().refused
+        refused = prepare_kernel_cache()[1]
     except ResourceError as e:
         yield Finding(topic, MISSING, str(e), "set WARP_CACHE_PATH or TMPDIR to a folder that you may write to", True)
         return
@@ -323,14 +301,7 @@ def _findings(check: Callable[[], Iterable[Finding]]) -> list[Finding]:
 
 
 def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]:
-    """Check everything that a fit and its report need.
-
-    Args:
-        tell: Called with lines on the progress.
-
-    Returns:
-        The findings in the order of the report. Nothing is raised: a check that fails is itself a finding.
-    """
+    """Check everything that a fit and its report need."""
     with ThreadPoolExecutor(len(APART)) as pool:
         apart = {check: pool.submit(_findings, check) for check in CHECKS if check in APART}
         checks = [check for check in CHECKS if check not in APART]
@@ -339,15 +310,7 @@ def diagnose(tell: Callable[[str], object] = lambda line: None) -> list[Finding]
 
 
 def print_report(findings: list[Finding], console=None) -> int:
-    """Print the findings as a table, and the fixes below it.
-
-    Args:
-        findings: Result of `diagnose`.
-        console: A `rich.console.Console`; None for the standard output.
-
-    Returns:
-        The exit code: 0 if a fit can run, else 4.
-    """
+    """Print the findings as a table, and the fixes below it."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.markup import escape
@@ -384,41 +347,26 @@ def print_report(findings: list[Finding], console=None) -> int:
 # `warpgs doctor`: check this machine. Parses, calls, prints; no logic.
 
 
-def run_doctor(arguments: list[str], about: str) -> int:
-    """Run the command; ``about`` describes it in its help.
+def run(arguments: list[str], about: str) -> int:
+    """Run the command; ``about`` describes it in its help."""
 
-    Raises:
-        UsageError: Flags exclude each other, or a value is invalid.
-    """
+    def doctor(*, warm: bool = False) -> int:
+        """Check this machine.
 
-    @dataclass(frozen=True)
-    class Doctor:
-        warm: bool = False
-        """Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks."""
-        repeat: Path | None = None
-        """File not_finite.safetensors of a run: repeat the saved step, name the non-finite values, and skip the checks."""
-        device: str = "auto"
-        """Device for --repeat: auto, cpu or cuda."""
-
-    a = parse_flags(Doctor, arguments, "warpgs doctor", about)
-    if a.repeat is None and a.device != "auto":
-        raise UsageError("--device requires --repeat")
-    if a.repeat is not None:
-        from warpgs.pipeline.run.commands import repeat_failed_step
-
-        for line in repeat_failed_step(a.repeat, a.device):
-            say(line)
-        return 0
-    if a.warm:
+        Args:
+            warm: Compile the kernels of a fit with pinhole cameras for this machine's devices, and skip the checks.
+        """
+        if warm:
+            with fast_imports():
+                from warpgs.pipeline.run.precompile import print_warming
+            waiting()("compiling kernels")
+            print_warming()
+            return 0
+        stages = Stages()
+        stages("checking this machine")
         with fast_imports():
-            from warpgs.pipeline.run.precompile import print_warming
-        waiting()("compiling kernels")
-        print_warming()
-        return 0
+            findings = diagnose(waiting())
+        stages.clear()
+        return print_report(findings)
 
-    stages = Stages()
-    stages("checking this machine")
-    with fast_imports():
-        findings = diagnose(waiting())
-    stages.clear()
-    return print_report(findings)
+    return call(doctor, arguments, "warpgs doctor", about)

@@ -3,11 +3,22 @@
 import dataclasses
 import inspect
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import MAX_THREADS, check_range, flags_of, listed, load_own, parse_flags, settings_of, word_after
+from warpgs.app.flags import (
+    MAX_THREADS,
+    MAX_WHOLE,
+    check_range,
+    flags_of,
+    listed,
+    load_own,
+    parse_flags,
+    settings_of,
+    word_after,
+)
 from warpgs.device import parse_bytes
 from warpgs.errors import UsageError
 from warpgs.io.folder import READERS
@@ -26,11 +37,7 @@ from warpgs.ranks import join, place
 
 
 def scene_flags(*, positional: bool) -> tuple[type, Any]:
-    """Return the dataclass of the flags, and their defaults.
-
-    Args:
-        positional: True if the scene folder is a positional argument; False if the command has its own argument for scenes.
-    """
+    """Return the dataclass of the flags, and their defaults."""
     import tyro
 
     if positional:
@@ -41,12 +48,10 @@ def scene_flags(*, positional: bool) -> tuple[type, Any]:
 
 
 def scene_of(flags: Any, path: str) -> SceneRequest:
-    """Return the request for a scene folder from parsed flags; a user-defined reader is loaded.
-
-    Raises:
-        UsageError: There is no such reader.
-    """
+    """Return the request for a scene folder from parsed flags; a user-defined reader is loaded."""
     asked = settings_of(SceneRequest, flags)
+    if asked.downscale is not None:
+        check_range("--downscale", asked.downscale, 1, MAX_WHOLE)
     if asked.reader is not None:
         reader = asked.reader
         load_own(READERS.kind, reader, lambda: READERS.load(reader))
@@ -64,30 +69,27 @@ CONTINUING = {"--out": 1, "--resume": 0, "--device": 1, "--threads": 1, "--view"
 """Flags that may accompany --resume when a run keeps its settings, and the number of values of each."""
 
 
-def _request_type() -> type:
-    """Return the dataclass of the flags that are not settings of a fit: its input, output and machine."""
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Flags that are not settings of a fit: its input, output and machine."""
 
-    @dataclass(frozen=True, kw_only=True)
-    class Request:
-        out: Path
-        """Run folder to fill; new or empty."""
-        device: str = "auto"
-        """auto, cpu or cuda."""
-        threads: int = 0
-        """CPU threads; 0 for as many as there are cores."""
-        resume: bool = False
-        """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
-        all settings from the run."""
-        lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
-        time_budget: float | None = None
-        """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
-        view: bool = False
-        """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
-        view_port: int = 8080
-        """Port of --view; 0 for any free one."""
-
-    return Request
+    out: Path
+    """Run folder to fill; new or empty."""
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    threads: int = 0
+    """CPU threads; 0 for as many as there are cores."""
+    resume: bool = False
+    """Continue the run in --out from its last checkpoint; `warpgs fit --out RUN --resume` takes the scene, the device and
+    all settings from the run."""
+    lpips_weights: Path | None = None
+    """File of `warpgs convert-lpips`; without it LPIPS is not measured."""
+    time_budget: float | None = None
+    """Choose the number of steps so that set-up and steps take about this time [s]; not with --steps or --resume."""
+    view: bool = False
+    """Show the model in a browser while it trains, at the printed address; this changes no byte of the result."""
+    view_port: int = 8080
+    """Port of --view; 0 for any free one."""
 
 
 def _load(registry: Registry[Any], name: str) -> type[Any]:
@@ -152,34 +154,28 @@ def _choices() -> str:
     return "\n\n".join(listed(title, about) for title, about in lines.items())
 
 
-def _size() -> Any:
-    """Return the specification of a flag for a size in bytes, such as 2GiB."""
+def _read_by(metavar: str, read: Callable[[str], Any], kind: type, text: Callable[[Any], str]) -> Any:
+    """Return tyro's rule for a flag of one word, whose value is of ``kind`` or None, and is shown as ``text``."""
     import tyro
 
     return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="SIZE", instance_from_str=lambda words: parse_bytes(words[0]),
-        is_instance=lambda value: value is None or isinstance(value, int),
-        str_from_instance=lambda value: ["none" if value is None else f"{value}B"],
+        nargs=1, metavar=metavar, instance_from_str=lambda words: read(words[0]),
+        is_instance=lambda value: value is None or isinstance(value, kind), str_from_instance=lambda value: [text(value)],
     )  # fmt: skip
 
 
 def _names(parts: Parts) -> Any:
-    """Return the specification of a flag that names parts of a registry; their settings are flags of their own."""
-    import tyro
-
-    return tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1, metavar="NAME,...", instance_from_str=lambda words: tuple(parts.values()),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=lambda value: [",".join(t.name for t in value) or "none"],
-    )  # fmt: skip
+    """Return the rule of a flag that names parts of a registry; their settings are flags of their own."""
+    return _read_by("NAME,...", lambda _: tuple(parts.values()), tuple, lambda v: ",".join(t.name for t in v) or "none")
 
 
 def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     """Return the dataclass of all flags: the request, ``base``, the settings of strategy, loss terms and view modules."""
     import tyro
 
+    size = _read_by("SIZE", parse_bytes, int, lambda v: "none" if v is None else f"{v}B")
     special = {
-        "memory_limit": (_size(),), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
+        "memory_limit": (size,), "loss_terms": (_names(terms),), "view_modules": (_names(modules),),
         "priors": (tyro.conf.OmitArgPrefixes,), "strategy_config": (tyro.conf.Fixed, tyro.conf.Suppress),
     }  # fmt: skip
     chosen = dataclasses.replace(base, loss_terms=tuple(terms.values()), view_modules=tuple(modules.values()))
@@ -188,7 +184,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     own = {} if base.strategy_config is None else {flag_group(base.strategy): base.strategy_config}
     reading, unread = scene_flags(positional=True)
     fields.append(("reading", Annotated[reading, tyro.conf.arg(name="")], field(default=unread)))
-    kinds = (FitConfig, SceneRequest, _request_type())
+    kinds = (FitConfig, SceneRequest, Request)
     taken = {f.name for kind in kinds for f in dataclasses.fields(kind)} | {"config", "reading"}
     for name, settings in [*own.items(), *terms.items(), *modules.items()]:
         if name in taken:
@@ -199,7 +195,7 @@ def _flags(base: FitConfig, terms: Parts, modules: Parts) -> type:
     for name in VIEW_MODULES.names():
         about = (inspect.getdoc(VIEW_MODULES.find(name)) or "").partition("\n\n")[0]
         fields.append((name, Annotated[bool, tyro.conf.arg(help=about)], field(default=name in modules)))
-    return dataclasses.make_dataclass("Fit", fields, bases=(_request_type(),), frozen=True, kw_only=True)
+    return dataclasses.make_dataclass("Fit", fields, bases=(Request,), frozen=True, kw_only=True)
 
 
 def _config(a: Any, base: FitConfig, terms: Parts, modules: Parts) -> FitConfig:
@@ -240,60 +236,42 @@ def _continued(arguments: list[str], about: str) -> FitRequest:
     """Return the request that continues a run with its original settings."""
     from warpgs.pipeline.run.folder import stored_request
 
-    @dataclass(frozen=True, kw_only=True)
-    class Continue:
-        out: Path
-        """Run folder."""
-        resume: bool = False
-        """Continue the run."""
-        device: str | None = None
-        """auto, cpu or cuda. Default: the device of the run."""
-        threads: int = 0
-        """CPU threads; 0 for as many as there are cores."""
-        view: bool = False
-        """Show the model in a browser while it trains."""
-        view_port: int = 8080
-        """Port of --view; 0 for any free one."""
-        lpips_weights: Path | None = None
-        """File of `warpgs convert-lpips`; a run does not store the file, so give it again to measure LPIPS."""
+    a = parse_flags(Request, arguments, "warpgs fit", about)
+    view_port = _machine(a)
+    request = stored_request(a.out)
+    say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
+    device = request.device if word_after(arguments, "--device") is None else a.device
+    return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
 
-    a = parse_flags(Continue, arguments, "warpgs fit", about)
+
+def _machine(a: Any) -> int | None:
+    """Set the number of threads; return the port of the viewer, None for no viewer."""
     check_range("--threads", a.threads, 0, MAX_THREADS)
     check_range("--view-port", a.view_port, 0, 65535)
     if a.threads:
         set_threads(a.threads)
-    request = stored_request(a.out)
-    say(f"continuing the run: preset {request.config.preset}, {request.config.steps:,} steps, {request.scene.path}")
-    device, view_port = a.device or request.device, a.view_port if a.view else None
-    return dataclasses.replace(request, device=device, view_port=view_port, lpips_weights=a.lpips_weights)
+    return a.view_port if a.view else None
 
 
 def request_of(arguments: list[str], about: str) -> FitRequest:
-    """Return the request for the arguments of a command line.
-
-    Raises:
-        UsageError: A flag is wrong, or a plug-in cannot be loaded.
-    """
+    """Return the request for the arguments of a command line."""
     if _names_a_run_alone(arguments):
         return _continued(arguments, about)
     base, origin = _preset(arguments)
     parts = _parts(LOSS_TERMS, "--loss-terms", arguments, base.loss_terms), _view_modules(arguments, base)
     a: Any = parse_flags(_flags(base, *parts), arguments, "warpgs fit", f"{about}\n\n{_choices()}")
     scene = scene_of(a.reading, a.reading.path)
-    check_range("--threads", a.threads, 0, MAX_THREADS)
-    check_range("--view-port", a.view_port, 0, 65535)
-    if a.threads:
-        set_threads(a.threads)
+    view_port = _machine(a)
     config = dataclasses.replace(_config(a, base, *parts), preset=base.preset)
+    check_range("--steps", config.steps or 1, 1, MAX_WHOLE)
     _check_time_budget(a, arguments)
     notes = (origin_note(origin, base, config),)
     if word_after(arguments, "--preset") is None:
         say(f"preset {base.preset}: {PRESETS.described()[base.preset]}")
-    view_port = a.view_port if a.view else None
     return FitRequest(scene, a.out, config, a.device, a.resume, a.lpips_weights, a.time_budget, notes, view_port)
 
 
-def run_fit(arguments: list[str], about: str) -> int:
+def run(arguments: list[str], about: str) -> int:
     """Run the command; ``about`` describes it in its help."""
     if place()[0] > 0:
         be_quiet()

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from warpgs.app.flags import either, flags_of, listed, load_own, settings_of, word_after
+from warpgs.app.flags import flags_of, listed, load_own, settings_of, word_after
 from warpgs.errors import UsageError
 from warpgs.export.base import FORMATS, Format, all_formats, find_format
 from warpgs.pipeline.run.export import Filters
@@ -60,15 +60,7 @@ def _found(choice: str) -> Format:
 
 
 def chosen_formats(a: Any, target: Path) -> list[Format]:
-    """Return formats to prefer: the target file's format if it has options, then the format of --format if given.
-
-    Args:
-        a: Parsed flags of `format_flags`.
-        target: The file to write.
-
-    Raises:
-        UsageError: There is no such format, or an option belongs to another format.
-    """
+    """Return formats to prefer: the target file's format if it has options, then the format of --format if given."""
     named = [] if a.format is None else [_found(a.format)]
     written = next((type(f) for f in [*named, *all_formats()] if f.fits(target)), Format)
     for group, config in _with_options(a.format).items():
@@ -83,4 +75,6 @@ def chosen_formats(a: Any, target: Path) -> list[Format]:
 
 def filters_of(a: Any) -> Filters:
     """Return the filters of parsed flags of `format_flags`."""
-    return Filters(a.crop, either(a, "clean"), a.sh_degree, a.rotate)
+    if a.clean and a.no_clean:
+        raise UsageError("--clean and --no-clean exclude each other; give one of them")
+    return Filters(a.crop, a.clean or (False if a.no_clean else None), a.sh_degree, a.rotate)

@@ -39,12 +39,7 @@ def wxyz_of(camera: Camera) -> np.ndarray:
 
 
 def fov_y(camera: Camera, aspect: float = math.inf) -> float:
-    """Return the vertical field of view [rad] at which a window shows a camera's whole image, centred.
-
-    Args:
-        camera: The camera.
-        aspect: Width of the window over its height; by default the window is wider than the image.
-    """
+    """Return the vertical field of view [rad] at which a window shows a camera's whole image, centred."""
     return 2 * math.atan(max(0.5 * camera.height / float(camera.K[1, 1]), 0.5 * camera.width / float(camera.K[0, 0]) / aspect))
 
 
@@ -111,15 +106,10 @@ class Packed:
 
 
 def packed(gaussians: Gaussians) -> Packed:
-    """Return Gaussians for the browser.
-
-    Half precision is too coarse for covariances in scene units: an axis of 0.001 u has the square 1e-6, of which four bits
-    remain; the square of an axis below 0.00017 u becomes 0. In units in which the median of the longest axes is 1, nearly all
-    squares keep eleven bits.
-
-    Args:
-        gaussians: N Gaussians, on any device.
-    """
+    """Return Gaussians for the browser."""
+    # Half precision is too coarse for covariances in scene units: an axis of 0.001 u has the square 1e-6, of which four
+    # bits remain; the square of an axis below 0.00017 u becomes 0. In units in which the median of the longest axes is
+    # 1, nearly all squares keep eleven bits.
     means, quats, log_scales, logits, sh = (t.detach().cpu().double().numpy() for t in gaussians.tensors().values())
     median = float(np.median(log_scales.max(1))) if len(means) else 0.0
     scale = math.exp(median) / MEDIAN_AXIS
@@ -212,16 +202,9 @@ def middle_first(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 def turning_limits(cameras: Sequence[Camera], target: np.ndarray, up: np.ndarray) -> tuple[float, float]:
-    """Return how far a page may turn from the first camera around a target, to each side and up or down [rad].
-
-    The page turns as far as the photographs do, plus `MARGIN`: beyond, the model shows places that no photograph saw. With one
-    camera, and with photographs all round, the result is pi: no limit.
-
-    Args:
-        cameras: Cameras, at least one.
-        target: Point around which the page turns [u], shape [3].
-        up: Upward direction, unit length, shape [3].
-    """
+    """Return how far a page may turn from the first camera around a target, to each side and up or down [rad]."""
+    # The page turns as far as the photographs do, plus `MARGIN`: beyond, the model shows places that no photograph saw.
+    # With one camera, and with photographs all round, the result is pi: no limit.
     if len(cameras) < 2:
         return math.pi, math.pi
     # as seen from the target, and by the axis: cameras in a row look in parallel, those in a room outwards
@@ -247,21 +230,9 @@ def page_of(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "warpgs",
 ) -> tuple[str, list[str]]:
-    """Return the page as text, and notes for the user on differences from a render.
-
-    The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of a file, a
-    view or a machine, except ``title``.
-
-    Args:
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras; the page starts at the first. Without cameras it starts in front of the model.
-        background: Colour behind the scene, in [0, 1].
-        title: Title of the page.
-
-    Raises:
-        DataError: There is no Gaussian.
-        ResourceError: viser is not installed.
-    """
+    """Return the page as text, and notes for the user on differences from a render."""
+    # The page holds the Gaussians in their own units (`packed`), with colours of degree 0 only. It contains no name of
+    # a file, a view or a machine, except ``title``.
     if not len(gaussians):
         raise DataError("a page needs at least one Gaussian; fit the scene for longer")
     stored = packed(gaussians)
@@ -303,37 +274,14 @@ def write_html(
     background: Sequence[float] = (0.0, 0.0, 0.0),
     title: str = "warpgs",
 ) -> list[str]:
-    """Write a model as one HTML file, which appears whole or not at all; returns notes for the user (`page_of`).
-
-    Args:
-        path: The file; an existing one is replaced.
-        gaussians: N Gaussians in the units of the cameras.
-        cameras: Cameras; the page starts at the first. Without cameras it starts in front of the model.
-        background: Colour behind the scene, in [0, 1].
-        title: Title of the page.
-
-    Raises:
-        DataError: There is no Gaussian.
-        ResourceError: viser is not installed, or the file cannot be written.
-    """
+    """Write a model as one HTML file, which appears whole or not at all; returns notes for the user (`page_of`)."""
     text, notes = page_of(gaussians, cameras, background, title)
     write_text(Path(path), text)
     return notes
 
 
 def export_html(folder: Path, target: Path, filters: Filters = NO_FILTERS) -> list[str]:
-    """Write a run as one HTML file that starts at the middle training camera; returns lines for the user.
-
-    Args:
-        folder: The run folder.
-        target: The file to write.
-        filters: Filters of the model; floaters and needles are removed by default.
-
-    Raises:
-        DataError: The folder is not a run, or nothing is left of its model.
-        ResourceError: viser is not installed, another process writes into the file's folder, or the file cannot be written.
-        UsageError: A filter is invalid.
-    """
+    """Write a run as one HTML file that starts at the middle training camera; returns lines for the user."""
     require_viser()
     run = open_run(folder, "cpu")
     gaussians, rotation, lines = filtered(file_gaussians(run), run, filters, cleaned=True)

@@ -64,12 +64,7 @@ _MARK_LOADED = (
 
 
 def live_page(text: str, nonce: str) -> str:
-    """Return viser's page for a content policy that only runs scripts with a nonce.
-
-    Args:
-        text: The page of viser.
-        nonce: Word of the policy, of letters that are safe in an attribute.
-    """
+    """Return viser's page for a content policy that only runs scripts with a nonce."""
     own = f"<script>{NO_PARAMETERS}{NO_TEXT_AS_CODE}{_MARK_LOADED.replace('NONCE', nonce)}</script>"
     return text.replace("<head>", f"<head>{own}", 1).replace("<script", f'<script nonce="{nonce}"')
 
@@ -143,14 +138,7 @@ MESSAGES: Mapping[str, Schema] = {
 
 
 def read_frame(frame: bytes | str) -> dict[str, Any]:
-    """Return the message of a websocket frame, with ``type`` and checked fields.
-
-    Args:
-        frame: MessagePack, as viser's page sends it.
-
-    Raises:
-        DataError: The frame is not a message, not one of `MESSAGES`, or a field has an invalid value.
-    """
+    """Return the message of a websocket frame, with ``type`` and checked fields."""
     import msgspec
 
     if not isinstance(frame, bytes) or len(frame) > MAX_FRAME:
@@ -182,16 +170,7 @@ def write_frame(message: Mapping[str, Any]) -> bytes:
 
 
 def control_value(value: Any, control: Any) -> Any:
-    """Return a message's value as a value for a control, clamped to the control's limits.
-
-    Args:
-        value: Value of a message, as `read_frame` returns it.
-        control: A control of viser, with its present ``value`` and perhaps ``options``, ``min`` and ``max``; None for an
-            unknown one, which can only be a button.
-
-    Raises:
-        DataError: The control cannot have the value.
-    """
+    """Return a message's value as a value for a control, clamped to the control's limits."""
     present = True if control is None else control.value
     options = getattr(control, "options", None)
     low, high = getattr(control, "min", None), getattr(control, "max", None)
@@ -245,11 +224,7 @@ class Rules:
         """Websockets."""
 
     def checked(self, frame: bytes | str) -> bytes | None:
-        """Return a frame as viser may read it, or None for a value that its control cannot have.
-
-        Raises:
-            DataError: The frame is malformed.
-        """
+        """Return a frame as viser may read it, or None for a value that its control cannot have."""
         message = read_frame(frame)
         if message["type"] == "GuiUpdateMessage":
             try:
@@ -260,14 +235,7 @@ class Rules:
         return write_frame(message)
 
     def answer(self, inner: Callable[..., Any] | None, protocol: str, connection: Any, request: Any) -> Any:
-        """Return the answer to a request; None if its websocket may be opened.
-
-        Args:
-            inner: viser's own function, which returns files.
-            protocol: Name of the protocol that a websocket must speak.
-            connection: The connection.
-            request: The request, as websockets passes it.
-        """
+        """Return the answer to a request; None if its websocket may be opened."""
         from websockets.datastructures import Headers
 
         headers = request.headers
@@ -356,15 +324,8 @@ def _failed(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
 
 @contextlib.contextmanager
 def guarded_server(rules: Rules, bound: socket.socket, protocol: str) -> Iterator[None]:
-    """Make the server that viser starts in the block follow rules, and listen at the socket ``bound``.
-
-    viser has no option for such checks, so the function that starts its server is replaced in the block.
-
-    Args:
-        rules: The rules.
-        bound: The socket.
-        protocol: Name of the protocol that a websocket must speak.
-    """
+    """Make the server that viser starts in the block follow rules, and listen at the socket ``bound``."""
+    # viser has no option for such checks, so the function that starts its server is replaced in the block.
     import websockets.asyncio.server as module
 
     with _HOOK:
@@ -399,11 +360,7 @@ OTHER_PORT = "choose another port with --port (fit: --view-port), or 0 for any f
 
 
 def require_viser() -> None:
-    """Check that viser is installed.
-
-    Raises:
-        ResourceError: viser is not installed; the message names the package.
-    """
+    """Check that viser is installed."""
     try:
         version("viser")
     except PackageNotFoundError:
@@ -424,16 +381,7 @@ def _control_of(server: viser.ViserServer, uuid: str) -> Any:
 
 
 def open_server(port: int = PORT, label: str = "warpgs") -> viser.ViserServer:
-    """Start a server that only this machine reaches, at an address with a secret (`address`); ``server.stop()`` ends it.
-
-    Args:
-        port: Port to listen at; 0 for any free one.
-        label: Title of the panel.
-
-    Raises:
-        ResourceError: viser is not installed, or its version offers no way to check requests.
-        UsageError: The port is taken or invalid.
-    """
+    """Start a server that only this machine reaches, at an address with a secret (`address`); ``server.stop()`` ends it."""
     require_viser()
     import viser
 

@@ -31,19 +31,7 @@ POLL = 1.0
 
 
 def view(path: Path, port: int = PORT, device: str = "auto", reader: str | None = None) -> None:
-    """Show a run folder or a file of Gaussians until Ctrl-C; new checkpoints of a running fit are shown, too.
-
-    Args:
-        path: Run folder, also while its fit runs; or a file of any registered format.
-        port: Port to listen at; 0 for any free one.
-        device: Device that renders images: auto, cpu or cuda.
-        reader: User-defined reader, as for `warpgs fit --reader`.
-
-    Raises:
-        DataError: The path is neither a run folder nor a file of Gaussians.
-        ResourceError: viser or the device is missing.
-        UsageError: The port is taken, or the device is unknown.
-    """
+    """Show a run folder or a file of Gaussians until Ctrl-C; new checkpoints of a running fit are shown, too."""
     choose_device(device)
     if path.is_dir():
         read_record(path)
@@ -166,12 +154,7 @@ class LiveView:
 
 @contextlib.contextmanager
 def live_view(folder: Path, port: int = PORT) -> Iterator[LiveView]:
-    """Give a viewer of a fit that runs in the block; it closes when the fit ends, and `warpgs view` shows the run from then on.
-
-    Raises:
-        ResourceError: viser is not installed.
-        UsageError: The port is taken.
-    """
+    """Give a viewer of a fit that runs in the block; it closes when the fit ends."""
     server = open_server(port)
     try:
         say(f"watch the fit at {address(server)} (afterwards with `warpgs view {shlex.quote(str(folder))}`)")

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -69,16 +69,7 @@ class Content:
 
 
 def content_of_run(folder: Path, device: str = "cpu", views: Mapping[str, View] | None = None) -> Content:
-    """Read a run, finished or still going.
-
-    Args:
-        folder: The run folder.
-        device: auto, cpu or cuda.
-        views: Views that were read before, by name.
-
-    Raises:
-        DataError: The folder is not a run, or it holds no checkpoint yet.
-    """
+    """Read a run, finished or still going."""
     run = open_run(folder, device)
     level = load_checkpoint(folder)[0].get("columns.level")
     # a fit that continues may have written another checkpoint in between
@@ -102,11 +93,7 @@ def views_of(content: Content, reader: str | None = None) -> tuple[dict[str, Vie
 
 
 def content_of_file(path: Path, device: str = "cpu") -> Content:
-    """Read a file of Gaussians of any format; it is centred and scaled for the viewer.
-
-    Raises:
-        DataError: The file holds no Gaussians.
-    """
+    """Read a file of Gaussians of any format; it is centred and scaled for the viewer."""
     stored, antialiased = read_with_antialiasing(path, None, "file")
     if not len(stored):
         raise DataError(f"{path}: contains no Gaussians; export the model again")
@@ -161,17 +148,7 @@ class CropBox:
 
 
 def keyframe(camera: Camera, seconds: float, normalization: Normalization) -> dict[str, Any]:
-    """Return a camera of a path as JSON.
-
-    Args:
-        camera: Camera in scene units.
-        seconds: Time at which the path reaches the camera [s].
-        normalization: Similarity from file to scene units.
-
-    Returns:
-        ``c2w``, camera-to-world in OpenCV axes and file units, 4 rows of 4; ``fov_y``, the vertical field of view [rad]; and
-        ``seconds``.
-    """
+    """Return a camera of a path as JSON."""
     viewmat = convert_camera(camera, normalization, "scene", "file").viewmat
     c2w = np.eye(4)
     c2w[:3, :3] = viewmat[:3, :3].T
@@ -206,14 +183,7 @@ class Maps:
 
     @torch.no_grad()
     def image(self, kind: str, camera: Camera, gaussians: Gaussians, sh_degree: int) -> tuple[np.ndarray, str]:
-        """Return an image as uint8, shape [H, W, 3], and its description.
-
-        Args:
-            kind: One of `MAPS`.
-            camera: Camera of the browser.
-            gaussians: The Gaussians to show, in scene units: all of the model or some.
-            sh_degree: Degree of the colours.
-        """
+        """Return an image as uint8, shape [H, W, 3], and its description."""
         options = dataclasses.replace(self.content.model.options(), sh_degree=min(sh_degree, gaussians.sh_degree), record=False)
         drawn: dict[str, Callable[..., tuple[np.ndarray, str]]] = {
             RENDER: self._render, DEPTH: self._depth, COVERAGE: self._coverage, ERROR: self._error,
@@ -267,26 +237,10 @@ NOWHERE = "(choose one)"
 BOX, GIZMO = "/crop/box", "/crop"
 
 
-class Shown(Protocol):
-    """Methods of the window that the panel calls."""
-
-    def redraw(self) -> None:
-        """Send the current image."""
-
-    def step_into(self, name: str, client: Any) -> None:
-        """Move a browser's camera to the model's camera of that name."""
-
-    def reset(self, client: Any) -> None:
-        """Move a browser's camera back to where pages start."""
-
-    def camera_of(self, client: Any, side: int | None = None) -> Camera:
-        """Return a browser's camera."""
-
-
 class Panel:
     """Controls that all browsers share."""
 
-    def __init__(self, server: viser.ViserServer, content: Content, window: Shown, maps: bool):
+    def __init__(self, server: viser.ViserServer, content: Content, window: Window, maps: bool):
         """Make the controls that are useful for the model."""
         self.server, self.content, self.window = server, content, window
         self.keyframes: list[dict[str, Any]] = []
@@ -471,13 +425,7 @@ class Window:
     """Shows a model to all browsers that are connected; a later model of a fit replaces it."""
 
     def __init__(self, server: viser.ViserServer, content: Content, maps: bool = True):
-        """Show a model.
-
-        Args:
-            server: The server, without anything in its scene.
-            content: The model.
-            maps: Whether images may be rendered here: False while a fit runs in this process.
-        """
+        """Show a model."""
         self.server, self.content = server, content
         cameras = list(content.model.scene_cameras.values())
         self.first = self._first_camera()

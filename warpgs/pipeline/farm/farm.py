@@ -40,30 +40,12 @@ SECONDS_TO_SAVE = 60.0
 MAX_SLOTS = 256
 
 
-@dataclass(frozen=True)
-class Slot:
-    """A device, or a part of one, for one job at a time."""
-
-    device: str
-    """cpu or cuda, as the job sees it."""
-    threads: int
-    """CPU threads."""
-    environment: dict[str, str] = field(default_factory=dict)
-    """Environment variables of the slot's process, which select its GPU."""
+Slot = tuple[str, int, dict[str, str]]
+"""A device, or a part of one, for one job at a time: cpu or cuda, its CPU threads, and the variables that select its GPU."""
 
 
 def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
-    """Return the slots of this machine.
-
-    Args:
-        device: auto, cpu or cuda.
-        slots: Number of slots; None: ``per_gpu`` for each GPU, or one on a CPU.
-        per_gpu: Slots of each GPU.
-
-    Raises:
-        ResourceError: CUDA was requested and is missing.
-        UsageError: More slots are requested than are possible, or than the GPUs have.
-    """
+    """Return the slots of this machine."""
     import torch
 
     kind = choose_device(device)[0].type
@@ -77,10 +59,10 @@ def local_slots(device: str, slots: int | None, per_gpu: int) -> list[Slot]:
         )
     threads = max(1, torch.get_num_threads() // count)
     if not gpus:
-        return [Slot("cpu", threads)] * count
+        return [("cpu", threads, {})] * count
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     names = named.split(",")[:gpus] if named else [str(i) for i in range(gpus)]
-    return [Slot("cuda", threads, {"CUDA_VISIBLE_DEVICES": names[i % gpus]}) for i in range(count)]
+    return [("cuda", threads, {"CUDA_VISIBLE_DEVICES": names[i % gpus]}) for i in range(count)]
 
 
 class _Process:
@@ -88,9 +70,8 @@ class _Process:
 
     def __init__(self, slot: Slot, news: queue.SimpleQueue[tuple[_Process, str | None]]):
         """Start the process; its lines go to ``news``, then None when it ends."""
-        threads = {"OMP_NUM_THREADS": str(slot.threads)}
         self.slot, self.job = slot, ""
-        self.worker = PythonWorker(WORKER, environment={**threads, **slot.environment})
+        self.worker = PythonWorker(WORKER, environment={"OMP_NUM_THREADS": str(slot[1]), **slot[2]})
         threading.Thread(target=self._listen, args=(news,), daemon=True).start()
 
     def _listen(self, news: queue.SimpleQueue[tuple[_Process, str | None]]) -> None:
@@ -116,11 +97,11 @@ class LocalEngine:
     def _prepare(self) -> None:
         """Compile kernels once for all processes, in a process that sees all devices."""
         self._compiled = True
-        slot = self._free[-1]
-        alone = self.slots == 1 or slot.device == "cpu"  # that process can serve its slot afterwards
-        process = _Process(self._free.pop() if alone else Slot(slot.device, slot.threads), self._news)
+        device, threads, _ = self._free[-1]
+        alone = self.slots == 1 or device == "cpu"  # that process can serve its slot afterwards
+        process = _Process(self._free.pop() if alone else (device, threads, {}), self._news)
         try:
-            self._compile(process, slot.device)
+            self._compile(process, device)
         except BaseException:
             process.worker.end(0)
             raise
@@ -130,11 +111,7 @@ class LocalEngine:
             process.worker.end(SECONDS_TO_SAVE)
 
     def _compile(self, process: _Process, device: str) -> None:
-        """Compile kernels of all devices that a process sees.
-
-        Raises:
-            ResourceError: The process ends early.
-        """
+        """Compile kernels of all devices that a process sees."""
         process.worker.send(json.dumps({"kernels": device}))
         _, line = self._news.get()
         if line is None or json.loads(line).get("state") != "done":
@@ -150,17 +127,13 @@ class LocalEngine:
         return {name: process.worker.number for name, process in self._busy.items()}
 
     def start(self, job: FarmJob) -> None:
-        """Start a job in an idle process, or in a new one; before the first job, kernels are compiled.
-
-        Raises:
-            ResourceError: The kernels cannot be compiled.
-        """
+        """Start a job in an idle process, or in a new one; before the first job, kernels are compiled."""
         if not self._compiled:
             self._prepare()
         process = self._idle.pop() if self._idle else _Process(self._free.pop(), self._news)
         process.job = job.name
         self._busy[job.name] = process
-        process.worker.send(json.dumps({"job": job_text(job), "threads": process.slot.threads}))
+        process.worker.send(json.dumps({"job": job_text(job), "threads": process.slot[1]}))
 
     def wait(self, seconds: float) -> list[Event]:
         """Return the new events of all processes."""
@@ -245,24 +218,10 @@ class JobStatus:
 def run_farm(
     jobs: list[FarmJob], engine: Engine, show: Callable[[list[JobStatus]], object] = lambda _: None, *, poll: float = POLL
 ) -> list[JobStatus]:
-    """Run jobs until each is done or has failed.
-
-    A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more after the
-    others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has locked is checked
-    again later, and its result is used.
-
-    Args:
-        jobs: The jobs.
-        engine: Engine that runs the jobs; it is not closed.
-        show: Called with the status of all jobs whenever one changed, and every ``poll`` seconds.
-        poll: Time between checks of a job that another farm works on [s].
-
-    Returns:
-        The status of each job.
-
-    Raises:
-        ResourceError: A record or a lock cannot be written.
-    """
+    """Run jobs until each is done or has failed."""
+    # A finished, valid job is skipped. If the process of a job dies or runs out of memory, the job is started once more
+    # after the others, from its checkpoint. The folder of a running job is locked. A job whose folder another farm has
+    # locked is checked again later, and its result is used.
     return _Farm(jobs, engine, show, poll).run()
 
 
@@ -410,16 +369,7 @@ def row_of(status: JobStatus) -> JobRow:
 
 
 def write_index(folder: Path, statuses: list[JobStatus], seconds: float) -> None:
-    """Write index.html and results.csv of a farm.
-
-    Args:
-        folder: Folder of the results.
-        statuses: The jobs.
-        seconds: Time since the farm began [s].
-
-    Raises:
-        ResourceError: A file cannot be written.
-    """
+    """Write index.html and results.csv of a farm."""
     cards = []
     for status in statuses:
         record, job = status.record, status.job
@@ -454,67 +404,29 @@ INDEX_INTERVAL = 30.0
 """Time between two updates of the index while jobs run [s]."""
 
 
-@dataclass(frozen=True)
-class EngineRequest:
-    """An engine and its number of concurrent jobs."""
-
-    engine: str = "local"
-    """local (processes of this machine), ray or slurm."""
-    slots: int | None = None
-    """Number of concurrent jobs; None: ``per_gpu`` for each GPU, one on a CPU, as many as fit into Ray's cluster, or 100 with
-    Slurm."""
-    per_gpu: int = 1
-    """Jobs that share a GPU."""
-    threads: int = 1
-    """CPU threads of a job of ray or slurm."""
-    minutes: int = 240
-    """Time after which slurm ends a job [min]."""
-    partition: str | None = None
-    """Slurm's partition."""
-    slurm_folder: Path | None = None
-    """Private folder for Slurm's job files; None for one in the user's cache."""
-
-
-def make_engine(request: EngineRequest, device: str) -> Engine:
-    """Make the engine that is requested.
-
-    Raises:
-        ResourceError: The device is missing, the cluster cannot be reached, or Slurm's private folder cannot be written.
-        UsageError: The engine is unknown or not installed, has fewer slots than requested, or other users can write to
-            ``slurm_folder``.
-    """
-    r = request
-    if r.engine not in ENGINES:
-        raise UsageError(f"--engine {r.engine!r} is not one of {', '.join(ENGINES)}")
-    if r.engine == "local":
-        return LocalEngine(local_slots(device, r.slots, r.per_gpu))
-    if min(1 if r.slots is None else r.slots, r.per_gpu, r.threads, r.minutes) < 1:
+def make_engine(
+    device: str, engine: str = "local", *, slots: int | None = None, per_gpu: int = 1, threads: int = 1, minutes: int = 240,
+    partition: str | None = None, slurm_folder: Path | None = None,
+) -> Engine:  # fmt: skip
+    """Make an engine by its name, with the options of `warpgs farm`."""
+    if engine not in ENGINES:
+        raise UsageError(f"--engine {engine!r} is not one of {', '.join(ENGINES)}")
+    if engine == "local":
+        return LocalEngine(local_slots(device, slots, per_gpu))
+    if min(1 if slots is None else slots, per_gpu, threads, minutes) < 1:
         raise UsageError("--slots, --per-gpu, --threads and --minutes must be at least 1")
-    if r.engine == "ray":
+    if engine == "ray":
         from warpgs.pipeline.farm.ray import RayEngine
 
-        return RayEngine(choose_device(device)[0].type, r.slots, r.per_gpu, r.threads)
+        return RayEngine(choose_device(device)[0].type, slots, per_gpu, threads)
     from warpgs.pipeline.farm.slurm import SlurmEngine
 
     kind = choose_device(device)[0].type if device == "auto" else device
-    return SlurmEngine(kind, r.slots, r.threads, r.minutes, r.partition, r.slurm_folder)
+    return SlurmEngine(kind, slots, threads, minutes, partition, slurm_folder)
 
 
 def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bool | None = None) -> list[JobStatus]:
-    """Run a farm, show its progress, and write its index.
-
-    Args:
-        jobs: The jobs, with folders below ``results``.
-        engine: Engine that runs the jobs; it is closed at the end.
-        results: Folder of the results.
-        live: As in `FarmTable`.
-
-    Returns:
-        The status of each job.
-
-    Raises:
-        ResourceError: The folder cannot be written, or no job could be started.
-    """
+    """Run a farm, show its progress, and write its index."""
     began = time.monotonic()
     shown = written = began - INDEX_INTERVAL
     count = f"{len(jobs)} job{'' if len(jobs) == 1 else 's'}"
@@ -545,11 +457,7 @@ def run_and_show(jobs: list[FarmJob], engine: Engine, results: Path, *, live: bo
 
 
 def check_failures(statuses: list[JobStatus]) -> None:
-    """Check that no job failed.
-
-    Raises:
-        ResourceError: A job failed; the message names up to five failed jobs.
-    """
+    """Check that no job failed."""
     failed = [s for s in statuses if s.state == "failed"]
     if failed:
         first = failed[0].record

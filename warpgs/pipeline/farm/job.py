@@ -62,11 +62,7 @@ def job_text(job: FarmJob) -> str:
 
 
 def job_of(text: str) -> FarmJob:
-    """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text.
-
-    Raises:
-        UsageError: The user code cannot be imported.
-    """
+    """Return the job of `job_text`; user code that the job names is imported, as in the process that wrote the text."""
     values = schema.parse(text)
     r = values["request"]
     scene, config = SceneRequest(**r["scene"]), r["config"]
@@ -137,25 +133,13 @@ FARM_FLAGS = (
 """Flags of `warpgs fit` that a single job may not set."""
 
 
-@dataclass(frozen=True)
-class ListedJob:
-    """A scene to fit, and the job's flags in addition to those of all jobs."""
-
-    name: str
-    """Name, unique in the farm; the folder of its results."""
-    scene: Path
-    """Folder of the scene, or a video."""
-    flags: tuple[str, ...] = ()
-    """Arguments of `warpgs fit`."""
+ListedJob = tuple[str, Path, tuple[str, ...]]
+"""Name, unique in the farm, which is also that of the folder of results; folder of the scene, or a video; flags of `warpgs fit`
+in addition to those of all jobs."""
 
 
 def list_jobs(jobs: str) -> list[ListedJob]:
-    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file.
-
-    Raises:
-        DataError: A line of the file is not a job, or a name is not valid for a folder.
-        UsageError: There is nothing to fit, the folder is a single scene, or two jobs have the same name.
-    """
+    """List the jobs of a folder of scenes, a glob, or a .jsonl file, by name or in the order of the file."""
     path = Path(jobs)
     if path.is_dir():
         if any(r.probe(path) is not None for r in all_readers()):
@@ -167,20 +151,20 @@ def list_jobs(jobs: str) -> list[ListedJob]:
         found = _named(sorted(Path(p) for p in glob.glob(jobs)))
     if not found:
         raise UsageError(f"{jobs}: no scene found; give a folder of scenes, a glob in quotes, or a .jsonl file")
-    taken: dict[str, ListedJob] = {}
-    for job in found:
-        if not NAME.fullmatch(job.name) or job.name.endswith((".", " ")) or job.name in OWN_FILES:
+    taken: set[str] = set()
+    for name, _, _ in found:
+        if not NAME.fullmatch(name) or name.endswith((".", " ")) or name in OWN_FILES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} is not a valid name for a job and its folder; give another name in a .jsonl file"
+                f"{jobs}: {name[:100]!r} is not a valid name for a job and its folder; give another name in a .jsonl file"
             )
-        if (size := len(os.fsencode(job.name))) > MOST_BYTES:
+        if (size := len(os.fsencode(name))) > MOST_BYTES:
             raise DataError(
-                f"{jobs}: {job.name[:100]!r} has {size} bytes, but a job's name may have at most {MOST_BYTES}; give another "
+                f"{jobs}: {name[:100]!r} has {size} bytes, but a job's name may have at most {MOST_BYTES}; give another "
                 "name in a .jsonl file"
             )
-        if job.name.casefold() in taken:
-            raise UsageError(f"{jobs}: two jobs have the name {job.name!r}; give each line of a .jsonl file its own name")
-        taken[job.name.casefold()] = job
+        if name.casefold() in taken:
+            raise UsageError(f"{jobs}: two jobs have the name {name!r}; give each line of a .jsonl file its own name")
+        taken.add(name.casefold())
     return found
 
 
@@ -188,9 +172,9 @@ def _named(scenes: list[Path]) -> list[ListedJob]:
     """Name scenes by their folders; if two folders have the same name, by their paths below the common folder."""
     scenes = [Path(os.path.abspath(s)) for s in scenes]
     if len({s.name.casefold() for s in scenes}) == len(scenes):
-        return [ListedJob(s.name, s) for s in scenes]
+        return [(s.name, s, ()) for s in scenes]
     above = os.path.commonpath(scenes)
-    return [ListedJob("-".join(s.relative_to(above).parts), s) for s in scenes]
+    return [("-".join(s.relative_to(above).parts), s, ()) for s in scenes]
 
 
 def _read(path: Path) -> list[ListedJob]:
@@ -219,7 +203,7 @@ def _job(values: Any, folder: Path) -> ListedJob:
     _LINE(values, "")
     scene = Path(os.path.abspath(folder / values["scene"]))
     flags = [word for key, value in values.items() if key not in ("scene", "name") for word in _flag(key, value)]
-    return ListedJob(values.get("name", scene.name), scene, tuple(flags))
+    return values.get("name", scene.name), scene, tuple(flags)
 
 
 def _flag(key: str, value: Any) -> list[str]:
@@ -297,11 +281,7 @@ class JobRecord:
 
 
 def write_record(folder: Path, record: JobRecord) -> None:
-    """Write the record of a job.
-
-    Raises:
-        ResourceError: The record cannot be written.
-    """
+    """Write the record of a job."""
     write_json(folder / RECORD, asdict(record))
 
 
@@ -316,11 +296,7 @@ def read_job_record(folder: Path) -> JobRecord | None:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file, in hexadecimal digits.
-
-    Raises:
-        ResourceError: The file cannot be read.
-    """
+    """Return the SHA-256 of a file, in hexadecimal digits."""
     try:
         return input_digest(path, path.parent)
     except OSError as e:

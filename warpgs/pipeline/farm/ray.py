@@ -25,19 +25,7 @@ class RayEngine:
     name = "ray"
 
     def __init__(self, device: str, slots: int | None, per_gpu: int, threads: int = 1, address: str | None = None):
-        """Connect to a cluster, or start Ray on this machine.
-
-        Args:
-            device: cpu or cuda.
-            slots: Jobs at a time; None for as many as fit into the cluster now.
-            per_gpu: Jobs that share a GPU.
-            threads: CPU threads of a job.
-            address: Address of the cluster; None: the cluster that RAY_ADDRESS names, or else a new one on this machine.
-
-        Raises:
-            ResourceError: The cluster cannot be reached, or Ray does not start.
-            UsageError: Ray is not installed, or no job fits into the cluster.
-        """
+        """Connect to a cluster, or start Ray on this machine."""
         address = address or os.environ.get("RAY_ADDRESS") or "local"
         if address == "local":  # Ray asks for a token unless RAY_AUTH_MODE says otherwise; without this it keeps one in ~/.ray
             os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
@@ -94,10 +82,8 @@ class RayEngine:
 
 
 def _connect(ray: Any, address: str) -> None:
-    """Join a cluster, or start one with its sockets in a private folder, because Ray's default folders have mode 0777.
-
-    The address is never read from ``/tmp/ray``, where other users can write.
-    """
+    """Join a cluster, or start one with its sockets in a private folder, because Ray's default folders have mode 0777."""
+    # The address is never read from ``/tmp/ray``, where other users can write.
     own = {"include_dashboard": False, "_temp_dir": str(private_folder() / "ray")} if address == "local" else {}
     try:
         ray.init(address=address, log_to_driver=False, logging_level="warning", **own)

@@ -9,7 +9,6 @@ import shlex
 import shutil
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from warpgs.errors import ResourceError, UsageError, WarpgsError
@@ -17,7 +16,7 @@ from warpgs.files import write_text
 from warpgs.locks import private_shared_folder
 from warpgs.pipeline.farm.job import Event, FarmJob, job_text
 from warpgs.pipeline.farm.work import run_job
-from warpgs.process import ProgramResult, interrupting_signals, run_program, say
+from warpgs.process import interrupting_signals, run_program, say
 
 # The engine for Slurm clusters: a Slurm job for each scene, by sbatch, squeue and scancel.
 #
@@ -43,17 +42,6 @@ PATIENCE = 60.0
 """Time limit of a command of Slurm [s]."""
 
 
-@dataclass
-class _Queued:
-    """A job that was handed to Slurm."""
-
-    slurm_id: str
-    number: int
-    """Number in the names of the job's files in the private folder."""
-    missed: int = 0
-    """Number of calls of squeue that did not list the job."""
-
-
 class SlurmEngine:
     """Hands each job to Slurm."""
 
@@ -68,20 +56,7 @@ class SlurmEngine:
         partition: str | None = None,
         folder: Path | None = None,
     ):
-        """Look for Slurm, and make a private folder.
-
-        Args:
-            device: cpu or cuda.
-            slots: Jobs that are queued or running at a time; None for 100.
-            threads: CPU threads of a job.
-            minutes: Time after which Slurm ends a job [min].
-            partition: Slurm's partition; None for its default.
-            folder: As the base of `private_shared_folder`.
-
-        Raises:
-            ResourceError: The private folder cannot be written.
-            UsageError: Slurm is not installed, or other users can write to the folder.
-        """
+        """Look for Slurm, and make a private folder."""
         missing = [p for p in ("sbatch", "squeue", "scancel") if shutil.which(p) is None]
         if missing:
             raise UsageError(f"--engine slurm needs Slurm's {', '.join(missing)}: run warpgs on a machine of the cluster")
@@ -95,26 +70,25 @@ class SlurmEngine:
         self._stack = contextlib.ExitStack()
         self._folder = self._stack.enter_context(private_shared_folder(folder))
         self._numbers = itertools.count()
-        self._running: dict[str, _Queued] = {}
+        self._running: dict[str, tuple[str, int]] = {}
+        """Slurm's identifier, and the number in the names of the files in the private folder, by job."""
+        self._missed: dict[str, int] = {}
+        """Number of calls of squeue that did not list a job."""
         self._asked = float("-inf")
         self._told = False
 
     def start(self, job: FarmJob) -> None:
-        """Hand a job to Slurm.
-
-        Raises:
-            ResourceError: Slurm rejects it.
-        """
+        """Hand a job to Slurm."""
         number = next(self._numbers)
         text, answer, log = (self._folder / f"{number}.{kind}" for kind in ("json", "answer", "log"))
         write_text(text, job_text(job))
         command = [sys.executable, "-P", "-m", "warpgs.pipeline.farm.slurm", str(text), str(answer), str(self._threads)]
         script = f"#!/bin/sh\nexec {shlex.join(command)}\n"
-        done = _call("sbatch", "--parsable", *self._options, f"--output={log}", script=script)
-        slurm_id = done.output.strip().partition(";")[0]
-        if done.code or not slurm_id.isdecimal():
-            raise ResourceError(f"sbatch rejected job {job.name}: {_last_line(done.errors + done.output)}")
-        self._running[job.name] = _Queued(slurm_id, number)
+        code, output, errors = _call("sbatch", "--parsable", *self._options, f"--output={log}", script=script)
+        slurm_id = output.strip().partition(";")[0]
+        if code or not slurm_id.isdecimal():
+            raise ResourceError(f"sbatch rejected job {job.name}: {_last_line(errors + output)}")
+        self._running[job.name], self._missed[job.name] = (slurm_id, number), 0
 
     def wait(self, seconds: float) -> list[Event]:
         """Return the jobs that have ended; answer files are checked once a second, and squeue is called four times a minute."""
@@ -133,40 +107,40 @@ class SlurmEngine:
         self._folder.chmod(0o700)  # makes network file systems show files that are new
         there = set(os.listdir(self._folder))
         events = []
-        for name, job in list(self._running.items()):
-            if f"{job.number}.answer" in there:
-                events.append(self._answered(name, job))
-            elif job.missed >= MISSED:
-                reason = _last_line(self._output(job)) or "no output"
-                events.append(Event(name, "crashed", f"Slurm's job {job.slurm_id} ended without an answer: {reason}"))
+        for name, (slurm_id, number) in self._running.items():
+            if f"{number}.answer" in there:
+                events.append(self._answered(name, slurm_id, number))
+            elif self._missed[name] >= MISSED:
+                reason = _last_line(self._output(number)) or "no output"
+                events.append(Event(name, "crashed", f"Slurm's job {slurm_id} ended without an answer: {reason}"))
         for event in events:
             del self._running[event.name]
         return events
 
     def _count_missed(self) -> None:
         """Ask Slurm which jobs it has."""
-        done = _call("squeue", "--noheader", "--me", f"--name={NAME}", "--format=%A")
-        if done.code:  # Slurm is busy or away: nothing is known, and answers still count
+        code, output, errors = _call("squeue", "--noheader", "--me", f"--name={NAME}", "--format=%A")
+        if code:  # Slurm is busy or away: nothing is known, and answers still count
             if not self._told:
                 self._told = True
-                say(f"squeue failed; trying again: {_last_line(done.errors)}", error=True)
+                say(f"squeue failed; trying again: {_last_line(errors)}", error=True)
             return
-        there = set(done.output.split())
-        for job in self._running.values():
-            job.missed = 0 if job.slurm_id in there else job.missed + 1
+        there = set(output.split())
+        for name, (slurm_id, _) in self._running.items():
+            self._missed[name] = 0 if slurm_id in there else self._missed[name] + 1
 
-    def _answered(self, name: str, job: _Queued) -> Event:
-        state = (self._folder / f"{job.number}.answer").read_text("utf-8")
+    def _answered(self, name: str, slurm_id: str, number: int) -> Event:
+        state = (self._folder / f"{number}.answer").read_text("utf-8")
         if state not in STATES:
-            return Event(name, "crashed", f"Slurm's job {job.slurm_id} ended with an unknown answer")
+            return Event(name, "crashed", f"Slurm's job {slurm_id} ended with an unknown answer")
         for kind in ("json", "answer", "log"):
-            (self._folder / f"{job.number}.{kind}").unlink(missing_ok=True)
+            (self._folder / f"{number}.{kind}").unlink(missing_ok=True)
         return Event(name, state)
 
-    def _output(self, job: _Queued) -> str:
+    def _output(self, number: int) -> str:
         """Return the end of the output that Slurm wrote for a job."""
         try:
-            with (self._folder / f"{job.number}.log").open("rb") as f:
+            with (self._folder / f"{number}.log").open("rb") as f:
                 f.seek(0, os.SEEK_END)
                 f.seek(max(0, f.tell() - LAST_BYTES))
                 return f.read().decode("utf-8", "replace")
@@ -176,14 +150,14 @@ class SlurmEngine:
     def close(self) -> None:
         """Stop running jobs, drop queued ones, and remove the private folder; running fits save their state."""
         if self._running:
-            done = _call("scancel", *(job.slurm_id for job in self._running.values()))
-            if done.code:
-                say(f"scancel failed, jobs may still run: {_last_line(done.errors)}", error=True)
+            code, _, errors = _call("scancel", *(slurm_id for slurm_id, _ in self._running.values()))
+            if code:
+                say(f"scancel failed, jobs may still run: {_last_line(errors)}", error=True)
         self._running.clear()
         self._stack.close()
 
 
-def _call(program: str, *options: str, script: str = "") -> ProgramResult:
+def _call(program: str, *options: str, script: str = "") -> tuple[int, str, str]:
     """Call a command of Slurm. Variables such as SBATCH_ACCOUNT apply, but those of squeue do not: they could hide jobs."""
     return run_program(program, *options, stdin=script, timeout=PATIENCE, hidden="SQUEUE_")
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from warpgs import schema
 from warpgs.device import is_out_of_memory, no_memory_message
-from warpgs.errors import DataError, FolderHeldError, ResourceError, UsageError, WarpgsError
+from warpgs.errors import DataError, FolderHeldError, UsageError, WarpgsError
 from warpgs.files import (
     LOCK,
     appending,
@@ -26,6 +26,7 @@ from warpgs.files import (
     read_file,
     remove_file,
     remove_leftovers,
+    writable,
     write_bytes,
     writing_into,
 )
@@ -98,20 +99,14 @@ def _difference(record: dict[str, Any], config: FitConfig, fingerprint: str, spl
 
 
 def _set_aside(folder: Path) -> Path:
-    """Rename the folder of a run that cannot be used; no result is deleted.
-
-    Raises:
-        ResourceError: Another process writes there, or the folder cannot be moved.
-    """
+    """Rename the folder of a run that cannot be used; no result is deleted."""
     with hold_folder(folder):
         pass  # no process writes there; the lock is released first, since Windows moves no folder with an open file
     number = 1
     while os.path.lexists(target := folder.with_name(f"{folder.name}.old{number}")):
         number += 1
-    try:
+    with writable(folder, "move it by hand", f"moved to {target.name}"):
         return move_folder(folder, target.name)
-    except OSError as e:
-        raise ResourceError(f"{folder}: cannot be moved to {target.name} ({e.strerror or e}); move it by hand") from e
 
 
 def _with_lpips(metrics: dict[str, Any], folder: Path, request: FitRequest, variants: dict[str, str]) -> dict[str, Any]:
@@ -133,23 +128,9 @@ def ensure_run(
     resolved: FitConfig | None = None,
     **others: Any,
 ) -> Outcome:
-    """Ensure that a run folder holds the finished run that is requested.
-
-    A finished run with the same configuration, user code, data, views, kind of device and version is kept. An interrupted run
-    is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
-
-    Args:
-        request: The fit; ``out`` is its folder, ``resume`` is ignored.
-        fingerprint: Fingerprint of the scene's data.
-        split: Training and held-out views; None if no existing run can match.
-        device: cpu or cuda.
-        variants: Definitions of the required LPIPS scores by name; empty for none.
-        resolved: The settings of ``request`` with automatic ones chosen; None if no setting is automatic.
-        others: Further arguments of `fit`: on_step, verbose.
-
-    Returns:
-        The outcome. It contains the error of this run, if any, so that other runs continue.
-    """
+    """Ensure that a run folder holds the finished run that is requested."""
+    # A finished run with the same configuration, user code, data, views, kind of device and version is kept. An
+    # interrupted run is continued from its checkpoint. Any other folder is moved aside, and the run is repeated.
     try:
         record, why = _stored(request.out)
         gap = "" if record is None else _difference(record, resolved or request.config, fingerprint, split, device)
@@ -212,16 +193,7 @@ THUMBNAIL_SIDE = 480
 
 
 def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Run a job from its text; the job's output goes to its log.
-
-    Args:
-        text: Result of `job_text`.
-        threads: CPU threads; 0 for as many as there are.
-        on_step: As in `fit`.
-
-    Returns:
-        The state: done, failed, or held if another farm works on the job. The job's record has all other results.
-    """
+    """Run a job from its text; the job's output goes to its log."""
     if threads:
         set_threads(threads)
     job = job_of(text)
@@ -235,20 +207,14 @@ def run_job(text: str, threads: int = 0, on_step: Callable[[StepReport], object]
 @contextlib.contextmanager
 def _logged(path: Path) -> Iterator[None]:
     """Append all output of the block to a log, including that of native libraries."""
-    try:
+    with writable(path):
         file = appending(path)
-    except OSError as e:
-        raise ResourceError(f"{path}: cannot be written ({e.strerror or e}); write elsewhere, or free some disk space") from e
     with file, output_to(file.fileno()):
         yield
 
 
 def fit_job(job: FarmJob, on_step: Callable[[StepReport], object] | None = None) -> str:
-    """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does.
-
-    Raises:
-        ResourceError: The record cannot be written.
-    """
+    """Fit or continue a job, or keep a finished one, and write its record; returns the state as `run_job` does."""
     began, again, message = time.perf_counter(), False, ""
     source = source_stamp(Path(job.request.scene.path))
     try:

@@ -9,6 +9,7 @@ import io
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import write_bytes, write_json, write_text
 from warpgs.io.load import Split, held_out_split, split_views
 from warpgs.locks import hold_folder
-from warpgs.pipeline.farm.farm import EngineRequest, make_engine, run_and_show
+from warpgs.pipeline.farm.farm import make_engine, run_and_show
 from warpgs.pipeline.farm.job import PLY, FarmJob, JobRecord, file_digest
 from warpgs.pipeline.farm.work import Outcome, ensure_run
 from warpgs.pipeline.metrics.lpips import load_lpips
@@ -131,7 +132,7 @@ class StudyRequest:
     """auto, cpu or cuda."""
     lpips_weights: Path | None = None
     """File of `warpgs convert-lpips`; None to leave LPIPS out."""
-    engine: EngineRequest | None = None
+    engine: dict[str, Any] | None = None
     """Engine of a farm for the runs; None: one run after another in this process."""
     marks: dict[str, tuple[bool, ...]] = field(default_factory=dict)
     """Check marks of each variant in the order of `SWITCHES`; empty for a comparison of presets."""
@@ -480,7 +481,7 @@ def _farmed(request: StudyRequest, fits: dict[Key, tuple[Place, FitRequest]]) ->
     for key, (_, fit) in fits.items():
         name = "-".join(map(str, key)).replace(" ", "-")
         jobs[name] = FarmJob(name, fit, request.out / "farm" / name, request.out)
-    engine = make_engine(request.engine, request.device)
+    engine = make_engine(request.device, **request.engine)
     statuses = run_and_show(list(jobs.values()), engine, request.out)
     return {key: s.record for key, s in zip(fits, statuses, strict=True) if s.record is not None}
 

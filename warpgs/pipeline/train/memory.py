@@ -60,10 +60,7 @@ class Layout:
         return (self.table.lasting_bytes() + sums) * count + self.view_bytes
 
     def moments(self, count: int, instances: int, chunked: bool) -> dict[str, int]:
-        """Return the bytes in addition to `held` at each moment of a step that may be the heaviest.
-
-        ``instances`` is the number in the image or, if ``chunked``, in its heaviest chunk.
-        """
+        """Return the bytes in addition to `held` at each moment of a step that may be the heaviest."""
         sizes = replace(self.sizes, count=count, instances=instances, chunked=chunked)
         needs, own = add_needs((*RENDER, *self.parts), sizes), add_needs(self.parts, sizes)
         if SAMPLING not in own:  # no part samples
@@ -166,19 +163,7 @@ def layout_of(
     modules: Sequence[ViewModule] = (), *, kept: Sequence[TrainingView] = (), captured: bool = False, sums: int = 0,
     averaged: bool = False,
 ) -> Layout:  # fmt: skip
-    """Return the layout of steps of a fit.
-
-    Args:
-        table: The Gaussians with their columns.
-        views: Training views, including those of half size.
-        terms: Loss terms.
-        strategy: Density strategy.
-        modules: View modules.
-        kept: Other views that are kept on the device.
-        captured: True to capture steps as CUDA graphs where the device can.
-        sums: Number of sums of gradients that a step of several views keeps.
-        averaged: True if the parameters of the last steps are summed.
-    """
+    """Return the layout of steps of a fit."""
     largest = max((v.camera for v in views), key=lambda c: c.width * c.height)
     cuda = table.device.type == "cuda"
     sizes = StepSizes(
@@ -199,23 +184,7 @@ def most_instances(gaussians: Gaussians, cameras: list[Camera], options: Rasteri
 def plan(
     layout: Layout, *, count: int, instances: int, most: int, limit: int | None, available: int, capacity_factor: float = 1.0
 ) -> tuple[MemoryPlan, Layout]:
-    """Plan a fit that starts with ``count`` Gaussians and ``instances`` in the heaviest view, and may reach ``most`` Gaussians.
-
-    Args:
-        layout: Layout of the steps; with graphs if possible.
-        count: Gaussians at the start.
-        instances: Largest number of (Gaussian, tile) instances of a view at the start.
-        most: Number of Gaussians that densification may reach.
-        limit: Bytes that the fit may take; None for no limit.
-        available: Bytes that the device has free.
-        capacity_factor: Capacity of a CUDA graph for instances, as a multiple of the present number.
-
-    Returns:
-        The plan, and the layout of the steps: without graphs if graphs would exceed the limit.
-
-    Raises:
-        UsageError: The limit is below the memory of the smallest step.
-    """
+    """Plan a fit of ``count`` Gaussians and ``instances`` in the heaviest view, growing to ``most``; return its layout, too."""
     cap, refused = max(most, count), False
     single = replace(layout, graphs=0)
     if limit is not None:
