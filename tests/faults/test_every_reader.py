@@ -17,7 +17,7 @@ from warpgs.pipeline.metrics import lpips
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
     "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
-    "fromfile", "imdecode", "imread", "safe_open", "AvifImageFile", "HeifImageFile", "InferenceSession", "VideoCapture",
+    "fromfile", "imdecode", "imread", "safe_open", "HeifImageFile", "InferenceSession", "VideoCapture",
     "ZipFile",
 }  # fmt: skip
 """Names of functions and classes that open a file or decode what one holds."""
@@ -32,9 +32,8 @@ READERS = {
     "export/spz.py": {"SPZ.is_antialiased": "SPZ"},
     "io/transforms.py": {"_json": "cameras", "read_json": "transforms"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
-    "io/images.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
+    "io/image_files.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
     "io/others.py": {"_read_matrices": "dtu", "read_poses_bounds": "llff", "read_camera_rows": "middlebury"},
-    "io/image_formats/avif.py": {"open_image": "avif"},
     "io/maps.py": {"_read_array": "given maps"},
     "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
     "pipeline/farm/job.py": {"_read": "list of jobs", "read_job_record": "record of a job"},

@@ -9,7 +9,8 @@ from PIL import Image
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.images import Lens, decode, load_image
+from warpgs.io.image_files import decode
+from warpgs.io.images import Lens, load_image
 from warpgs.io.load import fingerprint, load_scene
 
 

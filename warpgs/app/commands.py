@@ -8,7 +8,7 @@ from typing import Annotated
 
 from warpgs.app.flags import MAX_THREADS, check_range, listed, load_own, parse_flags, word_after
 from warpgs.errors import UsageError
-from warpgs.io.images import MAX_PIXELS
+from warpgs.io.image_files import MAX_PIXELS
 from warpgs.process import say
 from warpgs.report.progress import waiting
 
@@ -266,7 +266,7 @@ def run_priors(arguments: list[str], about: str) -> int:
 def _show(arguments: list[str]) -> int:
     import tyro
 
-    from warpgs.io.images import MAX_PIXELS
+    from warpgs.io.image_files import MAX_PIXELS
     from warpgs.priors.views import PriorConfig
 
     @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError, UsageError
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-from warpgs.io.images import BLACK, MAX_PIXELS, REDUCED, Lens, LoadedImage, decode, list_images, load_image, unread_note
+from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
+from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, list_images, load_image
 from warpgs.io.maps import NO_MAPS, NOTHING_NAMED, GivenMaps, MapOptions, NamedMaps
 from warpgs.plugins import Registry
 from warpgs.scene import Camera, Scene, View

@@ -26,7 +26,8 @@ from warpgs.io.folder import (
     named_by_dtu,
     protocol_ids,
 )
-from warpgs.io.images import MAX_PIXELS, READ, cut_from_black, list_images, unread_note
+from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
+from warpgs.io.images import cut_from_black, list_images
 from warpgs.io.maps import NO_MAPS, MapOptions, check_found
 from warpgs.scene import Normalization, PointCloud, Scene, View, checked_scene
 

@@ -12,7 +12,8 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.files import inside, open_input, unread_reason
 from warpgs.geometry import CENTRAL
-from warpgs.io.images import MAX_PIXELS, LoadedImage, decode_png, turn_upright, undistortion_maps
+from warpgs.io.image_files import MAX_PIXELS, decode_png
+from warpgs.io.images import LoadedImage, turn_upright, undistortion_maps
 from warpgs.scene import DEPTH_KINDS, GivenDepth, View
 
 SUFFIXES = (".png", ".npy")

@@ -11,7 +11,7 @@ import torch
 
 from warpgs.errors import ResourceError, UsageError
 from warpgs.io.folder import image_scale
-from warpgs.io.images import MAX_PIXELS
+from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, coincident_views, load_scene, split_views
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.scene import Scene
