@@ -76,7 +76,7 @@ def measure(task: Task) -> dict:
             cameras = {f"{i:03d}.png": c for i, c in enumerate(camera_path(24, task.width, height))}
             write_maps(Path(work), name, more == "normals", shapes, cameras)
             request = SceneRequest(
-                str(folder), split, 1, depths=str(Path(work, "depths")) if KINDS[name] else None,
+                str(folder), split, downscale=1, depths=str(Path(work, "depths")) if KINDS[name] else None,
                 normals=str(Path(work, "normals")) if more else None, depth_kind=KINDS[name] or "metric",
             )  # fmt: skip
             fitted = warpgs.fit(request, config_of(task.preset, task.seed), device=task.device, verbose=False)

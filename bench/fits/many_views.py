@@ -33,7 +33,7 @@ def fit_in_new_process(task: tuple[str, str, str, int, str]) -> dict:
     """Fit (folder, split, preset, seed, device) and return its figures, with the peak memory of this process [bytes]."""
     folder, split, preset, seed, device = task
     config, began = config_of(preset, seed), time.perf_counter()
-    metrics = warpgs.fit(SceneRequest(folder, split, 1), config, device=device, verbose=False).metrics
+    metrics = warpgs.fit(SceneRequest(folder, split, downscale=1), config, device=device, verbose=False).metrics
     wall = time.perf_counter() - began
     views = metrics["protocol"]["training_views"]
     return {"seed": seed, "training_views": views, "wall": wall, "peak_rss_bytes": peak_resident()} | figures_of(metrics)

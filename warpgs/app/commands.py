@@ -297,7 +297,12 @@ def _show(arguments: list[str]) -> int:
 
     check_range("--threads", a.threads, 0, MAX_THREADS)
     scene = SceneRequest(
-        str(a.scene), a.split, a.downscale, allow_outside=a.allow_outside, max_pixels=a.max_pixels, max_side=a.max_side
+        str(a.scene),
+        a.split,
+        downscale=a.downscale,
+        allow_outside=a.allow_outside,
+        max_pixels=a.max_pixels,
+        max_side=a.max_side,
     )
     for line in show_priors(scene, a.priors, a.source, a.out, a.threads):
         say(line)

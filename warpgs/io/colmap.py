@@ -18,7 +18,6 @@ from warpgs.files import read_input, unread_reason
 from warpgs.io.folder import (
     Probe,
     Reader,
-    ReadOptions,
     SceneFolder,
     ViewList,
     has_folder,
@@ -27,7 +26,7 @@ from warpgs.io.folder import (
     rigid,
     view_name,
 )
-from warpgs.io.images import Lens, list_images
+from warpgs.io.images import Lens, ReadOptions, list_images
 from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}

@@ -19,8 +19,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
 from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
-from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, list_images, load_image
-from warpgs.io.maps import NO_MAPS, NOTHING_NAMED, GivenMaps, MapOptions, NamedMaps
+from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, ReadOptions, list_images, load_image
+from warpgs.io.maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.plugins import Registry
 from warpgs.scene import Camera, Scene, View
 
@@ -29,58 +29,6 @@ from warpgs.scene import Camera, Scene, View
 # One module of `warpgs.io` holds one format and registers its reader. Adding a format means adding one such module; a
 # user's own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``file.py:Class``
 # (examples/06_own_format.py).
-
-DEFAULT_MAX_SIDE = 1600
-"""Default of the longest side of an image [px]: 12 MP of a phone would take hours on a CPU."""
-
-
-def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
-    """Return the factor and the longest side [px] (0 for no limit) that follow from two settings, each None if not given."""
-    if max_side is None:
-        max_side = DEFAULT_MAX_SIDE if downscale is None else 0
-    return 1 if downscale is None else downscale, max_side
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Options for reading a scene folder."""
-
-    downscale: int = 1
-    """Factor, at least 1, by which both image sides shrink."""
-    strict: bool = False
-    """True to treat a frame without an image file as an error instead of a note."""
-    allow_outside: bool = False
-    """True to allow names and links that point to files outside the scene folder."""
-    masks: str = "ignore"
-    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
-    mask_keeps: str = "white"
-    """Colour of a mask file that keeps a pixel: white or black."""
-    black_is_empty: bool = True
-    """True to make dark pixels around an object transparent, if every image shows an object on black."""
-    max_pixels: int = MAX_PIXELS
-    """Largest number of pixels that an image or a mask may have."""
-    max_side: int = 0
-    """Largest image side [px], after ``downscale``; 0 for no limit."""
-    lenses: str = "undistort"
-    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (`Camera.model` names the lens)."""
-    maps: MapOptions = NO_MAPS
-    """Given maps of depth and normals."""
-    on_image: Callable[[Path], object] | None = None
-    """Called with the file of each image before it is decoded; None for no call."""
-
-    def __post_init__(self) -> None:
-        if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
-            raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
-        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or not 0 <= self.max_side:
-            raise UsageError(f"--max-side must be a whole number of pixels, 0 for no limit, not {self.max_side!r}")
-        if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
-            raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
-        if self.masks not in ("ignore", "cutout"):
-            raise UsageError(f"--masks must be ignore or cutout, not {self.masks!r}")
-        if self.lenses not in ("undistort", "native"):
-            raise UsageError(f"--lenses must be undistort or native, not {self.lenses!r}")
-        if self.mask_keeps not in ("white", "black"):
-            raise UsageError(f"--mask-keeps must be white or black, not {self.mask_keeps!r}")
 
 
 @dataclass(frozen=True)
@@ -350,7 +298,7 @@ class SceneFolder:
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
         self._reduced = False
-        self._maps = GivenMaps(options.maps, options.max_pixels, options.allow_outside)
+        self._maps = GivenMaps(options)
 
     def inside(self, path: Path) -> Path:
         """Return a path after a check that no link in it points outside the scene folder, unless this is allowed.

@@ -1,7 +1,8 @@
-"""Files of photographs: known by their first bytes, bounded by their header, checked for damage, decoded; and their EXIF.
+"""Files of photographs: their format, size, damage and pixels, and the EXIF of their lens.
 
-OpenCV decodes damaged files as far as it can, and at most prints a warning. So files are checked first. JPEG, and lossy WebP and
-AVIF, have no checksum: damage that leaves a valid code of the same length is not detected (docs/decisions/012-files-from-anyone.md).
+OpenCV decodes damaged files as far as it can, and at most prints a warning, so files are checked first. JPEG, and lossy WebP
+and AVIF, have no checksum: damage that leaves a valid code of the same length is not detected
+(docs/decisions/012-files-from-anyone.md).
 """
 
 from __future__ import annotations
@@ -73,7 +74,7 @@ RAW = (
 
 
 def unread_format(path: Path, head: bytes) -> str | None:
-    """Return a remedy for a photograph of an unsupported format, by suffix for RAW, else by its first bytes; None for any other file."""
+    """Return a remedy for a photograph of an unsupported format, by RAW's suffix or its first bytes; None for other files."""
     if path.suffix.lower() in RAW_SUFFIXES or brand(head) == "RAW":
         return RAW
     return HEIC if brand(head) == "HEIC" else None
@@ -130,9 +131,7 @@ def _unreadable(path: Path, error: OSError) -> DataError:
 
 # Size and damage. Functions take the bytes of a file, and raise a ValueError with the reason as part of a sentence.
 
-BROKEN = (
-    OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, OverflowError, struct.error,
-)  # fmt: skip
+BROKEN = (OSError, SyntaxError, RuntimeError, EOFError, LookupError, AttributeError, TypeError, ValueError, struct.error)
 """Errors that Pillow raises about malformed files, as fuzzing shows."""
 
 
@@ -181,7 +180,7 @@ def _size(name: str, data: bytes) -> tuple[int, int]:
 
 
 def _decoded(name: str, data: bytes) -> np.ndarray | None:
-    """Check a file for damage; return its pixels in BGR or BGRA if a decoder that finds damage has them, else None for OpenCV."""
+    """Check a file for damage; return its pixels in BGR or BGRA where the check has decoded them, else None for OpenCV."""
     if name == "JPEG":
         return _decoded_jpeg(data)
     if name == "AVIF":

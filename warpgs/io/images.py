@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from warpgs import geometry
 from warpgs.errors import DataError, UsageError
 from warpgs.io.image_files import MAX_PIXELS, decode, read_exif, read_image_file
-from warpgs.scene import GivenDepth, View
+from warpgs.scene import DEPTH_KINDS, GivenDepth, View
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
@@ -28,6 +29,90 @@ MAX_DISTORTION = 1e4
 """Distortion coefficients must be below this value."""
 MIN_FOLD = 1e-9
 """Inverse of a squared radius; a fold of the lens beyond that radius lies outside any image."""
+
+
+DEFAULT_MAX_SIDE = 1600
+"""Default of the longest side of an image [px]: 12 MP of a phone would take hours on a CPU."""
+
+
+def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
+    """Return the factor and the longest side [px] (0 for no limit) that follow from two settings, each None if not given."""
+    if max_side is None:
+        max_side = DEFAULT_MAX_SIDE if downscale is None else 0
+    return 1 if downscale is None else downscale, max_side
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Options for reading a scene folder."""
+
+    downscale: int | None = None
+    """Factor by which both image sides shrink; None for 1."""
+    strict: bool = False
+    """Treat a frame without an image file as an error."""
+    allow_outside: bool = False
+    """Allow names and links that point to files outside the scene folder."""
+    masks: str = "ignore"
+    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
+    mask_keeps: str = "white"
+    """Colour of a mask file that keeps a pixel: white or black."""
+    black_is_empty: bool = True
+    """Make dark pixels around the object transparent, if every image shows an object on a black background."""
+    score_masks: str | None = None
+    """Folder of object masks for scoring, matched by image id; None for the scene's own idrmasks, if any."""
+    max_pixels: int = MAX_PIXELS
+    """Largest number of pixels of a stored image or mask."""
+    max_side: int | None = None
+    """Largest image side [px], 0 for no limit. None: no limit with --downscale; otherwise 1600, or 800 in a fit on a CPU."""
+    lenses: str = "undistort"
+    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (the model is rendered through the
+    lens). Fisheyes need native."""
+    depths: str | None = None
+    """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
+    Default: the maps that transforms.json names; with the value none, these maps are ignored."""
+    normals: str | None = None
+    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
+    depth_kind: str = "metric"
+    """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
+    disparity (inverse lengths of unknown scale and shift, as networks give)."""
+    depth_unit: float | None = None
+    """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
+    normal_axes: str = "opencv"
+    """Camera axes of the normals: opencv (y down, z forward) or opengl (y up, z back)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions(SceneOptions):
+    """Options as a reader gets them: checked, with the image sizes that follow from the defaults."""
+
+    downscale: int = 1
+    """Factor, at least 1, by which both image sides shrink."""
+    max_side: int = 0
+    """Largest image side [px], after ``downscale``; 0 for no limit."""
+    on_image: Callable[[Path], object] | None = None
+    """Called with the file of each image before it is decoded; None for no call."""
+
+    def __post_init__(self) -> None:
+        for name, least, needs in (
+            ("downscale", 1, "of at least 1"), ("max_side", 0, "of pixels, 0 for no limit"), ("max_pixels", 1, "of at least 1"),
+        ):  # fmt: skip
+            number = getattr(self, name)
+            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+                raise UsageError(f"--{name.replace('_', '-')} must be a whole number {needs}, not {number!r}")
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                listed = f"{choices[0]} or {choices[1]}" if len(choices) == 2 else f"one of {', '.join(choices)}"
+                raise UsageError(f"--{name.replace('_', '-')} must be {listed}, not {getattr(self, name)!r}")
+        unit = self.depth_unit
+        if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
+            raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
+
+
+CHOICES = {
+    "masks": ("ignore", "cutout"), "lenses": ("undistort", "native"), "mask_keeps": ("white", "black"),
+    "depth_kind": DEPTH_KINDS, "normal_axes": ("opencv", "opengl"),
+}  # fmt: skip
+"""Values of the options that have a choice."""
 
 
 @dataclass(frozen=True)

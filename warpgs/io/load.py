@@ -8,7 +8,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,18 +17,16 @@ from warpgs.errors import DataError, UsageError, similar_folder
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.folder import (
     Reader,
-    ReadOptions,
     SceneFolder,
     all_readers,
     find_reader,
     image_ids,
-    image_scale,
     named_by_dtu,
     protocol_ids,
 )
 from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
-from warpgs.io.images import cut_from_black, list_images
-from warpgs.io.maps import NO_MAPS, MapOptions, check_found
+from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images
+from warpgs.io.maps import check_found
 from warpgs.scene import Normalization, PointCloud, Scene, View, checked_scene
 
 MIN_EXTENT = 1e-9
@@ -450,31 +448,37 @@ def load_scene(
         UsageError: A number is out of range, a choice or the reader is unknown, an image would become too small, or a camera
             model does not support a given map.
     """
-    root, (factor, side) = Path(path), image_scale(downscale, max_side)
-    given = [None if p is None else Path(p) for p in (depths, normals)]
-    maps = MapOptions(given[0], given[1], depth_kind, depth_unit, normal_axes)
-    options = ReadOptions(
-        factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side,
-        lenses=lenses, maps=maps, on_image=_counted(root, progress),
+    folders = {name: None if p is None else str(p) for name, p in (("depths", depths), ("normals", normals))}
+    options = SceneOptions(
+        downscale=downscale, max_side=max_side, strict=strict, allow_outside=allow_outside, masks=masks, mask_keeps=mask_keeps,
+        black_is_empty=black_is_empty, score_masks=None if score_masks is None else str(score_masks), max_pixels=max_pixels,
+        lenses=lenses, depth_kind=depth_kind, depth_unit=depth_unit, normal_axes=normal_axes, **folders,
     )  # fmt: skip
-    try:
-        _check_folder(root)
-        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
-        return _finished(root, chosen, chosen.read(root, options), notes, score_masks, options)
-    except OSError as e:
-        # folders without permission, names too long for the file system, disks that fail
-        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
+    return read_folder(path, options, reader, progress)
 
 
-def _counted(root: Path, progress: Callable[[str], object] | None) -> Callable[[Path], None]:
-    """Return a function that reports the number of the image that is read next."""
-    numbers = itertools.count(1)
+def read_folder(
+    path: str | Path,
+    options: SceneOptions,
+    reader: str | type[Reader] | Reader | None = None,
+    progress: Callable[[str], object] | None = None,
+) -> Scene:
+    """Read a scene folder, as `load_scene` does."""
+    root, (factor, side), numbers = Path(path), image_scale(options.downscale, options.max_side), itertools.count(1)
 
     def on_image(file: Path) -> None:
         if progress is not None:
             progress(f"reading {root}: image {next(numbers)}")
 
-    return on_image
+    given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
+    checked = ReadOptions(**given | {"downscale": factor, "max_side": side, "on_image": on_image})
+    try:
+        _check_folder(root)
+        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+        return _finished(root, chosen, chosen.read(root, checked), notes, checked)
+    except OSError as e:
+        # folders without permission, names too long for the file system, disks that fail
+        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
 
 
 def detect(root: Path) -> tuple[Reader, list[str]]:
@@ -525,9 +529,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
     return reader
 
 
-def _finished(
-    root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None, options: ReadOptions
-) -> Scene:
+def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
     if not isinstance(scene, Scene):
@@ -545,15 +547,15 @@ def _finished(
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more
-    more = (*more, *check_found(views, options.maps, options.allow_outside))
+    more = (*more, *check_found(views, options))
     n: Normalization = normalization_of(views, points, str(root))
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n, str(root))
-    if score_masks is not None or (root / FOLDER).is_dir():
+    if options.score_masks is not None or (root / FOLDER).is_dir():
         # links in a folder that the user names must stay inside it; links in the scene's own folder, inside the scene
-        masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
-        plain = replace(options, mask_keeps="white", maps=NO_MAPS)
+        masks, bound = (root / FOLDER, root) if options.score_masks is None else (Path(options.score_masks),) * 2
+        plain = replace(options, mask_keeps="white", depths=None, normals=None)
         views, note = add_score_masks(views, masks, SceneFolder(bound, plain))
         more = (*more, note)
     return replace(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -13,8 +12,8 @@ from warpgs.errors import DataError, UsageError
 from warpgs.files import inside, open_input, unread_reason
 from warpgs.geometry import CENTRAL
 from warpgs.io.image_files import MAX_PIXELS, decode_png
-from warpgs.io.images import LoadedImage, turn_upright, undistortion_maps
-from warpgs.scene import DEPTH_KINDS, GivenDepth, View
+from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortion_maps
+from warpgs.scene import GivenDepth, View
 
 SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
@@ -27,42 +26,12 @@ MILLIMETRES = 0.001
 """Default length of a unit of integers: RGB-D cameras store depth in millimetres, with poses in metres."""
 MAX_DEPTH = 1e12
 """Largest depth [file units]; maps with larger values are rejected."""
-AXES = ("opencv", "opengl")
 UNIT_TOLERANCE = 0.1
 """Largest difference of a normal's length from 1; eight bits round by less than 0.01."""
 NO_NORMAL = 0.5
 """Length below which a vector counts as missing, such as gray in an image of normals."""
 MAX_STRAY = 0.05
 """Largest fraction of a map's normals that may have another length, or face away from the camera."""
-
-
-@dataclass(frozen=True)
-class MapOptions:
-    """Given maps of depth and normals, and the meaning of their numbers."""
-
-    depths: Path | None = None
-    """Folder of depth maps; None for the maps that the scene names, ``none`` to ignore these."""
-    normals: Path | None = None
-    """Folder of normal maps; None for the maps that the scene names, ``none`` to ignore these."""
-    depth_kind: str = "metric"
-    """Meaning of the depth maps, one of `DEPTH_KINDS`."""
-    depth_unit: float | None = None
-    """Length of one unit of a depth map in units of the cameras; None means 0.001 for integers and 1 for floats."""
-    normal_axes: str = "opencv"
-    """Axes of the normals: camera axes of OpenCV (y down, z forward) or OpenGL (y up, z back)."""
-
-    def __post_init__(self) -> None:
-        if self.depth_kind not in DEPTH_KINDS:
-            raise UsageError(f"--depth-kind must be one of {', '.join(DEPTH_KINDS)}, not {self.depth_kind!r}")
-        if self.normal_axes not in AXES:
-            raise UsageError(f"--normal-axes must be one of {', '.join(AXES)}, not {self.normal_axes!r}")
-        unit = self.depth_unit
-        if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
-            raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
-
-
-NO_MAPS = MapOptions()
-"""Options of a scene without maps."""
 
 
 class MapFolder:
@@ -170,13 +139,13 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
     )
 
 
-def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
     """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values.
 
     Raises:
         DataError: The file is not a map, or its values cannot be depths.
     """
-    raw = _gray(path, read_numbers(path, max_pixels), "depth map")
+    raw = _gray(path, read_numbers(path, options.max_pixels), "depth map")
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
         raise DataError(
@@ -225,13 +194,13 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     return values
 
 
-def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
+def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
     """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
 
     Raises:
         DataError: The file is not a map of normals, contains none, or too many of its vectors have another length than 1.
     """
-    raw = read_numbers(path, max_pixels)
+    raw = read_numbers(path, options.max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:
         shape = " x ".join(map(str, raw.shape))
         raise DataError(f"{path}: is {shape}, normals need three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
@@ -357,16 +326,16 @@ NOTHING_NAMED = NamedMaps()
 class GivenMaps:
     """Depth and normal maps of a scene, from the folders that the user names or the files that the scene names."""
 
-    def __init__(self, options: MapOptions, max_pixels: int, allow_outside: bool):
+    def __init__(self, options: ReadOptions):
         """List the files of the folders in ``options``.
 
         Raises:
             DataError: A folder is missing, or holds no map.
         """
-        self.options, self.max_pixels = options, max_pixels
+        self.options = options
 
-        def folder(path: Path | None, flag: str) -> MapFolder | None:
-            return MapFolder(path, flag, allow_outside) if path is not None and str(path) != NONE else None
+        def folder(path: str | None, flag: str) -> MapFolder | None:
+            return MapFolder(Path(path), flag, options.allow_outside) if path not in (None, NONE) else None
 
         self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
 
@@ -389,16 +358,16 @@ class GivenMaps:
             loaded = replace(loaded, depth=self._depth(loaded, depth, confidence, options))
         return loaded if normals is None else replace(loaded, normals=self._normals(loaded, normals))
 
-    def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: MapOptions) -> GivenDepth:
+    def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: ReadOptions) -> GivenDepth:
         if loaded.camera_model not in CENTRAL or loaded.camera_model == "fisheye":
             raise UsageError(
                 f"{path}: depth is not supported for the camera model {loaded.camera_model}; leave out --lenses "
                 f"native, or the map ({DEPTHS} none)"
             )
-        stored = read_depth(path, options, self.max_pixels)
+        stored = read_depth(path, options)
         values, sure = in_pixels_of(loaded, stored, path), None
         if confidence is not None:
-            known = read_confidence(confidence, stored.shape, self.max_pixels)
+            known = read_confidence(confidence, stored.shape, options.max_pixels)
             sure = in_pixels_of(loaded, np.where(stored > 0, known, 0), confidence)
             values = np.where(sure > 0, values, 0)
         if not values.any():
@@ -413,7 +382,7 @@ class GivenMaps:
                 f"{path}: normals need pinholes, not the camera model {loaded.camera_model}; leave out --lenses native, or the "
                 f"map ({NORMALS} none)"
             )
-        normals = in_pixels_of(loaded, read_normals(path, self.options, self.max_pixels), path)
+        normals = in_pixels_of(loaded, read_normals(path, self.options), path)
         size = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0.5)
         height, width = normals.shape[:2]
@@ -433,7 +402,7 @@ class GivenMaps:
         return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
 
 
-def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool) -> list[str]:
+def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
     """Return notes on the maps of a scene's views.
 
     Raises:
@@ -443,17 +412,17 @@ def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool)
     flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
     for name, (path, flag) in flags.items():
         having = [v for v in views if getattr(v, name) is not None]
-        if path is not None and str(path) != NONE and not having:
-            raise MapFolder(path, flag, allow_outside).unmatched()
+        if path not in (None, NONE) and not having:
+            raise MapFolder(Path(path), flag, options.allow_outside).unmatched()
         if not having:
             continue
-        where = f"from {path}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
+        where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
         what = "normals" if name == "normals" else "depth maps"
         notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)}, {where}")
     return notes
 
 
-def _about(name: str, views: Sequence[View], options: MapOptions) -> str:
+def _about(name: str, views: Sequence[View], options: ReadOptions) -> str:
     """Return a description of the values of the maps, for a note."""
     if name == "normals":
         return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"

@@ -14,7 +14,6 @@ from warpgs.geometry import matmul
 from warpgs.io.folder import (
     Probe,
     Reader,
-    ReadOptions,
     SceneFolder,
     ViewList,
     from_camera_to_world,
@@ -24,7 +23,7 @@ from warpgs.io.folder import (
     rigid,
     view_name,
 )
-from warpgs.io.images import Lens, list_images
+from warpgs.io.images import Lens, ReadOptions, list_images
 from warpgs.scene import Scene
 
 # LLFF scenes: poses_bounds.npy, one row of 17 numbers per image in sorted-name order (Mildenhall et al. 2019).

@@ -16,7 +16,6 @@ from warpgs.io import colmap
 from warpgs.io.folder import (
     Probe,
     Reader,
-    ReadOptions,
     SceneFolder,
     ViewList,
     from_camera_to_world,
@@ -26,7 +25,7 @@ from warpgs.io.folder import (
     rigid,
     view_name_of,
 )
-from warpgs.io.images import BLACK, SUFFIXES, Lens
+from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
 from warpgs.scene import Camera, Scene
@@ -199,7 +198,7 @@ class _Reading:
         """Return the maps that a frame names under nerfstudio's keys."""
 
         def path(key: str, flag: str) -> Path | None:
-            if not frame.get(key) or getattr(self.scene.options.maps, flag) is not None:
+            if not frame.get(key) or getattr(self.scene.options, flag) is not None:
                 return None
             found = self.scene.inside(self.child(file.parent, frame[key], f"{where}, {key}"))
             if found.suffix.lower() not in MAPS:
