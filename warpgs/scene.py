@@ -443,11 +443,7 @@ INTRINSICS = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
 
 
 def checked_scene(scene: Scene, where: str = "") -> Scene:
-    """Return a scene whose fields are all valid.
-
-    Raises:
-        DataError: A field is invalid; the message starts with ``where``.
-    """
+    """Return a scene whose fields are all valid."""
     of = f"{where}scene."
     for name in ("path", "format", "fingerprint", "pixels"):
         _check(of + name, getattr(scene, name), str, "give a str, '' if unknown")
@@ -479,11 +475,7 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
 
 
 def checked_views(views: Iterable[View], where: str = "") -> list[View]:
-    """Return views whose fields are all valid, in their order.
-
-    Raises:
-        DataError: A field is invalid; the message starts with ``where``.
-    """
+    """Return views whose fields are all valid, in their order."""
     if isinstance(views, (View, Scene, np.ndarray)) or not isinstance(views, Iterable):
         fix = "give scene.views" if isinstance(views, Scene) else "give [view]"
         raise _wrong(f"{where}views", "a list of View", type(views).__name__, fix)

@@ -111,12 +111,7 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
 
 
 def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY.
-
-    Raises:
-        DataError: The file is malformed or truncated, needs another file, or has a kernel, colour space, transformation or
-            number of Gaussian primitives that is not supported.
-    """
+    """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY."""
     document, body = _split(path, data)
     buffers = document.get("buffers")
     if not isinstance(buffers, list) or len(buffers) != 1 or not isinstance(buffers[0], dict):

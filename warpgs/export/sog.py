@@ -159,11 +159,7 @@ def _webp(pixels: np.ndarray) -> bytes:
 
 
 def decode(path: Path, file: BinaryIO) -> Arrays:
-    """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding.
-
-    Raises:
-        DataError: The file is malformed, truncated, or announces more than its size can hold.
-    """
+    """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding."""
     size = file.seek(0, os.SEEK_END)
     _check_contents(path, file, size)
     with zipfile.ZipFile(file) as archive:
@@ -347,11 +343,7 @@ class SOG(Format):
         return encode(arrays, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether meta.json declares antialiasing.
-
-        Raises:
-            DataError: The file cannot be read or is malformed.
-        """
+        """Return whether meta.json declares antialiasing."""
         try:
             with open_input(path) as file, zipfile.ZipFile(file) as archive:
                 return _meta(path, archive).get("model") == "antialiased"

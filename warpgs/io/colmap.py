@@ -174,11 +174,7 @@ def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]])
 
 
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion.
-
-    Raises:
-        DataError: The file is malformed, or a camera model is not supported.
-    """
+    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion."""
     cameras: dict[int, Lens] = {}
     known = MODELS | NATIVE_MODELS if native else MODELS
     if path.suffix == ".bin":
@@ -205,11 +201,7 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
 
 
 def read_poses(path: Path) -> dict[int, Pose]:
-    """Return poses by image number from images.bin or images.txt.
-
-    Raises:
-        DataError: The file is malformed.
-    """
+    """Return poses by image number from images.bin or images.txt."""
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
         r = _BinaryFile(path)
@@ -241,18 +233,7 @@ def read_poses(path: Path) -> dict[int, Pose]:
 
 
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
-    """Return points, with the views that saw them, from points3D.bin or points3D.txt.
-
-    Args:
-        path: The file; it may list no points.
-        names: View names by image number; images without a name here are left out of the tracks.
-
-    Returns:
-        N points in file coordinates with colours in [0, 1] and tracks.
-
-    Raises:
-        DataError: The file is malformed, or a point is not finite.
-    """
+    """Return points, with the views that saw them, from points3D.bin or points3D.txt."""
     points: list[tuple[float, ...]] = []
     colors: list[tuple[int, ...]] = []
     tracks: list[frozenset[str]] = []

@@ -98,9 +98,6 @@ def find_reader(choice: str | type[Reader] | Reader) -> Reader:
     """Return the reader for a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader object.
 
     A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
-
-    Raises:
-        UsageError: There is no such reader, or it does not derive from `Reader`.
     """
     if isinstance(choice, Reader):
         return choice
@@ -140,21 +137,7 @@ def image_ids(names: list[str]) -> list[int] | None:
 
 
 def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: str) -> dict[int, str]:
-    """Return the names of the images with the wanted ids.
-
-    Args:
-        names: All image names of a scan, sorted.
-        wanted: Ids that a protocol picks, counted from 0.
-        least: Smallest number of images for which the ids of the protocol apply.
-        where: Protocol and scene, for errors.
-
-    Returns:
-        Name by id. Names without numbers are counted in sorted order. Numbered images must have no gaps: after a gap, the
-        numbers might differ from the protocol's ids.
-
-    Raises:
-        DataError: There are too few images, or some ids are missing; the message names them.
-    """
+    """Return the names of the images with the wanted ids."""
     if len(names) < least:
         raise DataError(
             f"{where}: the protocol needs {least} views, and the scene has {len(names)}; restore the scan, or use llff:K or "
@@ -176,11 +159,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
 
 
 def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
-    """Return a pose [4, 4] with its rotation made exactly orthonormal.
-
-    Raises:
-        DataError: The pose is not finite, or its upper left 3 x 3 block is not a rotation; ``where`` is file and image.
-    """
+    """Return a pose [4, 4] with its rotation made exactly orthonormal."""
     if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
         raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")
     R = viewmat[:3, :3]
@@ -199,11 +178,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
 
 
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
-    """Return the rotation [3, 3] of a quaternion wxyz of any length.
-
-    Raises:
-        DataError: The quaternion is zero or not finite.
-    """
+    """Return the rotation [3, 3] of a quaternion wxyz of any length."""
     q = np.array(quat, np.float64)
     norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
     if not 1e-12 < norm < np.inf:
@@ -212,16 +187,7 @@ def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
 
 
 def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.ndarray:
-    """Return camera_from_world [4, 4] with OpenCV axes from a camera-to-world matrix.
-
-    Args:
-        matrix: Camera to world, shape [3, 4] or [4, 4].
-        where: File and image, for errors.
-        opengl: True if the camera looks along -z with +y up (OpenGL, Blender); y and z are then negated.
-
-    Raises:
-        DataError: The matrix is not rigid or not finite.
-    """
+    """Return camera_from_world [4, 4] with OpenCV axes from a camera-to-world matrix."""
     pose = np.eye(4)
     pose[: matrix.shape[0]] = matrix
     p, q, r, s = pose[3].tolist()  # numpy's allclose would take a quarter of the time of a pose
@@ -245,21 +211,7 @@ def has_folder(root: Path, *patterns: str) -> bool:
 
 
 def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
-    """Return the path of a file that a scene names.
-
-    Args:
-        folder: Folder to which the name is relative.
-        name: Name as in the scene's file.
-        where: The scene's file and the place in it, for errors.
-        root: Folder that must contain the file, links followed; None for ``folder``.
-        allow_outside: Allow links that point outside the folder.
-
-    Returns:
-        The path; the file may not exist.
-
-    Raises:
-        DataError: The name is empty or not a file name, or points outside the scene folder.
-    """
+    """Return the path of a file that a scene names."""
     usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
     if usable:
         try:
@@ -400,11 +352,7 @@ class SceneFolder:
 
 
 def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
+    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels."""
     gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
     return gray if keeps == "white" else 1 - gray
 

@@ -99,11 +99,7 @@ BYTES_PER_PIXEL = 32
 
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
-    """Return the bytes of an image file; files too large for ``max_pixels`` pixels are rejected.
-
-    Raises:
-        DataError: The file is missing, cannot be read, or is not a regular file.
-    """
+    """Return the bytes of an image file; files too large for ``max_pixels`` pixels are rejected."""
     try:
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
     except OSError as e:
@@ -111,11 +107,7 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
 
 
 def read_image_start(path: Path, count: int) -> bytes:
-    """Return the first bytes of an image file, at most ``count``.
-
-    Raises:
-        DataError: The file is missing, cannot be read, or is not a regular file.
-    """
+    """Return the first bytes of an image file, at most ``count``."""
     try:
         return read_start(path, count)
     except OSError as e:
@@ -469,12 +461,7 @@ def _too_large(path: Path, pixels: int) -> str:
 
 
 def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Decode a PNG to its numbers as stored, uint8 or uint16, shape [H, W] or [H, W, C] with colours in RGB order.
-
-    Raises:
-        DataError: The file is missing, not a PNG, too large, or damaged.
-        ResourceError: There is not enough memory for the image.
-    """
+    """Decode a PNG to its numbers as stored, uint8 or uint16, shape [H, W] or [H, W, C] with colours in RGB order."""
     data = read_image_file(path, max_pixels)
     if not data.startswith(PNG_START):
         raise DataError(f"{path}: is not a PNG file; save it as 16-bit PNG or NPY")
@@ -486,18 +473,6 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
     """Decode an image file as stored, without rotation by its EXIF tag.
 
     Gray, palette, 8- and 16-bit images and straight alpha are supported.
-
-    Args:
-        path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.
-        max_pixels: Largest number of pixels that its header may announce.
-        data: Bytes of the file, if they have been read already.
-
-    Returns:
-        Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
-
-    Raises:
-        DataError: The file is missing, of another format, too large, or damaged, as far as its format reveals damage.
-        ResourceError: There is not enough memory for the image.
     """
     raw = _raster(path, read_image_file(path, max_pixels) if data is None else data, max_pixels)
     if raw.dtype in (np.uint8, np.uint16):

@@ -230,14 +230,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the columns and rows [H, W] in the distorted image of a pinhole image's pixels, in OpenCV's convention.
-
-    Args:
-        K: Intrinsics [px] of both images at this size, shape [3, 3].
-        lens: Lens with the distortion.
-        width: Width [px].
-        height: Height [px].
-    """
+    """Return the columns and rows [H, W] in the distorted image of a pinhole image's pixels, in OpenCV's convention."""
     import cv2
 
     K = K.copy()
@@ -394,28 +387,6 @@ def load_image(
     """Decode an image, rotate it upright by EXIF, remove distortion, and resample.
 
     Colours are resampled in proportion to their opacity, so that the colours of transparent pixels do not affect others.
-
-    Args:
-        path: The image file.
-        lens: Its intrinsics, at any size; they are scaled to the image. For formats that do not store the image size, a
-            function that makes them from the width and height [px] of the stored raster.
-        downscale: Factor by which both sides shrink (area resampling).
-        mask: Weight of each pixel, in [0, 1], shape [H, W], at the size of the file or at another size of the same aspect.
-        background: Colour in [0, 1] behind transparent pixels.
-        max_pixels: Largest number of pixels that the file may have.
-        cutout: True to make masked-out pixels transparent, gray ones partly; False to ignore pixels with a weight of at most a
-            half.
-        max_side: Longest side that the image keeps [px] after ``downscale``; 0 for no limit.
-        native: Keep the distortion of the lens instead of undoing it.
-
-    Returns:
-        The image with intrinsics for its final size.
-
-    Raises:
-        DataError: The file cannot be decoded, its size does not fit its camera or its mask, its lens cannot be undistorted, or
-            no pixel is left.
-        ResourceError: There is not enough memory to decode the file.
-        UsageError: ``downscale`` or ``max_side`` leaves a side below `MIN_SIDE`.
     """
     image, alpha = decode(path, max_pixels)
     stored = image.shape[:2]
@@ -483,12 +454,6 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
 
     All other pixels get an opacity of 1, and so do dark specks and cracks that the object encloses. If any view has an alpha
     channel or a mask, or shows something else, all views stay unchanged.
-
-    Args:
-        views: The views of a scene.
-
-    Returns:
-        The views, and a note for the user; an empty note if nothing is changed.
     """
     done, empty = [], 0.0
     for v in views:

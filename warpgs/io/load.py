@@ -40,9 +40,6 @@ def normalization_of(views: list[View], points: PointCloud | None, where: str) -
 
     If all cameras are in one place, points set the scale: the median of their largest offsets along an axis becomes 1. Without
     points the scale is unchanged.
-
-    Raises:
-        DataError: A camera centre is absurdly far away; the message begins with ``where`` and names the image.
     """
     centers = np.array([v.camera.center for v in views])
     far = np.abs(centers).max(axis=1)
@@ -74,11 +71,7 @@ def normalize_view(view: View, n: Normalization) -> View:
 
 
 def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointCloud:
-    """Return the points in scene coordinates (float64).
-
-    Raises:
-        DataError: A point is not finite or absurdly far away; the message begins with ``where``.
-    """
+    """Return the points in scene coordinates (float64)."""
     with np.errstate(over="ignore", invalid="ignore"):
         moved = n.scale * (points.points - n.offset)
     far = int((~(np.abs(moved) < MAX_COORDINATE).all(axis=1)).sum())
@@ -214,11 +207,7 @@ class _Names:
 
 
 def check_spec(spec: str) -> None:
-    """Check that the specification of a split can be understood, before a scene is read.
-
-    Raises:
-        UsageError: The specification is unknown or malformed, or leaves nothing to train.
-    """
+    """Check that the specification of a split can be understood, before a scene is read."""
     if "=" in spec:
         _named(spec)
     elif spec == "every:1":
@@ -260,10 +249,6 @@ def split_views(scene: Scene, spec: str) -> Split:
     ``llff:K`` and ``mip360:K``: every 8th of the sorted views is held out, and K of the others, evenly spaced, train. ``dtu:K``
     and ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
     ``train=a,b;test=c``: names, with or without suffix; if one part is missing, it consists of all other views.
-
-    Raises:
-        DataError: The scene lacks views of the split, or training and test views overlap.
-        UsageError: The split is not understood.
     """
     check_spec(spec)
     names = sorted(v.name for v in scene.views)
@@ -344,18 +329,6 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
 
     The masks lie in ``folder`` or in its subfolder `mask`, named by id counted from 0 (000.png, 001.png, ...); the images
     are named by the same ids, or by DTU's own names, in which `rect_001_...` is id 0.
-
-    Args:
-        views: The scene's views, at their final size.
-        folder: The folder with the masks; white keeps a pixel.
-        scene: The scene folder that opens the masks.
-
-    Returns:
-        The views with ``score_mask`` set, inside the view's own mask where it has one, and a note for the user.
-
-    Raises:
-        DataError: No masks are found; a mask is missing (the message names the ids) or does not fit; or it is unclear whether
-            the images count from 0 or from 1.
     """
     inner = folder / "mask"
     folder = inner if inner.is_dir() else folder
@@ -482,11 +455,7 @@ def read_folder(
 
 
 def detect(root: Path) -> tuple[Reader, list[str]]:
-    """Return the reader of the first complete format of a scene folder, and notes on the formats passed over.
-
-    Raises:
-        DataError: The folder contains no known format, or only an incomplete one; the message names the files to look for.
-    """
+    """Return the reader of the first complete format of a scene folder, and notes on the formats passed over."""
     readers = all_readers()
     found = [(r, p) for r in readers if (p := r.probe(root)) is not None]
     complete = [r for r, p in found if not p.missing]

@@ -38,11 +38,7 @@ class MapFolder:
     """The maps of a folder, found by the names of images."""
 
     def __init__(self, folder: Path, flag: str, allow_outside: bool):
-        """List a folder; links in it may point outside the folder only with ``allow_outside``.
-
-        Raises:
-            DataError: The folder is missing or holds no map, two files are for one image, or a link points outside.
-        """
+        """List a folder; links in it may point outside the folder only with ``allow_outside``."""
         self.folder, self.flag = folder, flag
         if not folder.is_dir():
             raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
@@ -89,11 +85,7 @@ class MapFolder:
 
 
 def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C].
-
-    Raises:
-        DataError: The file is missing, larger than ``max_pixels``, of another type or shape, or damaged.
-    """
+    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C]."""
     if path.suffix.lower() == ".npy":
         return _read_array(path, max_pixels)
     return decode_png(path, max_pixels)
@@ -140,11 +132,7 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
 
 
 def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
-    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values.
-
-    Raises:
-        DataError: The file is not a map, or its values cannot be depths.
-    """
+    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values."""
     raw = _gray(path, read_numbers(path, options.max_pixels), "depth map")
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
@@ -176,9 +164,6 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
     uint8 and uint16 maps are divided by 2 if they hold only the levels 0, 1 and 2, else by the largest value of their type.
-
-    Raises:
-        DataError: The file is not a map, of another shape, or not in [0, 1].
     """
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
@@ -195,11 +180,7 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
 
 
 def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
-    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
-
-    Raises:
-        DataError: The file is not a map of normals, contains none, or too many of its vectors have another length than 1.
-    """
+    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values."""
     raw = read_numbers(path, options.max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:
         shape = " x ".join(map(str, raw.shape))
@@ -261,17 +242,7 @@ def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndarray:
-    """Rotate, undistort and resize a map like its image; the result has shape [h, w] or [h, w, C] of the image's final size.
-
-    Args:
-        loaded: The image at its final size.
-        values: The map, upright or oriented like the stored image, at the image's size or another size of the same aspect,
-            shape [H, W] or [H, W, C].
-        path: File of the map, for errors.
-
-    Raises:
-        DataError: The aspects differ, or the map holds vectors and the image was rotated.
-    """
+    """Rotate, undistort and resize a map like its image; the result has shape [h, w] or [h, w, C] of the image's final size."""
     import cv2
 
     height, width = loaded.full_size
@@ -327,11 +298,7 @@ class GivenMaps:
     """Depth and normal maps of a scene, from the folders that the user names or the files that the scene names."""
 
     def __init__(self, options: ReadOptions):
-        """List the files of the folders in ``options``.
-
-        Raises:
-            DataError: A folder is missing, or holds no map.
-        """
+        """List the files of the folders in ``options``."""
         self.options = options
 
         def folder(path: str | None, flag: str) -> MapFolder | None:
@@ -340,12 +307,7 @@ class GivenMaps:
         self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
 
     def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
-        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene.
-
-        Raises:
-            DataError: A map cannot be read, does not fit its image, or its values cannot be depths or normals.
-            UsageError: The camera model of the image does not support the map.
-        """
+        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene."""
         depth, confidence, options = named.depth, None, self.options
         if options.depths is not None:
             depth, confidence = self.depths.find(image) if self.depths is not None else (None, None)
@@ -403,11 +365,7 @@ class GivenMaps:
 
 
 def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
-    """Return notes on the maps of a scene's views.
-
-    Raises:
-        DataError: A folder is given, but no view has a map in it.
-    """
+    """Return notes on the maps of a scene's views."""
     notes = []
     flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
     for name, (path, flag) in flags.items():

@@ -34,11 +34,7 @@ MAX_ROWS = 1_000_000
 
 
 def read_poses_bounds(path: Path) -> np.ndarray:
-    """Return the array of poses_bounds.npy, float64, shape [N, 17].
-
-    Raises:
-        DataError: The file does not hold such an array.
-    """
+    """Return the array of poses_bounds.npy, float64, shape [N, 17]."""
     try:
         open_input(path).close()
         # mapped: numpy then compares the announced shape with the file's size before it allocates memory
@@ -108,11 +104,7 @@ MAX_MATRIX_BYTES = 4096
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4].
-
-    Raises:
-        DataError: The matrix is not finite, is singular, or has a skew of more than a thousandth of the focal length.
-    """
+    """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4]."""
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
         raise DataError(f"{where}: the projection matrix is not finite or not invertible; calibrate again")
@@ -232,11 +224,7 @@ def files_of(root: Path) -> list[Path]:
 
 
 def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
-    """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera.
-
-    Raises:
-        DataError: The file is malformed; the message names the line.
-    """
+    """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera."""
     rows, count = [], None
     try:
         text = read_input(path, MAX_BYTES).decode("utf-8-sig")

@@ -59,11 +59,7 @@ def _reject_constant(name: str):
 
 
 def read_json(path: Path) -> dict:
-    """Return the parsed file with its list of frames.
-
-    Raises:
-        DataError: The file is malformed, too large or nested too deep, or holds NaN or Infinity.
-    """
+    """Return the parsed file with its list of frames."""
     try:
         text = read_input(path, MAX_BYTES).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
@@ -95,19 +91,7 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
 
 
 def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, native: bool = False) -> Lens:
-    """Return the intrinsics of a frame; the frame's own values override the shared values of the file.
-
-    Args:
-        frame: An entry of the list of frames.
-        shared: The whole file.
-        width: Width of the image [px], used if the file gives none.
-        height: Height of the image [px], used if the file gives none.
-        where: File and frame, for errors.
-        native: True to read fisheyes, too.
-
-    Raises:
-        DataError: There is no focal length, a number is not finite, or the lens model is not supported.
-    """
+    """Return the intrinsics of a frame; the frame's own values override the shared values of the file."""
     model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV")))
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
@@ -150,11 +134,7 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
 
 
 def matrix_of(frame: dict, where: str) -> np.ndarray:
-    """Return the transform_matrix of a frame, shape [3, 4] or [4, 4].
-
-    Raises:
-        DataError: The matrix is missing or not made of rows of numbers.
-    """
+    """Return the transform_matrix of a frame, shape [3, 4] or [4, 4]."""
     try:
         # through object, so that ragged rows and huge integers are caught here and strings are not parsed
         rows = [[float(x) if not isinstance(x, (str, bool)) else math.nan for x in row] for row in frame["transform_matrix"]]
@@ -289,12 +269,6 @@ def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     """Return the cameras of a file or of a COLMAP folder by name, in file units, and notes for the user.
 
     Lenses become pinholes, because renders have no distortion; a note reports lenses with distortion.
-
-    Args:
-        path: A cameras.json, a transforms.json, or a folder with a COLMAP reconstruction, binary or text.
-
-    Raises:
-        DataError: The file is missing, malformed or holds no camera; a pose is not rigid, or a lens has impossible values.
     """
     if path.is_dir():
         found = _colmap(path)
