@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import io
 import itertools
+import math
 import os
 import re
 import struct
+import warnings
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -136,8 +138,9 @@ def _opened(name: str, data: bytes) -> ImageFile.ImageFile:
         "TIFF": TiffImagePlugin.TiffImageFile,
     }  # fmt: skip
     try:
-        # not Image.open, which has a limit of its own on the number of pixels
-        return types[name](io.BytesIO(data), "image")
+        with warnings.catch_warnings(action="ignore"):
+            # not Image.open, which has a limit of its own on the number of pixels
+            return types[name](io.BytesIO(data), "image")
     except BROKEN as e:
         raise ValueError(f"its decoder says: {e}") from e
 
@@ -145,7 +148,8 @@ def _opened(name: str, data: bytes) -> ImageFile.ImageFile:
 def _loaded(image: ImageFile.ImageFile) -> ImageFile.ImageFile:
     """Return an image after decoding all its pixels."""
     try:
-        image.load()
+        with warnings.catch_warnings(action="ignore"):
+            image.load()
     except BROKEN as e:
         raise ValueError(f"its pixels are damaged ({e})") from e
     return image
@@ -165,8 +169,7 @@ def _size(name: str, data: bytes) -> tuple[int, int]:
     if name == "WEBP":
         return _webp_size(data)
     if name == "TIFF":
-        tags = _tags(data)
-        return _one(tags, WIDTH), _one(tags, HEIGHT)
+        return _tiff_size(_tiff_tags(data))
     with _opened(name, data) as image:
         return image.size
 
@@ -328,63 +331,97 @@ def _webp_size(data: bytes) -> tuple[int, int]:
     raise ValueError("its header is broken")
 
 
-TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-"""Layouts of the integers that tags of a TIFF may hold, by type."""
+LAYOUTS = {1: "B", 3: "H", 4: "I", 16: "Q"}
+"""Layouts of the integers that tags may hold, by type."""
 SIZES = {1: 1, 2: 1, 3: 2, 4: 4, 6: 1, 7: 1, 8: 2, 9: 4, 11: 4, 13: 4}
 """Bytes of a value by type; values of other types have 8."""
 WIDTH, HEIGHT, COMPRESSION, STRIPS, TILES = 256, 257, 259, (273, 279), (324, 325)
 """Tags; the last two are offsets and lengths of the pieces that hold the pixels."""
 DEFLATE = (8, 32946)
-MAX_TIFF_ENTRIES = 4096
+MAX_ENTRIES = 4096
 """Largest number of tags in a directory."""
+MAX_TEXT = 100
+"""Longest text that is read [bytes]."""
 PIECE, INPUT_PIECE = 1 << 20, 1 << 14
 """Bytes unpacked at a time, and bytes that are given to the unpacker at a time."""
 
 
-def _tags(data: bytes) -> dict[int, tuple[int, ...]]:
-    """Return the integers of the first directory of a TIFF by tag; Pillow and libtiff would copy tags that overlap."""
-    order = "<" if data[:2] == b"II" else ">"
-    big = data[2:4] in (b"+\0", b"\0+")
-    number, entry, slot = ("Q", "HHQ", 8) if big else ("I", "HHI", 4)
-    try:
-        (at,) = struct.unpack_from(order + number, data, 8 if big else 4)
-        (count,) = struct.unpack_from(order + ("Q" if big else "H"), data, at)
-        at += 8 if big else 2
-        if count > MAX_TIFF_ENTRIES:
+class _Directory:
+    """Tags of a TIFF, or of EXIF, whose layout is the same (CIPA DC-008); a value is read when it is requested."""
+
+    def __init__(self, block: bytes, at: int | None = None):
+        """Find the tags of the directory at byte ``at``, None for the first; ValueError if they overlap or lie outside."""
+        self.block, self.order = block, "<" if block[:2] == b"II" else ">"
+        big = block[2:4] in (b"+\0", b"\0+")
+        self.pointer, entry, self.slot = ("Q", "HHQ", 8) if big else ("I", "HHI", 4)
+        self.entries: dict[int, tuple[int, int, int]] = {}
+        if at is None:
+            (at,) = self._unpack(self.pointer, 8 if big else 4)
+        (count,) = self._unpack("Q" if big else "H", at)
+        if count > MAX_ENTRIES:
             raise ValueError(f"its directory announces {count} tags")
-        tags, room = {}, len(data)
+        at, room = at + (8 if big else 2), len(block)
         for _ in range(count):
-            tag, kind, length = struct.unpack_from(order + entry, data, at)
-            place = at + struct.calcsize(order + entry)
-            at = place + slot
-            room -= max(0, SIZES.get(kind, 8) * length - slot)
-            if room < 0:
-                raise ValueError("its tags overlap, or lie outside of the file")
-            if tag in (WIDTH, HEIGHT, COMPRESSION, *STRIPS, *TILES) and kind in TYPES:
-                layout = order + f"{length}{TYPES[kind]}"
-                if struct.calcsize(layout) > slot:
-                    (place,) = struct.unpack_from(order + number, data, place)
-                tags[tag] = struct.unpack_from(layout, data, place)
-    except (struct.error, OverflowError) as e:
-        raise ValueError("its directory points outside the file") from e
+            tag, kind, length = self._unpack(entry, at)
+            place = at + struct.calcsize("=" + entry)
+            at = place + self.slot
+            self.entries[tag] = kind, length, place
+            room -= max(0, SIZES.get(kind, 8) * length - self.slot)
+        self.overlaps = room < 0
+
+    def _unpack(self, layout: str, at: int) -> tuple[int, ...]:
+        try:
+            return struct.unpack_from(self.order + layout, self.block, at)
+        except (struct.error, OverflowError) as e:
+            raise ValueError("its directory points outside the file") from e
+
+    def _place(self, size: int, place: int) -> int:
+        """Return where a value of some bytes begins: in its entry if it fits, else where the entry points."""
+        return place if size <= self.slot else self._unpack(self.pointer, place)[0]
+
+    def numbers(self, tag: int) -> tuple[int, ...]:
+        """Return the integers of a tag; none for a tag that is missing or of another type."""
+        kind, length, place = self.entries.get(tag, (0, 0, 0))
+        if kind not in LAYOUTS:
+            return ()
+        return self._unpack(f"{length}{LAYOUTS[kind]}", self._place(SIZES.get(kind, 8) * length, place))
+
+    def number(self, tag: int) -> int | None:
+        """Return a single integer of 16 or 32 bits, or None."""
+        kind, length, _ = self.entries.get(tag, (0, 0, 0))
+        return self.numbers(tag)[0] if kind in (3, 4) and length == 1 else None
+
+    def text(self, tag: int) -> str:
+        """Return the text of a tag, maybe empty, without the zero bytes and spaces around it."""
+        kind, length, place = self.entries.get(tag, (0, 0, 0))
+        place = self._place(length, place) if kind == 2 else len(self.block)
+        return self.block[place : place + min(length, MAX_TEXT)].decode("latin-1").strip("\0 ")
+
+
+def _tiff_tags(data: bytes) -> _Directory:
+    """Return the tags of a TIFF; ValueError if they overlap, because Pillow and libtiff would copy each of them."""
+    tags = _Directory(data)
+    if tags.overlaps:
+        raise ValueError("its tags overlap, or lie outside of the file")
     return tags
 
 
-def _one(tags: dict[int, tuple[int, ...]], tag: int) -> int:
-    """Return the first value of a tag that a TIFF must have."""
-    if not tags.get(tag):
-        raise ValueError(f"it lacks the tag {tag}")
-    return tags[tag][0]
+def _tiff_size(tags: _Directory) -> tuple[int, int]:
+    """Return width and height [px]."""
+    width, height = tags.numbers(WIDTH), tags.numbers(HEIGHT)
+    if not width or not height:
+        raise ValueError("it has no size")
+    return width[0], height[0]
 
 
 def _check_tiff(data: bytes) -> None:
     """Check that a TIFF holds all its pixels: by Pillow, and by the checksum of Deflate, at which libtiff does not look."""
-    tags = _tags(data)
-    offsets, lengths = (tags.get(tag, ()) for tag in (TILES if TILES[0] in tags else STRIPS))
+    tags = _tiff_tags(data)
+    offsets, lengths = (tags.numbers(tag) for tag in (TILES if TILES[0] in tags.entries else STRIPS))
     if any(offset + length > len(data) for offset, length in zip(offsets, lengths)):
         raise ValueError("its strips or tiles lie outside of the file")
-    if tags.get(COMPRESSION, (1,))[0] in DEFLATE:
-        left = FILE_BYTES_PER_PIXEL * _one(tags, WIDTH) * _one(tags, HEIGHT) + EXTRA_FILE_BYTES
+    if (tags.numbers(COMPRESSION) or (1,))[0] in DEFLATE:
+        left = FILE_BYTES_PER_PIXEL * math.prod(_tiff_size(tags)) + EXTRA_FILE_BYTES
         for offset, length in zip(offsets, lengths):
             left -= unpacked_size(memoryview(data)[offset : offset + length], left)
     try:
@@ -497,18 +534,10 @@ def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) 
 
 # EXIF of a photograph and its lens: five tags, read from the first directory and the block of exposure data.
 #
-# The layout is that of TIFF (CIPA DC-008). Only the values of these tags are read, because libraries that read all of
-# EXIF copy overlapping values again and again.
+# Only the values of these tags are read, because libraries that read all of EXIF copy overlapping values again and again.
 
 MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
 """Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
-ASCII = 2
-NUMBERS = {3: "H", 4: "I"}
-"""Layouts of the integers that EXIF tags may hold, by type."""
-MAX_ENTRIES = 1000
-"""Largest number of tags in a directory."""
-MAX_TEXT = 100
-"""Longest maker or model that is read [bytes]."""
 MAX_FOCAL = 10_000
 """Longest equivalent focal length that is accepted [mm]."""
 PREFIX = b"Exif\0\0"
@@ -545,15 +574,14 @@ def read_exif(data: bytes) -> Exif:
 def parse_exif(block: bytes) -> Exif:
     """Return the values of a block of EXIF, which begins as a TIFF file does; damaged values count as missing."""
     block = block.removeprefix(PREFIX)
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
-    if order is None:
+    if block[:4] not in (b"II*\0", b"MM\0*"):
         return Exif()
     try:
-        first = _Directory(block, order, *struct.unpack_from(order + "I", block, 4))
+        first = _Directory(block)
         orientation, place = first.number(ORIENTATION), first.number(EXPOSURE)
         maker, model = first.text(MAKE), first.text(MODEL)
-        focal = None if place is None else _Directory(block, order, place).number(FOCAL_35MM)
-    except (ValueError, struct.error):
+        focal = None if place is None else _Directory(block, place).number(FOCAL_35MM)
+    except ValueError:
         return Exif()
     if orientation is None or not 1 <= orientation <= 8:
         orientation = 1
@@ -573,35 +601,3 @@ def _block(data: bytes) -> bytes:
         return next((body for marker, body in head if marker == APP1 and body.startswith(PREFIX)), b"")
     chunks = {"PNG": _png_chunks, "WEBP": _webp_chunks}.get(name, lambda data: iter(()))
     return bytes(next((body for kind, body in chunks(data) if kind.upper() == b"EXIF"), b""))
-
-
-class _Directory:
-    """Entries of a directory of tags."""
-
-    def __init__(self, block: bytes, order: str, at: int):
-        self.block, self.order = block, order
-        (count,) = struct.unpack_from(order + "H", block, at)
-        if count > MAX_ENTRIES:
-            raise ValueError(f"a directory of {count} tags")
-        self.entries: dict[int, tuple[int, int, int]] = {}
-        for i in range(count):
-            place = at + 2 + 12 * i
-            tag, kind, length = struct.unpack_from(order + "HHI", block, place)
-            self.entries[tag] = kind, length, place + 8
-
-    def number(self, tag: int) -> int | None:
-        """Return a single integer, or None."""
-        kind, length, place = self.entries.get(tag, (0, 0, 0))
-        if kind not in NUMBERS or length != 1:
-            return None
-        value: int = struct.unpack_from(self.order + NUMBERS[kind], self.block, place)[0]
-        return value
-
-    def text(self, tag: int) -> str:
-        """Return the text of a tag, maybe empty, without the zero bytes and spaces around it."""
-        kind, length, place = self.entries.get(tag, (0, 0, 0))
-        if kind != ASCII:
-            return ""
-        if length > 4:
-            (place,) = struct.unpack_from(self.order + "I", self.block, place)
-        return self.block[place : place + min(length, MAX_TEXT)].decode("latin-1").strip("\0 ")
