@@ -515,6 +515,13 @@ def check_stored(gaussians: object) -> None:
         raise ValueError(f"sh must have shape [N, K, 3] (N={count}), where K is 1, 4, 9, 16 or 25, not {found}")
 
 
+def _same_units(source: str, target: str) -> bool:
+    """Return whether two names of units are equal; UsageError for an unknown one."""
+    check_units(source)
+    check_units(target)
+    return source == target
+
+
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
     """Return Gaussians in other units; tensors that do not change are shared.
 
@@ -522,9 +529,7 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
     Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.
     """
     check_stored(gaussians)
-    check_units(source)
-    check_units(target)
-    if source == target:
+    if _same_units(source, target):
         return gaussians
     means, log_scales = gaussians.means.double(), gaussians.log_scales.double()
     offset = means.new_tensor(np.asarray(normalization.offset, np.float64))
@@ -538,9 +543,7 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
 
 def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: str) -> Mesh:
     """Return a mesh in other units: its vertices change, triangles and colours are shared."""
-    check_units(source)
-    check_units(target)
-    if source == target:
+    if _same_units(source, target):
         return mesh
     scale, offset = normalization.scale, np.asarray(normalization.offset, np.float64)
     vertices = mesh.vertices / scale + offset if target == "file" else scale * (mesh.vertices - offset)
@@ -549,9 +552,7 @@ def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: 
 
 def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:
     """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not."""
-    check_units(source)
-    check_units(target)
-    if source == target:
+    if _same_units(source, target):
         return camera
     viewmat: Any = camera.viewmat.copy() if isinstance(camera.viewmat, np.ndarray) else camera.viewmat.clone()
     offset: Any = np.asarray(normalization.offset, np.float64)

@@ -25,11 +25,10 @@ PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", 
 """The same with their modules."""
 
 READERS = {
-    "export/base.py": {"Format.read": "splat"},
+    "export/base.py": {"reading": "splat"},
     "export/ply.py": {"start_of": "ply", "_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
-    "export/spz.py": {"SPZ.is_antialiased": "SPZ"},
     "io/transforms.py": {"_json": "cameras", "read_json": "transforms"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
@@ -72,7 +71,7 @@ DIGEST = "reads bytes that it does not look into"
 SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
-    "export/sog.py": {"encode": "writes"},
+    "export/sog.py": {"SOG.is_antialiased": "SOG", "encode": "writes"},
     "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER,

@@ -11,6 +11,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -165,6 +166,20 @@ BROKEN = (
 unknown methods as NotImplementedError, and seeks before the start as OSError."""
 
 
+@contextmanager
+def reading(path: Path, whole: bool = False) -> Iterator[BinaryIO]:
+    """Open a file, or read the ``whole`` file; errors of opening and of decoding become a DataError."""
+    try:
+        file: BinaryIO = io.BytesIO(read_input(path)) if whole else open_input(path)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+    try:
+        with file, np.errstate(all="ignore"):  # infinities and NaN are named afterwards, with their Gaussian
+            yield file
+    except BROKEN as e:
+        raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+
+
 class Format:
     """A file format of Gaussians. To add a format, derive a class that defines `encode`, `decode` or both."""
 
@@ -261,15 +276,8 @@ class Format:
             DataError: The file is missing or malformed.
         """
         normalization = checked_normalization(normalization, units, str(path))
-        try:
-            data: BinaryIO = open_input(path) if self.archive else io.BytesIO(read_input(path))
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        try:
-            with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
-                arrays = self.decode(path, data if self.archive else data.read())
-        except BROKEN as e:
-            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        with reading(path, whole=not self.archive) as file:
+            arrays = self.decode(path, file if self.archive else file.read())
         return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
 
 

@@ -21,7 +21,6 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
 from warpgs.export.base import (
-    BROKEN,
     SH_SIZES,
     SQRT2,
     Arrays,
@@ -33,13 +32,13 @@ from warpgs.export.base import (
     logits,
     malformed,
     parts,
+    reading,
     register,
     rounded,
     sigmoid,
     smallest_three,
     unit_quats,
 )
-from warpgs.files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
@@ -298,13 +297,8 @@ class SPZ(Format):
 
     def is_antialiased(self, path: Path) -> bool:
         """Return whether the header declares antialiasing."""
-        try:
-            with open_input(path) as file:
-                packed = file.read(2) == b"\x1f\x8b"
-                file.seek(0)
-                head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
-                return bool(HEADER.unpack(head)[5] & 1)
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        except BROKEN as e:
-            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        with reading(path) as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
+            return bool(HEADER.unpack(head)[5] & 1)
