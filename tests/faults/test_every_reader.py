@@ -29,7 +29,7 @@ READERS = {
     "export/ply.py": {"start_of": "ply", "_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
-    "io/transforms.py": {"_json": "cameras", "read_json": "transforms"},
+    "io/transforms.py": {"_json": "cameras"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
     "io/image_files.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
     "io/others.py": {"_read_matrices": "dtu", "read_poses_bounds": "llff", "read_camera_rows": "middlebury"},

@@ -120,7 +120,7 @@ def test_a_reader_must_return_a_scene_in_file_coordinates(change, folder):
         ("no_such_module:A", "the reader 'no_such_module:A' cannot be imported"),
         ("no_such_file.py:A", "the reader 'no_such_file.py:A' cannot be imported"),
         ("warpgs.io.colmap:Nothing", "warpgs.io.colmap does not define Nothing"),
-        ("warpgs.io.colmap:Pose", "is not a reader: it must be a class that derives from"),
+        ("warpgs.io.images:Lens", "is not a reader: it must be a class that derives from"),
         (dict, "dict is not a reader"),
         (3, "3 is not a reader; give a name"),
     ],
