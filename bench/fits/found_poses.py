@@ -26,7 +26,7 @@ from bench.lib.arguments import SCENE, parse
 from bench.lib.pose_errors import brought_over, errors
 from bench.lib.refined_views import refined
 from bench.lib.tables import mean_sd
-from warpgs.io.images import Lens, load_image
+from warpgs.io.images import Lens, ReadOptions, load_image
 from warpgs.pipeline.run.request import choose_device
 from warpgs.pipeline.train.view_modules import RefinePoses
 from warpgs.poses.find import find_poses, read_poses_record
@@ -60,7 +60,7 @@ def held_out(view: View, camera: Camera, image: Path, found: dict, downscale: in
     """
     f, width, height = found["focal"], found["width"], found["height"]
     K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
-    loaded = load_image(image, Lens(K, width, height, (found["distortion"], 0.0, 0.0, 0.0)), downscale=downscale)
+    loaded = load_image(image, Lens(K, width, height, (found["distortion"], 0.0, 0.0, 0.0)), ReadOptions(downscale=downscale))
     K = loaded.K * [[factor, 1, 1], [1, factor, 1], [1, 1, 1]]
     return View(view.name, replace(camera, K=K), loaded.image, loaded.mask)
 

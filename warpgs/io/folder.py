@@ -8,7 +8,7 @@ import posixpath
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
@@ -295,11 +295,8 @@ class SceneFolder:
         """
         if self.options.on_image is not None:
             self.options.on_image(path)
-        loaded = load_image(
-            self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
-            max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout", max_side=self.options.max_side,
-            native=self.options.lenses == "native",
-        )  # fmt: skip
+        options = self.options if downscale is None else replace(self.options, downscale=downscale)
+        loaded = load_image(self.inside(path), lens, options, mask, background)
         self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
         return self._maps.attached(loaded, path, named)
 

@@ -375,20 +375,16 @@ def _over_background(loaded: LoadedImage, background: tuple[float, float, float]
 def load_image(
     path: Path,
     lens: Lens | Callable[[int, int], Lens],
-    *,
-    downscale: int = 1,
+    options: ReadOptions,
     mask: np.ndarray | None = None,
     background: tuple[float, float, float] = BLACK,
-    max_pixels: int = MAX_PIXELS,
-    cutout: bool = False,
-    max_side: int = 0,
-    native: bool = False,
 ) -> LoadedImage:
-    """Decode an image, rotate it upright by EXIF, remove distortion, and resample.
+    """Decode an image, rotate it upright by EXIF, remove distortion, and resample; see `SceneFolder.image` for the arguments.
 
     Colours are resampled in proportion to their opacity, so that the colours of transparent pixels do not affect others.
     """
-    image, alpha = decode(path, max_pixels)
+    cutout, native = options.masks == "cutout", options.lenses == "native"
+    image, alpha = decode(path, options.max_pixels)
     stored = image.shape[:2]
     if not isinstance(lens, Lens):
         lens = lens(stored[1], stored[0])
@@ -406,7 +402,7 @@ def load_image(
     undone = lens if not native and any(lens.distortion) else None
     if undone is not None:
         loaded = _undistort(loaded, undone)
-    loaded = _shrink(path, loaded, downscale, max_side)
+    loaded = _shrink(path, loaded, options.downscale, options.max_side)
     if native and (lens.fisheye or any(lens.distortion)):
         loaded = _native(loaded, lens)
     if loaded.mask is not None and not loaded.mask.any():

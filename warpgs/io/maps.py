@@ -91,18 +91,22 @@ def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
     return decode_png(path, max_pixels)
 
 
-def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+def mapped_array(path: Path, fix: str) -> np.ndarray:
+    """Return the array of an NPY file, which stays in the file: numpy compares its shape with the file's size first."""
     try:
         open_input(path).close()
-        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
     except Exception as e:  # numpy raises a dozen types on malformed files
-        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); write it again") from e
+        why = unread_reason(e) if isinstance(e, OSError) else f"{type(e).__name__}: {e}"
+        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
     if not isinstance(found, np.ndarray):
         found.close()
-        raise DataError(f"{path}: is an archive of arrays, not one array [height, width]; save the map alone")
+        raise DataError(f"{path}: is an archive of arrays, not one array; {fix}")
+    return found
+
+
+def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+    found = mapped_array(path, "save the map alone")
     if found.dtype.kind not in "fu" or found.dtype.itemsize > 8:
         raise DataError(f"{path}: its numbers are {found.dtype}; save float32, or uint16 in millimetres")
     while found.ndim > 2 and found.shape[0] == 1:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import open_input, read_input, unread_reason
+from warpgs.files import read_input, unread_reason
 from warpgs.geometry import matmul
 from warpgs.io.folder import (
     Probe,
@@ -24,6 +24,7 @@ from warpgs.io.folder import (
     view_name,
 )
 from warpgs.io.images import Lens, ReadOptions, list_images
+from warpgs.io.maps import mapped_array
 from warpgs.scene import Scene
 
 # LLFF scenes: poses_bounds.npy, one row of 17 numbers per image in sorted-name order (Mildenhall et al. 2019).
@@ -35,15 +36,7 @@ MAX_ROWS = 1_000_000
 
 def read_poses_bounds(path: Path) -> np.ndarray:
     """Return the array of poses_bounds.npy, float64, shape [N, 17]."""
-    try:
-        open_input(path).close()
-        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
-        rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as e:  # numpy raises a dozen types on malformed files
-        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); copy it again") from e
-    if not isinstance(rows, np.ndarray):
-        rows.close()
-        raise DataError(f"{path}: is an archive of arrays, not one array [n, 17]; make it again")
+    rows = mapped_array(path, "make it again")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
     if len(rows) > MAX_ROWS:
