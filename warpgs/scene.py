@@ -247,9 +247,25 @@ class ViewDepth:
         return float(self.valid.mean())
 
 
+class _GaussianSet:
+    """What sets of Gaussians have in common, whatever their parameters."""
+
+    means: torch.Tensor
+    sh: torch.Tensor | None
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical-harmonics degree; 0 without ``sh``."""
+        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
+
+
 @document_fields
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(_GaussianSet):
     """A set of N Gaussians with the parameters that a fit optimises; the kernels apply exp, sigmoid and normalisation."""
 
     means: torch.Tensor
@@ -263,15 +279,6 @@ class Gaussians:
     sh: torch.Tensor
     """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
 
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree stored."""
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
-
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the five tensors by field name, in a fixed order."""
         return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
@@ -283,7 +290,7 @@ class Gaussians:
 
 @document_fields
 @dataclass(frozen=True)
-class ActivatedGaussians:
+class ActivatedGaussians(_GaussianSet):
     """A set of N Gaussians given by scales and opacities, for `rasterize`; fits and files use `Gaussians`.
 
     Opacity 1 and scale 0 are allowed and have finite gradients: the rule clamps alpha, and the pixel filter keeps a flat
@@ -301,15 +308,6 @@ class ActivatedGaussians:
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
 
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree given; 0 without ``sh``."""
-        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
-
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` is zeros [N, 1, 3] if it is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
@@ -323,7 +321,7 @@ class ActivatedGaussians:
 
 @document_fields
 @dataclass(frozen=True)
-class CovarianceGaussians:
+class CovarianceGaussians(_GaussianSet):
     """A set of N Gaussians given by covariances and opacities, for `rasterize`; fits and files use `Gaussians`."""
 
     means: torch.Tensor
@@ -336,15 +334,6 @@ class CovarianceGaussians:
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
-
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree given; 0 without ``sh``."""
-        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the four tensors by field name, in a fixed order; ``sh`` is zeros [N, 1, 3] if it is None."""

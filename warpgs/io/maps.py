@@ -59,19 +59,16 @@ class MapFolder:
         if not any(not key.endswith(CONFIDENCE) for key in self._files):
             found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "add"
             raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
-        self.taken: set[str] = set()
-        """Keys of the maps that images requested."""
 
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for a missing one.
 
         A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match is used.
         """
-        tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
-        for tail in tails:
+        for i in range(1 if image.is_absolute() else 0, len(image.parts)):
+            tail = PurePosixPath(*image.parts[i:])
             for key in (tail.with_suffix("").as_posix(), tail.as_posix()):
                 if key in self._files and not key.endswith(CONFIDENCE):
-                    self.taken.add(key)
                     return self._files[key], self._files.get(key + CONFIDENCE)
         return None, None
 
