@@ -514,32 +514,27 @@ def _checked_camera(what: str, camera: Camera) -> Camera:
     K, R, row = matrix("K", camera.K, (3, 3), INTRINSICS), viewmat[:3, :3].astype(np.float64), viewmat[3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = float(np.abs(R @ R.T - np.eye(3)).max())
-    for good, needs, got, fix in (
-        (
-            np.abs(row - (0, 0, 0, 1)).max() <= POSE_TOLERANCE,
-            "a pose above 0, 0, 0, 1",
-            row.tolist(),
-            "transpose it: viewmat.T",
-        ),
-        (off <= POSE_TOLERANCE, "rigid", f"R R^T off by {off:.2g} from the identity", "divide its scale out of R and t"),
-        (np.linalg.det(R) > 0, "a rotation", "a mirrored pose (determinant -1)", "for OpenGL axes, negate rows y and z"),
-    ):
+
+    def need(good: bool | np.bool_, name: str, needs: str, got: str, fix: str) -> None:
         if not good:
-            raise _wrong(f"{what}.viewmat", needs, str(got), fix)
-    if not max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1))) <= K_TOLERANCE:
-        raise _wrong(
-            f"{what}.K",
-            "without skew, above 0, 0, 1",
-            str(K.tolist()),
-            f"divide K by K[2, 2], or undistort skewed images; {INTRINSICS}",
-        )
-    focal, sides = np.abs([K[0, 0], K[1, 1]]), np.array([camera.width, camera.height])
-    if not focal.all() or (camera.model in ("pinhole", "opencv") and (focal < MIN_FOCAL * sides).any()):
-        fix = "multiply normalised intrinsics by width (first row) and height (second row)"
-        raise _wrong(f"{what}.K", "in pixels", f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}", fix)
+            raise _wrong(f"{what}.{name}", needs, got, fix)
+
+    near = np.abs(row - (0, 0, 0, 1)).max() <= POSE_TOLERANCE
+    need(near, "viewmat", "a pose above 0, 0, 0, 1", str(row.tolist()), "transpose it: viewmat.T")
+    got = f"R R^T off by {off:.2g} from the identity"
+    need(off <= POSE_TOLERANCE, "viewmat", "rigid", got, "divide its scale out of R and t")
+    got, fix = "a mirrored pose (determinant -1)", "for OpenGL axes, negate rows y and z"
+    need(np.linalg.det(R) > 0, "viewmat", "a rotation", got, fix)
+    plain = max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1))) <= K_TOLERANCE
+    fix = f"divide K by K[2, 2], or undistort skewed images; {INTRINSICS}"
+    need(plain, "K", "without skew, above 0, 0, 1", str(K.tolist()), fix)
+    focal, least = np.abs([K[0, 0], K[1, 1]]), MIN_FOCAL * np.array([camera.width, camera.height])
+    in_pixels = focal.all() and (camera.model not in ("pinhole", "opencv") or (focal >= least).all())
+    fix = "multiply normalised intrinsics by width (first row) and height (second row)"
+    need(in_pixels, "K", "in pixels", f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}", fix)
     lens, count = camera.distortion, COEFFICIENTS.get(camera.model)
-    if count == 0 and lens is not None:
-        raise _wrong(f"{what}.distortion", f"None for model {camera.model}", "a value", "give None, or model='opencv'")
+    fix = "give None, or model='opencv'"
+    need(count != 0 or lens is None, "distortion", f"None for model {camera.model}", "a value", fix)
     if count:
         given = np.zeros(0) if lens is None else lens
         lens = matrix("distortion", given, (count,), f"give {count} coefficients, np.zeros({count}) for an ideal lens")

@@ -31,7 +31,7 @@ READERS = {
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
     "io/transforms.py": {"_json": "cameras"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
-    "io/image_files.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
+    "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
     "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
     "io/maps.py": {"mapped_array": "given maps"},
     "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},

@@ -100,18 +100,12 @@ BYTES_PER_PIXEL = 32
 """Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
 
 
-def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
-    """Return the bytes of an image file; files too large for ``max_pixels`` pixels are rejected."""
+def read_image_file(path: Path, max_pixels: int = MAX_PIXELS, start: int | None = None) -> bytes:
+    """Return the bytes of an image file, or its first ``start``; files too large for ``max_pixels`` pixels are rejected."""
     try:
+        if start is not None:
+            return read_start(path, start)
         return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
-    except OSError as e:
-        raise _unreadable(path, e) from e
-
-
-def read_image_start(path: Path, count: int) -> bytes:
-    """Return the first bytes of an image file, at most ``count``."""
-    try:
-        return read_start(path, count)
     except OSError as e:
         raise _unreadable(path, e) from e
 

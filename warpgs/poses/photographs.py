@@ -38,7 +38,6 @@ from warpgs.io.image_files import (
     parse_exif,
     read_exif,
     read_image_file,
-    read_image_start,
 )
 from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
@@ -217,7 +216,7 @@ def is_heic(path: Path) -> bool:
     Raises:
         DataError: The file cannot be read.
     """
-    return brand(read_image_start(path, BRANDS_END)) == "HEIC"
+    return brand(read_image_file(path, start=BRANDS_END)) == "HEIC"
 
 
 def to_jpeg(
