@@ -98,7 +98,7 @@ MAX_MATRIX_BYTES = 4096
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4]."""
+    """Split a projection matrix [3, 4] into K [3, 3], for pixel centres at +0.5, and camera_from_world [4, 4]."""
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
         raise DataError(f"{where}: the projection matrix is not finite or not invertible; calibrate again")
