@@ -151,7 +151,8 @@ def interlaced() -> bytes:
 
 PNG_MODES = ("RGB", "RGBA", "L", "LA", "P", "1", "I;16")
 add(
-    "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()}, (image_files,),
+    "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()},
+    (image_files._png_chunks, image_files._loaded),
     (png_rows, rarely(png_bomb, png_rows)), repair=png_checksums, unexplained=same,
 )  # fmt: skip
 
@@ -181,12 +182,13 @@ def jpeg_segments(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:2] + head + data[at:]
 
 
+JPEG_PARSER = (image_files._segments, image_files._check_scans, image_files._decoded_jpeg)
 JPEGS = {
     f"{sub[0]}{sub[1]}{sub[2]}{p}": encoded("JPEG", "RGB", subsampling=":".join(sub), progressive=bool(p))
     for sub in ("444", "420") for p in (0, 1)
 }  # fmt: skip
 JPEGS |= {m: encoded("JPEG", m) for m in ("L", "CMYK")} | {"restart": encoded("JPEG", "RGB", restart_marker_blocks=2)}
-add("jpeg", JPEGS, (image_files,), (jpeg_segments, jpeg_segments))
+add("jpeg", JPEGS, JPEG_PARSER, (jpeg_segments, jpeg_segments))
 
 # ---- BMP, TIFF, WebP -------------------------------------------------------------------------------------------------
 
@@ -227,7 +229,13 @@ def webp_chunk(data: bytes, rng: np.random.Generator) -> bytes:
 
 BMP_MODES = ("RGB", "RGBA", "L", "P", "1")
 OLD = b"BM" + struct.pack("<IHHI", 26 + 4 * 32, 0, 0, 26) + struct.pack("<IHHHH", 12, 10, 4, 1, 24) + bytes(range(128))
-add("bmp", {m: encoded("BMP", m) for m in BMP_MODES} | {"old": OLD}, (image_files,), (header,), unexplained=near)
+add(
+    "bmp",
+    {m: encoded("BMP", m) for m in BMP_MODES} | {"old": OLD},
+    (image_files._opened, image_files._loaded),
+    (header,),
+    unexplained=near,
+)
 
 COLORS = np.asarray(photo("RGB"))
 DEEP = COLORS.astype(np.uint16) * 257
@@ -247,17 +255,29 @@ def big_tiled(order: str = "<") -> bytes:
     return head + entries + bytes(8) + struct.pack(order + "4Q", start + 32, start + 544, 512, 512) + bytes(range(256)) * 4
 
 
-add("tiff", TIFFS | {"big": big_tiled()}, (image_files,), (tiff_tag, tiff_tag))
+TIFF_PARSER = (
+    image_files._Directory,
+    image_files._tiff_tags,
+    image_files._tiff_size,
+    image_files._check_tiff,
+    image_files.unpacked_size,
+)
+add("tiff", TIFFS | {"big": big_tiled()}, TIFF_PARSER, (tiff_tag, tiff_tag))
 
 WEBPS = {
     "lossy": encoded("WEBP", "RGB"), "lossless": encoded("WEBP", "RGB", lossless=True),
     "alpha": encoded("WEBP", "RGBA"), "alpha lossless": encoded("WEBP", "RGBA", lossless=True),
 }  # fmt: skip
-add("webp", WEBPS, (image_files,), (webp_chunk, header))
+add("webp", WEBPS, (image_files._webp_chunks, image_files._webp_size), (webp_chunk, header))
 
 ANY = {"png": encoded("PNG", "LA"), "float": encoded("TIFF", "F"), "double": by_opencv(".tif", COLORS[..., 0] / 255.0)}
 ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P")}
-add("any image", ANY, (image_files.format_of, image_files._raster, image_files.decode), (header,))
+add(
+    "any image",
+    ANY,
+    (image_files.format_of, image_files._raster, image_files.decode, image_files._size, image_files._decoded),
+    (header,),
+)
 
 
 def other_size(data: bytes, rng: np.random.Generator) -> bytes:

@@ -123,7 +123,7 @@ register(
 # ---- AVIF and HEIC -----------------------------------------------------------------------------------------------------
 
 AVIFS = {m: encoded("AVIF", m, quality=70) for m in ("RGB", "RGBA")} | {"lossless": encoded("AVIF", "L", quality=100)}
-image_targets.add("avif", AVIFS, (image_files,), (box, box, box), share=0.7)
+image_targets.add("avif", AVIFS, (image_files._opened, image_files._loaded), (box, box, box), share=0.7)
 
 
 def heic_files(root: Path) -> list[Path]:
