@@ -400,7 +400,7 @@ def scene_name(name: str, data: bytes) -> str:
 
 def _format(data: bytes) -> str:
     try:
-        return format_of(data)[0]
+        return format_of(data)
     except ValueError:
         return ""
 
