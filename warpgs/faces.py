@@ -22,7 +22,7 @@ OLD = {
     "io.folders": {name: f"warpgs.io.{name}" for name in ("SceneFolder", "ViewList", "view_name")},
     "io.given_maps": {"NamedMaps": "warpgs.io.NamedMaps"},
     "io.images": {name: f"warpgs.io.{name}" for name in ("Lens", "LoadedImage")},
-    "io.map_files": {"MapOptions": "warpgs.io.MapOptions"},
+    "io.map_files": {"MapOptions": "warpgs.io.ReadOptions"},
     "io.readers": {
         **{name: f"warpgs.io.{name}" for name in ("Probe", "Reader", "ReadOptions")},
         "register": "warpgs.io.register_reader",

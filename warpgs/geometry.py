@@ -35,11 +35,7 @@ that leaves the bracket is replaced by a bisection."""
 
 
 def check_known(model: str) -> None:
-    """Check that a camera model is known here.
-
-    Raises:
-        UsageError: Only the kernels support the model.
-    """
+    """Check that a camera model is known here."""
     if model not in MODELS:
         raise UsageError(
             f"outside the rasterizer only the camera models {', '.join(MODELS)} are supported, not {model!r}; undistort the "
@@ -68,9 +64,6 @@ def to_plane(model: str, distortion: Array | None, positions: Array) -> Array:
     """Return the points in the image plane [..., 2] of positions in the camera [..., 3].
 
     Points behind a pinhole or beyond the rim of a lens are meaningless: see `on_lens`.
-
-    Raises:
-        UsageError: The model is unknown here.
     """
     check_known(model)
     library, x, y, z = _library(positions), *(positions[..., i] for i in range(3))
@@ -91,9 +84,6 @@ def from_plane(model: str, distortion: Array | None, points: Array) -> Array:
 
     Shapes are [..., 2] for points and [..., 3] for positions. For an orthographic camera the result is (u, v, 1); positions
     (u, v, z) of all other depths share that point.
-
-    Raises:
-        UsageError: The model is unknown here.
     """
     check_known(model)
     library, u, v = _library(points), points[..., 0], points[..., 1]
@@ -228,11 +218,7 @@ def quaternions(rotations: torch.Tensor) -> torch.Tensor:
 
 
 def check_pinhole(camera: Camera) -> None:
-    """Check that a camera is a pinhole, for code that assumes that straight lines stay straight.
-
-    Raises:
-        UsageError: The camera has another model.
-    """
+    """Check that a camera is a pinhole, for code that assumes that straight lines stay straight."""
     if camera.model != "pinhole":
         raise UsageError(
             f"only pinhole cameras are supported here, not {camera.model!r}; read the scene with --lenses undistort, or "
@@ -241,11 +227,7 @@ def check_pinhole(camera: Camera) -> None:
 
 
 def pinhole_of(camera: Camera) -> Camera:
-    """Return a pinhole camera with the same pose, K and size, and no distortion; it sees less than a wide fisheye.
-
-    Raises:
-        UsageError: The camera is orthographic, or its model is only supported by the kernels.
-    """
+    """Return a pinhole camera with the same pose, K and size, and no distortion; it sees less than a wide fisheye."""
     if camera.model not in CENTRAL:
         check_pinhole(camera)
     return replace(camera, model="pinhole", distortion=None) if camera.model != "pinhole" else camera
@@ -293,9 +275,6 @@ def project_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.n
 
     Depths are those of a render: z, or for a fisheye the distance. Lenses other than a pinhole give depth 0 for points that
     they cannot see.
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
     """
     in_camera = matmul(points, camera.viewmat[:3, :3].T) + camera.viewmat[:3, 3]
     z = in_camera[:, 2]
@@ -314,9 +293,6 @@ def back_project(camera: Camera, pixels: np.ndarray, depths: np.ndarray) -> np.n
     """Return the world points [N, 3] at pixels [N, 2] (centres at +0.5) and depths [N] [u]; inverts `project_points`.
 
     A pixel that a lens does not reach gives NaN.
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
     """
     if camera.model == "pinhole":
         homogeneous = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
@@ -331,17 +307,6 @@ def back_project_tensors(camera: Camera, pixels: torch.Tensor, depths: torch.Ten
     """Return what `back_project` returns, from tensors and without a matrix product: R^T (d K^-1 [x y 1] - t) for a pinhole.
 
     A matrix product would load another library on CUDA. Only focal lengths and principal point of K are used, as in projection.
-
-    Args:
-        camera: A camera with float32 or float64 tensors, on the device of ``pixels`` and ``depths``.
-        pixels: Positions (x, y) with centres at +0.5 [px], shape [S, 2].
-        depths: Depths [u], shape [S].
-
-    Returns:
-        World points [u], shape [S, 3].
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
     """
     import torch
 
@@ -359,13 +324,6 @@ def project_tensors(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor,
     """Return what `project_points` returns, from tensors and without a matrix product: pixels [S, 2] and depths [S] [u].
 
     For a point that the camera cannot see, the depth is at most 0 and the pixel is meaningless.
-
-    Args:
-        camera: A camera with float32 or float64 tensors, on the device of the points.
-        points: World points [u], shape [S, 3].
-
-    Raises:
-        UsageError: The camera model is only supported by the kernels.
     """
     import torch
 
@@ -519,27 +477,13 @@ SH_COUNTS = (1, 4, 9, 16, 25)
 
 
 def check_units(units: str) -> None:
-    """Check that ``units`` names one of the two systems.
-
-    Raises:
-        UsageError: ``units`` is not one of `UNITS`.
-    """
+    """Check that ``units`` names one of the two systems."""
     if units not in UNITS:
         raise UsageError(f"units {units!r} is not one of {', '.join(UNITS)}")
 
 
 def checked_normalization(normalization: Normalization | None, units: str, where: str) -> Normalization:
-    """Check and return ``normalization``; with file units, None becomes the identity.
-
-    Args:
-        normalization: Similarity from file to scene units, or None.
-        units: Units of the Gaussians: scene or file.
-        where: Beginning of messages, such as the path of a file.
-
-    Raises:
-        DataError: The normalization is not finite, or its scale is not above 0.
-        UsageError: The units are unknown, or scene units are given without a normalization.
-    """
+    """Check and return ``normalization``; with file units, None becomes the identity."""
     check_units(units)
     if normalization is None:
         if units == "scene":
@@ -555,12 +499,7 @@ def checked_normalization(normalization: Normalization | None, units: str, where
 
 
 def check_stored(gaussians: object) -> None:
-    """Check that Gaussians have log scales and logits, as in files, and tensors of matching shapes.
-
-    Raises:
-        TypeError: The Gaussians have other parameters, or a parameter is not a tensor.
-        ValueError: A shape disagrees.
-    """
+    """Check that Gaussians have log scales and logits, as in files, and tensors of matching shapes."""
     if not isinstance(gaussians, Gaussians):
         how = "give gaussians.stored()" if hasattr(gaussians, "stored") else "files hold quats, log scales and logits"
         raise TypeError(f"gaussians must be an instance of Gaussians, not {type(gaussians).__name__}; {how}")
@@ -576,27 +515,21 @@ def check_stored(gaussians: object) -> None:
         raise ValueError(f"sh must have shape [N, K, 3] (N={count}), where K is 1, 4, 9, 16 or 25, not {found}")
 
 
+def _same_units(source: str, target: str) -> bool:
+    """Return whether two names of units are equal; UsageError for an unknown one."""
+    check_units(source)
+    check_units(target)
+    return source == target
+
+
 def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source: str, target: str) -> Gaussians:
     """Return Gaussians in other units; tensors that do not change are shared.
 
     Means and log scales change; quaternions, opacities and spherical harmonics do not, because the similarity has no rotation.
     Sums are taken in float64: with georeferenced offsets of 10^6 m, float32 would lose millimetres.
-
-    Args:
-        gaussians: N Gaussians in the units ``source``, on any device.
-        normalization: Similarity from file to scene units.
-        source: Units of the input: scene or file.
-        target: Units of the result: scene or file.
-
-    Raises:
-        TypeError: The Gaussians are given by other parameters.
-        UsageError: A name of units is unknown.
-        ValueError: A shape disagrees.
     """
     check_stored(gaussians)
-    check_units(source)
-    check_units(target)
-    if source == target:
+    if _same_units(source, target):
         return gaussians
     means, log_scales = gaussians.means.double(), gaussians.log_scales.double()
     offset = means.new_tensor(np.asarray(normalization.offset, np.float64))
@@ -609,20 +542,8 @@ def convert_gaussians(gaussians: Gaussians, normalization: Normalization, source
 
 
 def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: str) -> Mesh:
-    """Return a mesh in other units: its vertices change, triangles and colours are shared.
-
-    Args:
-        mesh: The mesh in the units ``source``.
-        normalization: Similarity from file to scene units.
-        source: Units of the input: scene or file.
-        target: Units of the result: scene or file.
-
-    Raises:
-        UsageError: A name of units is unknown.
-    """
-    check_units(source)
-    check_units(target)
-    if source == target:
+    """Return a mesh in other units: its vertices change, triangles and colours are shared."""
+    if _same_units(source, target):
         return mesh
     scale, offset = normalization.scale, np.asarray(normalization.offset, np.float64)
     vertices = mesh.vertices / scale + offset if target == "file" else scale * (mesh.vertices - offset)
@@ -630,20 +551,8 @@ def convert_mesh(mesh: Mesh, normalization: Normalization, source: str, target: 
 
 
 def convert_camera(camera: Camera, normalization: Normalization, source: str, target: str) -> Camera:
-    """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not.
-
-    Args:
-        camera: One camera or a batch, with numpy arrays or torch tensors.
-        normalization: Similarity from file to scene units.
-        source: Units of the input: scene or file.
-        target: Units of the result: scene or file.
-
-    Raises:
-        UsageError: A name of units is unknown.
-    """
-    check_units(source)
-    check_units(target)
-    if source == target:
+    """Return a camera, or a batch of them, in other units: its translation changes, rotation and intrinsics do not."""
+    if _same_units(source, target):
         return camera
     viewmat: Any = camera.viewmat.copy() if isinstance(camera.viewmat, np.ndarray) else camera.viewmat.clone()
     offset: Any = np.asarray(normalization.offset, np.float64)

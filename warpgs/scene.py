@@ -247,9 +247,25 @@ class ViewDepth:
         return float(self.valid.mean())
 
 
+class _GaussianSet:
+    """What sets of Gaussians have in common, whatever their parameters."""
+
+    means: torch.Tensor
+    sh: torch.Tensor | None
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical-harmonics degree; 0 without ``sh``."""
+        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
+
+
 @document_fields
 @dataclass(frozen=True)
-class Gaussians:
+class Gaussians(_GaussianSet):
     """A set of N Gaussians with the parameters that a fit optimises; the kernels apply exp, sigmoid and normalisation."""
 
     means: torch.Tensor
@@ -263,15 +279,6 @@ class Gaussians:
     sh: torch.Tensor
     """Spherical-harmonics coefficients, shape [N, K, 3] with K = (degree + 1)^2, K in {1, 4, 9, 16, 25}."""
 
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree stored."""
-        return int(round(self.sh.shape[1] ** 0.5)) - 1
-
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the five tensors by field name, in a fixed order."""
         return {name: getattr(self, name) for name in ("means", "quats", "log_scales", "logit_opacities", "sh")}
@@ -283,7 +290,7 @@ class Gaussians:
 
 @document_fields
 @dataclass(frozen=True)
-class ActivatedGaussians:
+class ActivatedGaussians(_GaussianSet):
     """A set of N Gaussians given by scales and opacities, for `rasterize`; fits and files use `Gaussians`.
 
     Opacity 1 and scale 0 are allowed and have finite gradients: the rule clamps alpha, and the pixel filter keeps a flat
@@ -301,15 +308,6 @@ class ActivatedGaussians:
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
 
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree given; 0 without ``sh``."""
-        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
-
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the five tensors by field name, in the order of `Gaussians`; ``sh`` is zeros [N, 1, 3] if it is None."""
         sh = self.means.new_zeros(len(self), 1, 3) if self.sh is None else self.sh
@@ -323,7 +321,7 @@ class ActivatedGaussians:
 
 @document_fields
 @dataclass(frozen=True)
-class CovarianceGaussians:
+class CovarianceGaussians(_GaussianSet):
     """A set of N Gaussians given by covariances and opacities, for `rasterize`; fits and files use `Gaussians`."""
 
     means: torch.Tensor
@@ -336,15 +334,6 @@ class CovarianceGaussians:
     """Opacities in [0, 1], shape [N]."""
     sh: torch.Tensor | None = None
     """Spherical-harmonics coefficients, shape [N, K, 3] as in `Gaussians`; None with ``RasterizeOptions.colors``."""
-
-    def __len__(self) -> int:
-        """Return the number of Gaussians."""
-        return self.means.shape[0]
-
-    @property
-    def sh_degree(self) -> int:
-        """Highest spherical-harmonics degree given; 0 without ``sh``."""
-        return 0 if self.sh is None else int(round(self.sh.shape[1] ** 0.5)) - 1
 
     def tensors(self) -> dict[str, torch.Tensor]:
         """Return the four tensors by field name, in a fixed order; ``sh`` is zeros [N, 1, 3] if it is None."""
@@ -443,11 +432,7 @@ INTRINSICS = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels"
 
 
 def checked_scene(scene: Scene, where: str = "") -> Scene:
-    """Return a scene whose fields are all valid.
-
-    Raises:
-        DataError: A field is invalid; the message starts with ``where``.
-    """
+    """Return a scene whose fields are all valid."""
     of = f"{where}scene."
     for name in ("path", "format", "fingerprint", "pixels"):
         _check(of + name, getattr(scene, name), str, "give a str, '' if unknown")
@@ -479,11 +464,7 @@ def checked_scene(scene: Scene, where: str = "") -> Scene:
 
 
 def checked_views(views: Iterable[View], where: str = "") -> list[View]:
-    """Return views whose fields are all valid, in their order.
-
-    Raises:
-        DataError: A field is invalid; the message starts with ``where``.
-    """
+    """Return views whose fields are all valid, in their order."""
     if isinstance(views, (View, Scene, np.ndarray)) or not isinstance(views, Iterable):
         fix = "give scene.views" if isinstance(views, Scene) else "give [view]"
         raise _wrong(f"{where}views", "a list of View", type(views).__name__, fix)
@@ -533,32 +514,27 @@ def _checked_camera(what: str, camera: Camera) -> Camera:
     K, R, row = matrix("K", camera.K, (3, 3), INTRINSICS), viewmat[:3, :3].astype(np.float64), viewmat[3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = float(np.abs(R @ R.T - np.eye(3)).max())
-    for good, needs, got, fix in (
-        (
-            np.abs(row - (0, 0, 0, 1)).max() <= POSE_TOLERANCE,
-            "a pose above 0, 0, 0, 1",
-            row.tolist(),
-            "transpose it: viewmat.T",
-        ),
-        (off <= POSE_TOLERANCE, "rigid", f"R R^T off by {off:.2g} from the identity", "divide its scale out of R and t"),
-        (np.linalg.det(R) > 0, "a rotation", "a mirrored pose (determinant -1)", "for OpenGL axes, negate rows y and z"),
-    ):
+
+    def need(good: bool | np.bool_, name: str, needs: str, got: str, fix: str) -> None:
         if not good:
-            raise _wrong(f"{what}.viewmat", needs, str(got), fix)
-    if not max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1))) <= K_TOLERANCE:
-        raise _wrong(
-            f"{what}.K",
-            "without skew, above 0, 0, 1",
-            str(K.tolist()),
-            f"divide K by K[2, 2], or undistort skewed images; {INTRINSICS}",
-        )
-    focal, sides = np.abs([K[0, 0], K[1, 1]]), np.array([camera.width, camera.height])
-    if not focal.all() or (camera.model in ("pinhole", "opencv") and (focal < MIN_FOCAL * sides).any()):
-        fix = "multiply normalised intrinsics by width (first row) and height (second row)"
-        raise _wrong(f"{what}.K", "in pixels", f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}", fix)
+            raise _wrong(f"{what}.{name}", needs, got, fix)
+
+    near = np.abs(row - (0, 0, 0, 1)).max() <= POSE_TOLERANCE
+    need(near, "viewmat", "a pose above 0, 0, 0, 1", str(row.tolist()), "transpose it: viewmat.T")
+    got = f"R R^T off by {off:.2g} from the identity"
+    need(off <= POSE_TOLERANCE, "viewmat", "rigid", got, "divide its scale out of R and t")
+    got, fix = "a mirrored pose (determinant -1)", "for OpenGL axes, negate rows y and z"
+    need(np.linalg.det(R) > 0, "viewmat", "a rotation", got, fix)
+    plain = max(abs(K[0, 1]), abs(K[1, 0]), *np.abs(K[2] - (0, 0, 1))) <= K_TOLERANCE
+    fix = f"divide K by K[2, 2], or undistort skewed images; {INTRINSICS}"
+    need(plain, "K", "without skew, above 0, 0, 1", str(K.tolist()), fix)
+    focal, least = np.abs([K[0, 0], K[1, 1]]), MIN_FOCAL * np.array([camera.width, camera.height])
+    in_pixels = focal.all() and (camera.model not in ("pinhole", "opencv") or (focal >= least).all())
+    fix = "multiply normalised intrinsics by width (first row) and height (second row)"
+    need(in_pixels, "K", "in pixels", f"focal lengths {K[0, 0]:g} and {K[1, 1]:g}", fix)
     lens, count = camera.distortion, COEFFICIENTS.get(camera.model)
-    if count == 0 and lens is not None:
-        raise _wrong(f"{what}.distortion", f"None for model {camera.model}", "a value", "give None, or model='opencv'")
+    fix = "give None, or model='opencv'"
+    need(count != 0 or lens is None, "distortion", f"None for model {camera.model}", "a value", fix)
     if count:
         given = np.zeros(0) if lens is None else lens
         lens = matrix("distortion", given, (count,), f"give {count} coefficients, np.zeros({count}) for an ideal lens")

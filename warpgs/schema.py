@@ -35,11 +35,7 @@ class SchemaError(ValueError):
 
 
 def parse(text: str | bytes) -> Any:
-    """Return the value of a JSON text.
-
-    Raises:
-        SchemaError: The text is not JSON, longer than `MAX_BYTES`, deeper than `MAX_DEPTH`, or has more than `MAX_PARTS`.
-    """
+    """Return the value of a JSON text."""
     if len(text) > MAX_BYTES:
         raise SchemaError(f"is larger than {MAX_BYTES / 2**20:.0f} MiB")
     check_parts(text)
@@ -54,22 +50,14 @@ def parse(text: str | bytes) -> Any:
 
 
 def check_parts(text: str | bytes) -> None:
-    """Check the number of lists and objects of a JSON text before it is parsed.
-
-    Raises:
-        SchemaError: There are more than `MAX_PARTS`.
-    """
+    """Check the number of lists and objects of a JSON text before it is parsed."""
     count = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
     if count > MAX_PARTS:
         raise SchemaError(f"has more than {MAX_PARTS:,} lists and objects")
 
 
 def check_depth(value: Any, most: int) -> None:
-    """Check that at most ``most`` lists and objects are nested, without recursion.
-
-    Raises:
-        SchemaError: More are nested.
-    """
+    """Check that at most ``most`` lists and objects are nested, without recursion."""
     level, depth = [value], 0
     while level := [part for outer in level for part in _parts(outer)]:
         depth += 1
@@ -84,17 +72,7 @@ def _parts(value: Any) -> list[Any]:
 
 
 def read(path: Path, below: Path | None = None) -> Any:
-    """Return the value of a JSON file.
-
-    Args:
-        path: The file.
-        below: Folder, such as a run's, that contains the file; no link below that folder is followed. None for a file that
-            the user names.
-
-    Raises:
-        OSError: The file cannot be read, is a link that is not followed, not a regular file, or larger than `MAX_BYTES`.
-        SchemaError: `parse` rejects its content.
-    """
+    """Return the value of a JSON file."""
     return parse(read_input(path, MAX_BYTES, below))
 
 
@@ -195,13 +173,7 @@ def mapping(schema: Schema, names: Schema = text) -> Schema:
 
 
 def fields(needed: Mapping[str, Schema], more: Mapping[str, Schema] | None = None, *, others: bool = True) -> Schema:
-    """Return the schema of objects with certain names.
-
-    Args:
-        needed: Schema of each name that must be there.
-        more: Schema of each name that may be there.
-        others: Whether other names are allowed, too.
-    """
+    """Return the schema of objects with certain names."""
     known = {**needed, **(more or {})}
 
     def check(value: Any, place: str) -> None:

@@ -173,7 +173,7 @@ def packing(a: Namespace, work: Path) -> Iterator[dict]:
     if a.scene is None:
         write_demo(work / "demo", views=24, width=504, height=378)
         a.scene, a.split = work / "demo", "train=000.png,012.png,023.png;test=006.png,018.png"
-    scene = SceneRequest(str(a.scene.resolve()), a.split, a.downscale)
+    scene = SceneRequest(str(a.scene.resolve()), a.split, downscale=a.downscale)
     config = PRESETS["default"] if a.steps is None else dataclasses.replace(PRESETS["default"], steps=a.steps)
     there, best, alone = torch.cuda.device_count(), 0, {}
 

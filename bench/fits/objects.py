@@ -68,7 +68,7 @@ def measure(task: Task) -> dict:
             folder, file = Path(work, "scene"), Path(work, "model.ply")
             split = write_object(folder, form=task.format, views=task.views, seed=task.object, **side)
             masks = "cutout" if task.format == "colmap" else "ignore"
-            request = SceneRequest(str(folder), split, 1, masks=masks)
+            request = SceneRequest(str(folder), split, downscale=1, masks=masks)
             fitted = warpgs.fit(request, config, device=task.device, verbose=False)
             scene = warpgs.load_scene(folder, masks=masks)
             test = [scene.view(name) for name in fitted.test]

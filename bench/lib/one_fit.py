@@ -180,7 +180,7 @@ def pruned_figures(fit: Fit, config: FitConfig) -> dict:
     """Return the figures of one of our fits after its model was pruned; SSIM is not measured."""
     with tempfile.TemporaryDirectory() as place:
         run, out = Path(place, "run"), Path(place, "pruned")
-        request = SceneRequest(fit.folder, fit.split, fit.downscale)
+        request = SceneRequest(fit.folder, fit.split, downscale=fit.downscale)
         row = figures_of(warpgs.fit(request, config, out=run, device=fit.device, verbose=False).metrics)
         prune(run, KEEP_PSNR, out, fit.device)
         told = json.loads((out / "config.json").read_text("utf-8"))["pruned"]

@@ -18,15 +18,14 @@ from tests.faults.scene_targets import read_scene, write_masked
 from tests.faults.targets import Target, not_finite, register
 from tests.io import scenes
 from warpgs.io import folder as folders
-from warpgs.io import images, load
-from warpgs.io.image_formats import bmp, jpeg, png, tiff, webp
+from warpgs.io import image_files, images, load
 
 MAX_PIXELS = 20_000
 Pixels = tuple[np.ndarray, np.ndarray | None]
 
 
 def read(folder: Path, path: Path) -> Pixels:
-    pixels = images.decode(path, MAX_PIXELS)
+    pixels = image_files.decode(path, MAX_PIXELS)
     assert images.exif_orientation(path) in range(1, 9)
     return pixels
 
@@ -108,7 +107,7 @@ def chunks_of(data: bytes) -> list[tuple[bytes, bytes]]:
 
 
 def joined(chunks: list[tuple[bytes, bytes]]) -> bytes:
-    return png.SIGNATURE + b"".join(chunk(*c) for c in chunks)
+    return image_files.PNG_START + b"".join(chunk(*c) for c in chunks)
 
 
 def png_checksums(data: bytes) -> bytes:
@@ -139,16 +138,21 @@ def png_rows(data: bytes, rng: np.random.Generator) -> bytes:
     return joined([*others[:end], (b"IDAT", packed[:split]), (b"IDAT", packed[split:]), *others[end:]])
 
 
+PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+"""First column, first row and steps of the passes of an interlaced image."""
+
+
 def interlaced() -> bytes:
     gray = np.asarray(photo("L"))
-    rows = [b"\0" + r.tobytes() for x, y, dx, dy in png.PASSES for r in gray[y::dy, x::dx] if r.size]
+    rows = [b"\0" + r.tobytes() for x, y, dx, dy in PASSES for r in gray[y::dy, x::dx] if r.size]
     header = struct.pack(">IIBBBBB", gray.shape[1], gray.shape[0], 8, 0, 0, 0, 1)
     return joined([(b"IHDR", header), (b"IDAT", zlib.compress(b"".join(rows))), (b"IEND", b"")])
 
 
 PNG_MODES = ("RGB", "RGBA", "L", "LA", "P", "1", "I;16")
 add(
-    "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()}, (png,),
+    "png", {m.replace(";", ""): encoded("PNG", m) for m in PNG_MODES} | {"interlaced": interlaced()},
+    (image_files._png_chunks, image_files._loaded),
     (png_rows, rarely(png_bomb, png_rows)), repair=png_checksums, unexplained=same,
 )  # fmt: skip
 
@@ -178,12 +182,13 @@ def jpeg_segments(data: bytes, rng: np.random.Generator) -> bytes:
     return data[:2] + head + data[at:]
 
 
+JPEG_PARSER = (image_files._segments, image_files._check_scans, image_files._decoded_jpeg)
 JPEGS = {
     f"{sub[0]}{sub[1]}{sub[2]}{p}": encoded("JPEG", "RGB", subsampling=":".join(sub), progressive=bool(p))
     for sub in ("444", "420") for p in (0, 1)
 }  # fmt: skip
 JPEGS |= {m: encoded("JPEG", m) for m in ("L", "CMYK")} | {"restart": encoded("JPEG", "RGB", restart_marker_blocks=2)}
-add("jpeg", JPEGS, (jpeg,), (jpeg_segments, jpeg_segments))
+add("jpeg", JPEGS, JPEG_PARSER, (jpeg_segments, jpeg_segments))
 
 # ---- BMP, TIFF, WebP -------------------------------------------------------------------------------------------------
 
@@ -224,7 +229,13 @@ def webp_chunk(data: bytes, rng: np.random.Generator) -> bytes:
 
 BMP_MODES = ("RGB", "RGBA", "L", "P", "1")
 OLD = b"BM" + struct.pack("<IHHI", 26 + 4 * 32, 0, 0, 26) + struct.pack("<IHHHH", 12, 10, 4, 1, 24) + bytes(range(128))
-add("bmp", {m: encoded("BMP", m) for m in BMP_MODES} | {"old": OLD}, (bmp,), (header,), unexplained=near)
+add(
+    "bmp",
+    {m: encoded("BMP", m) for m in BMP_MODES} | {"old": OLD},
+    (image_files._opened, image_files._loaded),
+    (header,),
+    unexplained=near,
+)
 
 COLORS = np.asarray(photo("RGB"))
 DEEP = COLORS.astype(np.uint16) * 257
@@ -244,17 +255,29 @@ def big_tiled(order: str = "<") -> bytes:
     return head + entries + bytes(8) + struct.pack(order + "4Q", start + 32, start + 544, 512, 512) + bytes(range(256)) * 4
 
 
-add("tiff", TIFFS | {"big": big_tiled()}, (tiff,), (tiff_tag, tiff_tag))
+TIFF_PARSER = (
+    image_files._Directory,
+    image_files._tiff_tags,
+    image_files._tiff_size,
+    image_files._check_tiff,
+    image_files.unpacked_size,
+)
+add("tiff", TIFFS | {"big": big_tiled()}, TIFF_PARSER, (tiff_tag, tiff_tag))
 
 WEBPS = {
     "lossy": encoded("WEBP", "RGB"), "lossless": encoded("WEBP", "RGB", lossless=True),
     "alpha": encoded("WEBP", "RGBA"), "alpha lossless": encoded("WEBP", "RGBA", lossless=True),
 }  # fmt: skip
-add("webp", WEBPS, (webp,), (webp_chunk, header))
+add("webp", WEBPS, (image_files._webp_chunks, image_files._webp_size), (webp_chunk, header))
 
 ANY = {"png": encoded("PNG", "LA"), "float": encoded("TIFF", "F"), "double": by_opencv(".tif", COLORS[..., 0] / 255.0)}
 ANY |= {"jpeg": JPEGS["4440"], "gif": encoded("GIF", "P")}
-add("any image", ANY, (images.format_of, images._raster, images.decode), (header,))
+add(
+    "any image",
+    ANY,
+    (image_files.format_of, image_files._raster, image_files.decode, image_files._size, image_files._decoded),
+    (header,),
+)
 
 
 def other_size(data: bytes, rng: np.random.Generator) -> bytes:

@@ -17,8 +17,8 @@ from tests.faults.image_targets import encoded, jpeg_segments, photo, png_checks
 from tests.faults.mutations import Change, damage, number
 from tests.faults.targets import Target, register
 from warpgs.errors import DataError
-from warpgs.io.image_formats import avif
-from warpgs.io.images import decode
+from warpgs.io import image_files
+from warpgs.io.image_files import decode
 from warpgs.poses import photographs
 
 MAX_PIXELS = 20_000
@@ -123,7 +123,7 @@ register(
 # ---- AVIF and HEIC -----------------------------------------------------------------------------------------------------
 
 AVIFS = {m: encoded("AVIF", m, quality=70) for m in ("RGB", "RGBA")} | {"lossless": encoded("AVIF", "L", quality=100)}
-image_targets.add("avif", AVIFS, (avif,), (box, box, box), share=0.7)
+image_targets.add("avif", AVIFS, (image_files._opened, image_files._loaded), (box, box, box), share=0.7)
 
 
 def heic_files(root: Path) -> list[Path]:

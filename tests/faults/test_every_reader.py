@@ -17,7 +17,7 @@ from warpgs.pipeline.metrics import lpips
 PACKAGE = Path(warpgs.__file__).parent
 OPENING = {
     "open", "open_file", "open_input", "read_bytes", "read_file", "read_input", "read_start", "read_text", "input_digest",
-    "fromfile", "imdecode", "imread", "safe_open", "AvifImageFile", "HeifImageFile", "InferenceSession", "VideoCapture",
+    "fromfile", "imdecode", "imread", "safe_open", "HeifImageFile", "InferenceSession", "VideoCapture",
     "ZipFile",
 }  # fmt: skip
 """Names of functions and classes that open a file or decode what one holds."""
@@ -25,17 +25,15 @@ PARSING = {"json.load", "json.loads", "np.load", "schema.parse", "schema.read", 
 """The same with their modules."""
 
 READERS = {
-    "export/base.py": {"Format.read": "splat"},
+    "export/base.py": {"reading": "splat"},
     "export/ply.py": {"start_of": "ply", "_read": "ply"},
     "export/gltf.py": {"_split": "glTF"},
     "export/sog.py": {"SOG.is_antialiased": "SOG", "decode": "SOG", "_member": "SOG", "_meta": "SOG", "_pixels": "SOG"},
-    "export/spz.py": {"SPZ.is_antialiased": "SPZ"},
-    "io/transforms.py": {"_json": "cameras", "read_json": "transforms"},
+    "io/transforms.py": {"_json": "cameras"},
     "io/colmap.py": {"_BinaryFile.__init__": "colmap", "_lines": "colmap"},
-    "io/images.py": {"_raster": "any image", "read_image_file": "any image", "read_image_start": "heic by its process"},
-    "io/others.py": {"_read_matrices": "dtu", "read_poses_bounds": "llff", "read_camera_rows": "middlebury"},
-    "io/image_formats/avif.py": {"open_image": "avif"},
-    "io/maps.py": {"_read_array": "given maps"},
+    "io/image_files.py": {"_raster": "any image", "read_image_file": "any image"},
+    "io/others.py": {"_read_matrices": "dtu", "read_camera_rows": "middlebury"},
+    "io/maps.py": {"mapped_array": "given maps"},
     "pipeline/farm/work.py": {"_scores": "scores", "write_thumbnail": "render of a job"},
     "pipeline/farm/job.py": {"_read": "list of jobs", "read_job_record": "record of a job"},
     "pipeline/films/paths.py": {"read_keyframes": "keyframes"},
@@ -73,7 +71,7 @@ DIGEST = "reads bytes that it does not look into"
 SYSTEM = "reads what the system says"
 LAYER = "opens for others, which are named here"
 REASONS = {
-    "export/sog.py": {"encode": "writes"},
+    "export/sog.py": {"SOG.is_antialiased": "SOG", "encode": "writes"},
     "files.py": {"appending": "writes", "writing": "writes", "read_file": LAYER,
         "open_input": LAYER, "read_input": LAYER, "read_start": LAYER, "input_digest": LAYER},
     "folders.py": {"Folder.open": LAYER, "Folder.open_regular": LAYER, "_opened": LAYER,

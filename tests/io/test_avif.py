@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from warpgs.errors import DataError
-from warpgs.io.images import decode, list_images
+from warpgs.io.image_files import decode
+from warpgs.io.images import list_images
 from warpgs.poses.photographs import prepare, write_copy
 
 MAKE, MODEL, EXIF, FOCAL_35MM, ORIENTATION = 0x010F, 0x0110, 0x8769, 0xA405, 0x0112

@@ -44,7 +44,7 @@ def test_pixels_arrive_as_rgb(kind, tmp_path):
 @pytest.mark.parametrize("kind", scenes.WRITERS)
 def test_images_over_the_longest_side_are_reduced_and_that_is_said(kind, tmp_path, monkeypatch):
     """Without a factor the default bound holds, with one or with 0 none does."""
-    monkeypatch.setattr("warpgs.io.folder.DEFAULT_MAX_SIDE", 8)
+    monkeypatch.setattr("warpgs.io.images.DEFAULT_MAX_SIDE", 8)
     scenes.WRITERS[kind](tmp_path)
     reduced, whole = load_scene(tmp_path), load_scene(tmp_path, max_side=0)
     assert {(v.camera.width, v.camera.height) for v in reduced.views} == {(8, 6)} and "at most 8 px a side" in reduced.pixels

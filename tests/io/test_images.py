@@ -9,7 +9,8 @@ from PIL import Image
 
 from tests.io import scenes
 from warpgs.errors import DataError, UsageError
-from warpgs.io.images import Lens, decode, load_image
+from warpgs.io.image_files import decode
+from warpgs.io.images import Lens, ReadOptions, load_image
 from warpgs.io.load import fingerprint, load_scene
 
 
@@ -67,7 +68,7 @@ def test_exif_never_turns_a_raster_that_fits(orientation, tmp_path):
     exif = Image.Exif()
     exif[0x112] = orientation
     Image.fromarray(scenes.image(0)).save(tmp_path / "a.png", exif=exif)
-    loaded = load_image(tmp_path / "a.png", lens(16, 12))
+    loaded = load_image(tmp_path / "a.png", lens(16, 12), ReadOptions())
     np.testing.assert_allclose(loaded.image, scenes.image(0) / 255, atol=1e-6)
     assert loaded.done == ()
 
@@ -83,9 +84,9 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
     mask = np.arange(12 * 16).reshape(12, 16) % 3 > 0
     if orientation < 5:
         with pytest.raises(DataError, match=r"a.png: the image is 16 x 12 px, its camera 12 x 16.*Give the images"):
-            load_image(path, lens(12, 16))
+            load_image(path, lens(12, 16), ReadOptions())
         return
-    loaded = load_image(path, lens(12, 16), mask=mask)
+    loaded = load_image(path, lens(12, 16), ReadOptions(), mask=mask)
     np.testing.assert_allclose(loaded.image, np.array(ImageOps.exif_transpose(Image.open(path))) / 255, atol=1e-6)
     stored = Image.fromarray(mask.astype(np.uint8) * 255)
     stored.getexif()[0x112] = orientation
@@ -96,10 +97,10 @@ def test_exif_turns_only_what_fits_turned(orientation, tmp_path):
 def test_size_within_a_pixel_is_rescaled_and_others_are_refused(tmp_path):
     path = tmp_path / "a.png"
     scenes.save(path, scenes.image(0, 33, 25))  # a half of 65 x 49, rounded up
-    K = load_image(path, lens(65, 49, 40.0)).K
+    K = load_image(path, lens(65, 49, 40.0), ReadOptions()).K
     np.testing.assert_allclose(K[[0, 1, 0, 1], [0, 1, 2, 2]], [40 * 33 / 65, 40 * 25 / 49, 16.5, 12.5])
     with pytest.raises(DataError, match=r"a.png: the image is 33 x 25 px, its camera 60 x 60: the aspects differ"):
-        load_image(path, lens(60, 60))
+        load_image(path, lens(60, 60), ReadOptions())
 
 
 @pytest.mark.parametrize("factor", [2, 3, 4])
@@ -107,7 +108,7 @@ def test_resampling_is_an_area_mean_with_exact_intrinsics(factor, tmp_path):
     path = tmp_path / "a.png"
     rgb = np.random.default_rng(1).integers(0, 256, (24, 36, 3), np.uint8)
     scenes.save(path, rgb)
-    loaded = load_image(path, lens(36, 24, 30.0), downscale=factor)
+    loaded = load_image(path, lens(36, 24, 30.0), ReadOptions(downscale=factor))
     mean = rgb.reshape(24 // factor, factor, 36 // factor, factor, 3).mean(axis=(1, 3)) / 255
     np.testing.assert_allclose(loaded.image, mean, atol=1e-5)
     np.testing.assert_allclose(loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], np.array([30, 30, 18, 12]) / factor)
@@ -115,7 +116,7 @@ def test_resampling_is_an_area_mean_with_exact_intrinsics(factor, tmp_path):
 
 def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
     scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
-    loaded = load_image(tmp_path / "a.png", lens(35, 26), downscale=3)
+    loaded = load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(downscale=3))
     assert loaded.image.shape == (9, 12, 3)
     np.testing.assert_allclose(loaded.K[[0, 1], [0, 1]], [20 * 12 / 35, 20 * 9 / 26])
 
@@ -124,7 +125,7 @@ def test_uneven_resampling_scales_each_axis_by_itself(tmp_path):
 def test_a_longest_side_bounds_an_image_and_scales_each_axis_of_its_camera(downscale, side, size, tmp_path):
     """It holds after the factor; an image within it is untouched by it, and nothing is said."""
     scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
-    loaded = load_image(tmp_path / "a.png", lens(35, 26), downscale=downscale, max_side=side)
+    loaded = load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(downscale=downscale, max_side=side))
     assert loaded.image.shape == (*size[::-1], 3)
     np.testing.assert_allclose(
         loaded.K[[0, 1, 0, 1], [0, 1, 2, 2]], [20 * size[0] / 35, 20 * size[1] / 26, *np.array(size) / 2]
@@ -135,7 +136,7 @@ def test_a_longest_side_bounds_an_image_and_scales_each_axis_of_its_camera(downs
 def test_a_longest_side_that_leaves_nothing_is_refused(tmp_path):
     scenes.save(tmp_path / "a.png", scenes.image(0, 35, 26))
     with pytest.raises(UsageError, match=r"--max-side 4 leaves 4 x 3 px of .*a\.png"):
-        load_image(tmp_path / "a.png", lens(35, 26), max_side=4)
+        load_image(tmp_path / "a.png", lens(35, 26), ReadOptions(max_side=4))
 
 
 def distort(x, y, k1, k2, p1, p2, k3=0.0):
@@ -161,7 +162,7 @@ def test_undistortion_agrees_with_the_analytic_image(terms, tmp_path):
         x, y = x - (dx - xd), y - (dy - yd)
     path = tmp_path / "a.png"
     scenes.save(path, np.round(65535 * smooth(f * x + cx, f * y + cy)).astype(np.uint16))
-    loaded = load_image(path, Lens(K, width, height, tuple(terms), "OPENCV"))
+    loaded = load_image(path, Lens(K, width, height, tuple(terms), "OPENCV"), ReadOptions())
     mask = np.ones((height, width), bool) if loaded.mask is None else loaded.mask
     du, dv = distort((u - cx) / f, (v - cy) / f, *terms)
     du, dv = f * du + cx, f * dv + cy
@@ -178,7 +179,7 @@ def test_undistortion_agrees_with_the_analytic_image(terms, tmp_path):
 
 def test_a_lens_that_folds_back_is_masked_there(tmp_path):
     scenes.save(tmp_path / "a.png", scenes.image(0, 64, 48))
-    loaded = load_image(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"))
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 30.0, (-0.5, 0.0, 0.0, 0.0), "RADIAL"), ReadOptions())
     x, y = grid(64, 48)
     radius2 = ((x - 32) / 30) ** 2 + ((y - 24) / 30) ** 2
     assert not loaded.mask[radius2 > 1 / 1.5].any() and loaded.mask[radius2 < 0.6].all()
@@ -271,7 +272,7 @@ def test_transparent_colours_do_not_run_into_others(background, tmp_path):
     image[...] = 255, 0, 0, 0
     image[:, 5:] = 40, 80, 120, 255
     scenes.save(tmp_path / "a.png", image)
-    loaded = load_image(tmp_path / "a.png", lens(12, 8), downscale=2, background=background)
+    loaded = load_image(tmp_path / "a.png", lens(12, 8), ReadOptions(downscale=2), background=background)
     alpha = np.tile(np.float32([0, 0, 0.5, 1, 1, 1]), (4, 1))
     np.testing.assert_allclose(loaded.alpha, alpha, atol=1e-6)
     expected = alpha[..., None] * np.array([40, 80, 120]) / 255 + (1 - alpha[..., None]) * background
@@ -283,9 +284,9 @@ def test_alpha_is_freed_of_distortion_with_its_image(tmp_path):
     image = np.full((48, 64, 4), 255, np.uint8)
     image[..., 3] = np.tile((np.arange(64) % 8 < 4) * 255, (48, 1))
     scenes.save(tmp_path / "a.png", image)
-    loaded = load_image(tmp_path / "a.png", lens(64, 48, 60.0, (0.3, 0.0, 0.0, 0.0)), downscale=2)
+    loaded = load_image(tmp_path / "a.png", lens(64, 48, 60.0, (0.3, 0.0, 0.0, 0.0)), ReadOptions(downscale=2))
     np.testing.assert_allclose(loaded.image, loaded.alpha[..., None].repeat(3, 2), atol=1e-6)
-    straight = load_image(tmp_path / "a.png", lens(64, 48, 60.0), downscale=2)
+    straight = load_image(tmp_path / "a.png", lens(64, 48, 60.0), ReadOptions(downscale=2))
     assert np.abs(straight.alpha - loaded.alpha)[0].max() > 0.5 and loaded.mask is not None
 
 

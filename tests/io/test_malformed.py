@@ -73,7 +73,7 @@ def test_scenes_without_images(kind, lack, tmp_path):
 def read_all(folder, kind):
     colmap.read_cameras(folder / f"cameras.{kind}")
     poses = colmap.read_poses(folder / f"images.{kind}")
-    return colmap.read_points(folder / f"points3D.{kind}", {n: p.name for n, p in poses.items()})
+    return colmap.read_points(folder / f"points3D.{kind}", {n: p[0] for n, p in poses.items()})
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])

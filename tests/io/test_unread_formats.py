@@ -4,7 +4,7 @@ import pytest
 
 from tests.io import scenes
 from warpgs.errors import DataError
-from warpgs.io.images import decode
+from warpgs.io.image_files import decode
 from warpgs.io.load import load_scene
 
 FTYP = b"\0\0\0\x1cftyp"

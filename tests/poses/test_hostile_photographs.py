@@ -15,7 +15,7 @@ from PIL import Image
 from tests.poses.conftest import film, with_exif
 from tests.test_input_files import special
 from warpgs.errors import DataError
-from warpgs.io.images import Exif, parse_exif, read_exif
+from warpgs.io.image_files import Exif, parse_exif, read_exif
 from warpgs.pipeline.run.fit import with_poses
 from warpgs.pipeline.run.request import SceneRequest
 from warpgs.poses import find
@@ -176,9 +176,9 @@ def test_a_jpeg_of_many_scans_is_refused(tmp_path):
         prepare(tmp_path / "a.jpg", tmp_path, tmp_path / "small.png")
 
 
-def test_png_pixels_are_unpacked_without_copies_of_the_rest(monkeypatch):
+def test_pixels_are_unpacked_without_copies_of_the_rest(monkeypatch):
     """The unpacker copies the input that it leaves, so it is given little at a time."""
-    from warpgs.io.image_formats import png
+    from warpgs.io import image_files
 
     lengths, real = [], zlib.decompressobj
 
@@ -193,9 +193,9 @@ def test_png_pixels_are_unpacked_without_copies_of_the_rest(monkeypatch):
         def __getattr__(self, name):
             return getattr(self.stream, name)
 
-    monkeypatch.setattr(png, "zlib", types.SimpleNamespace(decompressobj=Counting, error=zlib.error))
+    monkeypatch.setattr(image_files, "zlib", types.SimpleNamespace(decompressobj=Counting, error=zlib.error))
     packed = zlib.compress(np.random.default_rng(0).bytes(2**22), 0)
-    assert png.unpacked_size(iter([memoryview(packed)]), 2**22) == 2**22
+    assert image_files.unpacked_size(memoryview(packed), 2**22) == 2**22
     assert sum(lengths) < 2 * len(packed)
 
 

@@ -12,7 +12,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg  # noqa: TID253 - flags a
 
 from warpgs.app.flags import MAX_THREADS, call, check_range, listed, load_own
 from warpgs.errors import UsageError
-from warpgs.io.images import MAX_PIXELS
+from warpgs.io.image_files import MAX_PIXELS
 from warpgs.process import say
 from warpgs.report.progress import Stages, waiting
 
@@ -272,6 +272,7 @@ Command = tuple[Callable[..., Any], str]
 
 def show_priors() -> Command:
     """Return `warpgs priors show`."""
+    from warpgs.io.image_files import MAX_PIXELS
     from warpgs.pipeline.run import commands
     from warpgs.pipeline.run.request import SceneRequest
     from warpgs.priors.views import PriorConfig
@@ -297,7 +298,7 @@ def show_priors() -> Command:
         """
         check_range("--threads", threads, 0, MAX_THREADS)
         request = SceneRequest(
-            str(scene), split, downscale, allow_outside=allow_outside, max_pixels=max_pixels, max_side=max_side
+            str(scene), split, downscale=downscale, max_side=max_side, allow_outside=allow_outside, max_pixels=max_pixels
         )
         return commands.show_priors(request, priors, source, out, threads)
 

@@ -11,6 +11,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar
 
@@ -63,11 +64,7 @@ def arrays_of(gaussians: Gaussians) -> Arrays:
 
 
 def check_finite(path: Path, arrays: Arrays) -> None:
-    """Check the values before they are written.
-
-    Raises:
-        DataError: A tensor holds a NaN or an infinity; the message names the first such tensor.
-    """
+    """Check the values before they are written."""
     for name, array in arrays.items():
         bad = array.size - int(np.isfinite(array).sum())
         if bad:
@@ -78,11 +75,7 @@ def check_finite(path: Path, arrays: Arrays) -> None:
 
 
 def gaussians_of(path: Path, arrays: Arrays) -> Gaussians:
-    """Return Gaussians of decoded arrays, as float32 tensors.
-
-    Raises:
-        DataError: A value is not finite in float32, or a rotation has zero length; the message names the first.
-    """
+    """Return Gaussians of decoded arrays, as float32 tensors."""
     import torch
 
     with np.errstate(over="ignore", invalid="ignore"):  # values beyond float32 become infinities, which the error below names
@@ -120,15 +113,7 @@ def unit_quats(quats: np.ndarray) -> np.ndarray:
 
 
 def smallest_three(quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split unit quaternions into the index of their largest component and the other three.
-
-    Args:
-        quats: Rotations [N, 4], components in any order.
-
-    Returns:
-        Index of the largest component, int64 [N], and the other components in their order [N, 3]. Each is at most 1/sqrt(2) in
-        magnitude. The sign of the quaternion is chosen so that the largest component is positive.
-    """
+    """Split unit quaternions into the index of their largest component and the other three."""
     q = unit_quats(quats)
     largest = np.abs(q).argmax(axis=1)
     rows = np.arange(len(q))
@@ -147,12 +132,7 @@ def from_smallest_three(largest: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def half_turn(arrays: Arrays, axis: str) -> Arrays:
-    """Turn Gaussians by 180 degrees about a coordinate axis: exact, and its own inverse.
-
-    Args:
-        arrays: The Gaussians.
-        axis: x (converts between SPZ's axes, RUB, and PLY's, RDF) or z (between PLY's axes and the y-up axes of glTF).
-    """
+    """Turn Gaussians by 180 degrees about a coordinate axis: exact, and its own inverse."""
     copies = arrays | {name: np.array(arrays[name]) for name in ("means", "quats", "sh")}
     half_turn_in_place(copies, axis)
     return copies
@@ -184,6 +164,20 @@ BROKEN = (
 )  # fmt: skip
 """Errors of decoders (standard library, zstandard, our own) about invalid content: zipfile reports encryption as RuntimeError,
 unknown methods as NotImplementedError, and seeks before the start as OSError."""
+
+
+@contextmanager
+def reading(path: Path, whole: bool = False) -> Iterator[BinaryIO]:
+    """Open a file, or read the ``whole`` file; errors of opening and of decoding become a DataError."""
+    try:
+        file: BinaryIO = io.BytesIO(read_input(path)) if whole else open_input(path)
+    except OSError as e:
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
+    try:
+        with file, np.errstate(all="ignore"):  # infinities and NaN are named afterwards, with their Gaussian
+            yield file
+    except BROKEN as e:
+        raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
 
 
 class Format:
@@ -282,15 +276,8 @@ class Format:
             DataError: The file is missing or malformed.
         """
         normalization = checked_normalization(normalization, units, str(path))
-        try:
-            data: BinaryIO = open_input(path) if self.archive else io.BytesIO(read_input(path))
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        try:
-            with data, np.errstate(all="ignore"):  # infinities and NaN of a broken file are named below, with their Gaussian
-                arrays = self.decode(path, data if self.archive else data.read())
-        except BROKEN as e:
-            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        with reading(path, whole=not self.archive) as file:
+            arrays = self.decode(path, file if self.archive else file.read())
         return convert_gaussians(gaussians_of(path, arrays), normalization, "file", units)
 
 
@@ -326,11 +313,7 @@ def encode(arrays: Arrays) -> list[bytes]:
 
 
 def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a file's bytes.
-
-    Raises:
-        DataError: The file is empty, its size is not a multiple of 32 bytes, or an axis length is negative.
-    """
+    """Return the Gaussians of a file's bytes."""
     if not data:
         raise malformed(path, "it is empty")
     if len(data) % _ROW.itemsize:
@@ -376,9 +359,6 @@ def find_format(choice: str | type[Format] | Format) -> Format:
     """Return a format that is given as a name, ``module:Class``, ``path/to/file.py:Class``, a class or an object.
 
     A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
-
-    Raises:
-        UsageError: There is no such format, it does not derive from `Format`, or it has no suffix.
     """
     if not isinstance(choice, (str, type, Format)):
         raise UsageError(
@@ -396,11 +376,7 @@ def find_format(choice: str | type[Format] | Format) -> Format:
 
 
 def format_of(path: str | os.PathLike[str], choice: str | type[Format] | Format | None = None) -> Format:
-    """Return the given format, or else the format of the file's suffix.
-
-    Raises:
-        UsageError: No format has the suffix, or the given format has another suffix.
-    """
+    """Return the given format, or else the format of the file's suffix."""
     if choice is not None:
         chosen = find_format(choice)
         if not chosen.fits(path):

@@ -11,7 +11,6 @@ import binascii
 import json
 import math
 import struct
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -111,12 +110,7 @@ def _document(arrays: Arrays) -> tuple[dict[str, Any], bytes]:
 
 
 def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY.
-
-    Raises:
-        DataError: The file is malformed or truncated, needs another file, or has a kernel, colour space, transformation or
-            number of Gaussian primitives that is not supported.
-    """
+    """Return the Gaussians of a .glb or .gltf file's bytes, in the axes of PLY."""
     document, body = _split(path, data)
     buffers = document.get("buffers")
     if not isinstance(buffers, list) or len(buffers) != 1 or not isinstance(buffers[0], dict):
@@ -126,7 +120,7 @@ def decode(path: Path, data: bytes) -> Arrays:
     primitive = _primitive(path, document)
     names = primitive["attributes"]
 
-    def values(name: str) -> _Table:
+    def values(name: str) -> np.ndarray:
         if name not in names:
             raise malformed(path, f"the attribute {name} is missing")
         return _accessor(path, document, body, names[name])
@@ -142,11 +136,11 @@ def decode(path: Path, data: bytes) -> Arrays:
     n = len(means)
     if any(len(v) != n for v in (turns, scales, opacities, *harmonics)):
         raise malformed(path, "its attributes differ in length")
-    if {v.width for v in (means, scales, *harmonics)} != {3}:
+    if {v.shape[1] for v in (means, scales, *harmonics)} != {3}:
         raise malformed(path, "a position, scale or harmonic does not have three components")
 
     def logs(part: slice) -> np.ndarray:
-        lengths = scales.rows(part)
+        lengths = _rows(scales, part)
         if (lengths < 0).any():
             raise malformed(path, "an axis has a negative length")
         return np.log(np.maximum(lengths, _TINY))
@@ -154,38 +148,23 @@ def decode(path: Path, data: bytes) -> Arrays:
     sh = np.empty((n, len(harmonics), 3), np.float32)
     for k, table in enumerate(harmonics):
         for part in parts(n):
-            sh[part, k] = table.rows(part)
+            sh[part, k] = _rows(table, part)
     arrays = {
         "sh": sh,
-        "means": by_rows(n, (3,), means.rows),
-        "quats": by_rows(n, (4,), lambda p: turns.rows(p)[:, [3, 0, 1, 2]]),
+        "means": by_rows(n, (3,), lambda p: _rows(means, p)),
+        "quats": by_rows(n, (4,), lambda p: _rows(turns, p)[:, [3, 0, 1, 2]]),
         "log_scales": by_rows(n, (3,), logs),
-        "logit_opacities": by_rows(n, (), lambda p: logits(opacities.rows(p)[:, 0], 2.0**-22)),
+        "logit_opacities": by_rows(n, (), lambda p: logits(_rows(opacities, p)[:, 0], 2.0**-22)),
     }
     half_turn_in_place(arrays, "z")
     return arrays
 
 
-@dataclass(frozen=True)
-class _Table:
-    """The numbers of an accessor, as stored in the file."""
-
-    block: np.ndarray
-    """float32, or integers that stand for fractions [N, W]."""
-
-    def __len__(self) -> int:
-        return len(self.block)
-
-    @property
-    def width(self) -> int:
-        return int(self.block.shape[1])
-
-    def rows(self, part: slice) -> np.ndarray:
-        """Return some rows [P, W]: float32, or fractions in float64."""
-        block = self.block[part]
-        if block.dtype.kind == "f":
-            return block.astype(np.float32)
-        return np.maximum(block / float(np.iinfo(block.dtype).max), -1.0)
+def _rows(block: np.ndarray, part: slice) -> np.ndarray:
+    """Return rows of an accessor's numbers [P, W]: float32, or in float64 the fractions that integers stand for."""
+    if block.dtype.kind == "f":
+        return block[part].astype(np.float32)
+    return np.maximum(block[part] / float(np.iinfo(block.dtype).max), -1.0)
 
 
 def _split(path: Path, data: bytes) -> tuple[dict[str, Any], bytes | memoryview]:
@@ -257,7 +236,7 @@ def _primitive(path: Path, document: dict[str, Any]) -> dict[str, Any]:
     return found[0]
 
 
-def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, index: object) -> _Table:
+def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, index: object) -> np.ndarray:
     """Return the numbers of an accessor, checked to lie in the file."""
 
     def item(table: str, at: object) -> dict[str, Any]:
@@ -286,8 +265,8 @@ def _accessor(path: Path, document: dict[str, Any], body: bytes | memoryview, in
     if stride < size or start + length > len(body) or (rows and offset + (rows - 1) * stride + size > length):
         raise malformed(path, f"accessor {index} reaches beyond its {length} bytes")
     if not rows:
-        return _Table(np.empty((0, width), np.float32))
-    return _Table(np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize)))
+        return np.empty((0, width), np.float32)
+    return np.ndarray((rows, width), dtype, body, start + offset, (stride, dtype.itemsize))
 
 
 @register("glb")

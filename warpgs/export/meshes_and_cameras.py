@@ -22,30 +22,14 @@ MAX_BYTES = 2**32 - 1
 
 
 def check_suffix(path: str | os.PathLike[str]) -> None:
-    """Check that a mesh can be written to such a file.
-
-    Raises:
-        UsageError: The suffix is not one of `SUFFIXES`.
-    """
+    """Check that a mesh can be written to such a file."""
     suffix = Path(path).suffix
     if suffix.lower() not in SUFFIXES:
         raise UsageError(f"{path}: format {suffix or '(none)'} is not supported; use {' or '.join(SUFFIXES)}")
 
 
 def write_mesh(path: str | os.PathLike[str], mesh: Mesh, up: np.ndarray | None = None) -> None:
-    """Write a mesh to a .ply or .glb file, atomically.
-
-    Args:
-        path: The file; an existing one is replaced.
-        mesh: The mesh.
-        up: Upward direction in the mesh's coordinates, any length, shape [3]: a .glb file contains the rotation that turns it
-            to +y, as glTF requires. None for +y. PLY has no upward direction.
-
-    Raises:
-        DataError: A number is not finite, a triangle refers to a missing vertex, or the file would be too large.
-        ResourceError: The file cannot be written.
-        UsageError: The suffix is neither .ply nor .glb.
-    """
+    """Write a mesh to a .ply or .glb file, atomically."""
     path = Path(path)
     check_suffix(path)
     if not (np.isfinite(mesh.vertices).all() and np.isfinite(mesh.colors).all()):
@@ -152,17 +136,7 @@ def holds_cameras(path: Path) -> bool:
 
 
 def write_cameras(path: Path, cameras: list[Camera]) -> list[str]:
-    """Write cameras in the format of the file name; returns notes for the user.
-
-    Args:
-        path: cameras.json or transforms.json in any folder; an existing file is replaced. Or a new or empty folder named
-            sparse, for COLMAP's text files in its subfolder 0.
-        cameras: Cameras in file units, numpy arrays; cameras with lenses are written as pinholes of the same K, with a note.
-
-    Raises:
-        ResourceError: The file cannot be written.
-        UsageError: The name has no known format, the folder exists and is not empty, or a camera has no pinhole of the same K.
-    """
+    """Write cameras in the format of the file name; returns notes for the user."""
     if not holds_cameras(path):
         raise UsageError(f"{path}: cameras go to {' or '.join(NAMES[:2])}, or to a folder named {NAMES[2]} (COLMAP)")
     bent = sum(c.model != "pinhole" for c in cameras)

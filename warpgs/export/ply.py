@@ -41,23 +41,10 @@ MAX_HEADER_BYTES = 65536
 REMEDY = "Export the model again with warpgs, or with any tool that writes the binary layout of the INRIA 3DGS code."
 
 _TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "<i2",
-    "int16": "<i2",
-    "ushort": "<u2",
-    "uint16": "<u2",
-    "int": "<i4",
-    "int32": "<i4",
-    "uint": "<u4",
-    "uint32": "<u4",
-    "float": "<f4",
-    "float32": "<f4",
-    "double": "<f8",
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2", "uint16": "<u2",
+    "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4", "double": "<f8",
     "float64": "<f8",
-}
+}  # fmt: skip
 
 
 @dataclass
@@ -187,11 +174,7 @@ def encode(arrays: Arrays, antialiased: bool = False) -> list[bytes]:
 
 
 def start_of(path: Path) -> bytes:
-    """Return the first `MAX_HEADER_BYTES` bytes of a PLY file, or the whole file if it is shorter, and check its header.
-
-    Raises:
-        DataError: The file cannot be read, or is not a PLY file.
-    """
+    """Return the first `MAX_HEADER_BYTES` bytes of a PLY file, or the whole file if it is shorter, and check its header."""
     try:
         head = read_start(path, MAX_HEADER_BYTES)
     except OSError as e:
@@ -207,11 +190,7 @@ def is_compressed(path: Path, data: bytes) -> bool:
 
 
 def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a file's bytes.
-
-    Raises:
-        DataError: The file is malformed or truncated, or needs an unsupported render mode.
-    """
+    """Return the Gaussians of a file's bytes."""
     elements, start = parse_header(path, data[:MAX_HEADER_BYTES])
     tables = {}
     for element in elements:
@@ -334,11 +313,7 @@ class CompressedPLY(Format):
         return encode(arrays, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header declares antialiasing.
-
-        Raises:
-            DataError: The file is missing or not a PLY file.
-        """
+        """Return whether the header declares antialiasing."""
         return is_antialiased(start_of(path))
 
 
@@ -574,19 +549,11 @@ class PLY(Format):
         write_ply(path, gaussians, normalization, units=units, antialiased=self.antialiased)
 
     def read(self, path: Path, normalization: Normalization | None, units: str) -> Gaussians:
-        """Read Gaussians with `read_ply`, or with `CompressedPLY` if the header announces that format.
-
-        Raises:
-            DataError: The file is missing or malformed.
-        """
+        """Read Gaussians with `read_ply`, or with `CompressedPLY` if the header announces that format."""
         if is_compressed(path, start_of(path)):
             return CompressedPLY().read(path, normalization, units)
         return _read(path, normalization, units)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header declares antialiasing.
-
-        Raises:
-            DataError: The file is missing or not a PLY file.
-        """
+        """Return whether the header declares antialiasing."""
         return is_antialiased(start_of(path))

@@ -19,9 +19,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from warpgs.errors import DataError
 from warpgs.export.base import (
-    BROKEN,
     SH_SIZES,
     SQRT2,
     Arrays,
@@ -31,12 +29,12 @@ from warpgs.export.base import (
     logits,
     malformed,
     parts,
+    reading,
     register,
     rounded,
     sigmoid,
     smallest_three,
 )
-from warpgs.files import open_input, unread_reason
 
 LEVELS = 256
 """Number of entries of a codebook."""
@@ -159,11 +157,7 @@ def _webp(pixels: np.ndarray) -> bytes:
 
 
 def decode(path: Path, file: BinaryIO) -> Arrays:
-    """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding.
-
-    Raises:
-        DataError: The file is malformed, truncated, or announces more than its size can hold.
-    """
+    """Return the Gaussians of an open file; images much larger than the Gaussians need are rejected before decoding."""
     size = file.seek(0, os.SEEK_END)
     _check_contents(path, file, size)
     with zipfile.ZipFile(file) as archive:
@@ -347,15 +341,6 @@ class SOG(Format):
         return encode(arrays, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether meta.json declares antialiasing.
-
-        Raises:
-            DataError: The file cannot be read or is malformed.
-        """
-        try:
-            with open_input(path) as file, zipfile.ZipFile(file) as archive:
-                return _meta(path, archive).get("model") == "antialiased"
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        except BROKEN as e:
-            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        """Return whether meta.json declares antialiasing."""
+        with reading(path) as file, zipfile.ZipFile(file) as archive:
+            return _meta(path, archive).get("model") == "antialiased"

@@ -21,7 +21,6 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
 from warpgs.export.base import (
-    BROKEN,
     SH_SIZES,
     SQRT2,
     Arrays,
@@ -33,13 +32,13 @@ from warpgs.export.base import (
     logits,
     malformed,
     parts,
+    reading,
     register,
     rounded,
     sigmoid,
     smallest_three,
     unit_quats,
 )
-from warpgs.files import open_input, unread_reason
 
 Section = Callable[[int], bytes]
 """Function that returns the next bytes of a section, exactly as many as are requested."""
@@ -59,11 +58,7 @@ bomb 1000."""
 
 
 def fractional_bits(means: np.ndarray) -> int:
-    """Return the number of fractional bits, at most 24, at which all coordinates [N, 3] just fit into 24 signed bits.
-
-    Raises:
-        DataError: A coordinate is beyond 2^23 - 1, which the format cannot hold.
-    """
+    """Return the number of fractional bits, at most 24, at which all coordinates [N, 3] just fit into 24 signed bits."""
     largest = float(np.abs(means).max(initial=0))
     bits = MAX_FRACTIONAL_BITS
     while bits >= 0 and largest * 2.0**bits > 2**23 - 1:
@@ -103,17 +98,7 @@ def _sections(a: Arrays, bits: int, version: int) -> list[bytes]:
 
 
 def encode(arrays: Arrays, version: int = VERSION, antialiased: bool = False) -> list[bytes]:
-    """Return the bytes of a file.
-
-    Args:
-        arrays: The Gaussians, in the axes of PLY.
-        version: 2, 3 or 4.
-        antialiased: True to declare antialiasing in the header.
-
-    Raises:
-        DataError: A coordinate is too large for the format.
-        UsageError: The version is unknown, or needs zstandard, which is not installed.
-    """
+    """Return the bytes of a file."""
     if version not in VERSIONS:
         raise UsageError(f"SPZ version {version}: choose one of {', '.join(map(str, VERSIONS))}")
     a = half_turn({k: np.asarray(v) for k, v in arrays.items()}, "x")
@@ -130,12 +115,7 @@ def encode(arrays: Arrays, version: int = VERSION, antialiased: bool = False) ->
 
 
 def decode(path: Path, data: bytes) -> Arrays:
-    """Return the Gaussians of a file's bytes, in the axes of PLY.
-
-    Raises:
-        DataError: The file is malformed, truncated, or announces more than its size can hold.
-        UsageError: The file has version 4, and zstandard is not installed.
-    """
+    """Return the Gaussians of a file's bytes, in the axes of PLY."""
     if data[:2] == b"\x1f\x8b":
         stream = gzip.GzipFile(fileobj=io.BytesIO(data))
         head = _inflated(path, stream, HEADER.size)
@@ -316,18 +296,9 @@ class SPZ(Format):
         return encode(arrays, self.config.version, self.antialiased)
 
     def is_antialiased(self, path: Path) -> bool:
-        """Return whether the header declares antialiasing.
-
-        Raises:
-            DataError: The file cannot be read or is malformed.
-        """
-        try:
-            with open_input(path) as file:
-                packed = file.read(2) == b"\x1f\x8b"
-                file.seek(0)
-                head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
-                return bool(HEADER.unpack(head)[5] & 1)
-        except OSError as e:
-            raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path and its permissions.") from e
-        except BROKEN as e:
-            raise malformed(path, f"its content is invalid ({type(e).__name__}: {str(e)[:80]})") from e
+        """Return whether the header declares antialiasing."""
+        with reading(path) as file:
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            head = _inflated(path, gzip.GzipFile(fileobj=file), HEADER.size) if packed else file.read(HEADER.size)
+            return bool(HEADER.unpack(head)[5] & 1)

@@ -9,7 +9,6 @@ from warpgs.faces import lazy
 __all__ = [
     "Lens",
     "LoadedImage",
-    "MapOptions",
     "NamedMaps",
     "Probe",
     "ReadOptions",
@@ -21,16 +20,15 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from warpgs.io.folder import Probe, Reader, ReadOptions, SceneFolder, ViewList, view_name
+    from warpgs.io.folder import Probe, Reader, SceneFolder, ViewList, view_name
     from warpgs.io.folder import register as register_reader
-    from warpgs.io.images import Lens, LoadedImage
-    from warpgs.io.maps import MapOptions, NamedMaps
+    from warpgs.io.images import Lens, LoadedImage, ReadOptions
+    from warpgs.io.maps import NamedMaps
 else:
     __getattr__, __dir__ = lazy(
         __name__,
         ("warpgs.io.folder", "SceneFolder", "ViewList", "view_name"),
         ("warpgs.io.maps", "NamedMaps"),
-        ("warpgs.io.images", "Lens", "LoadedImage"),
-        ("warpgs.io.maps", "MapOptions"),
-        ("warpgs.io.folder", "Probe", "Reader", "ReadOptions", "register as register_reader"),
+        ("warpgs.io.images", "Lens", "LoadedImage", "ReadOptions"),
+        ("warpgs.io.folder", "Probe", "Reader", "register as register_reader"),
     )

@@ -8,7 +8,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -18,7 +17,6 @@ from warpgs.files import read_input, unread_reason
 from warpgs.io.folder import (
     Probe,
     Reader,
-    ReadOptions,
     SceneFolder,
     ViewList,
     has_folder,
@@ -27,7 +25,7 @@ from warpgs.io.folder import (
     rigid,
     view_name,
 )
-from warpgs.io.images import Lens, list_images
+from warpgs.io.images import Lens, ReadOptions, list_images
 from warpgs.scene import PointCloud, Scene, View
 
 MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8)}
@@ -40,18 +38,9 @@ OTHER_MODELS = {7: "FOV", 10: "THIN_PRISM_FISHEYE"} | {number: name for number, 
 STEMS = ("cameras", "images", "points3D")
 
 
-@dataclass(frozen=True)
-class Pose:
-    """One row of the images file."""
-
-    name: str
-    """Path below the image folder, POSIX style, as in the file."""
-    camera_id: int
-    """Number of the image's camera."""
-    quat: tuple[float, ...]
-    """Rotation of camera_from_world, wxyz."""
-    translation: tuple[float, ...]
-    """Translation of camera_from_world [file units]."""
+Pose = tuple[str, int, tuple[float, ...], tuple[float, ...]]
+"""A row of the images file: path below the image folder, number of the camera, and camera_from_world: rotation wxyz and
+translation [file units]."""
 
 
 class _BinaryFile:
@@ -175,11 +164,7 @@ def _unknown_model(path: Path, model: object, known: dict[int, tuple[str, int]])
 
 
 def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
-    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion.
-
-    Raises:
-        DataError: The file is malformed, or a camera model is not supported.
-    """
+    """Return lenses by camera number from cameras.bin or cameras.txt; ``native`` also allows models without undistortion."""
     cameras: dict[int, Lens] = {}
     known = MODELS | NATIVE_MODELS if native else MODELS
     if path.suffix == ".bin":
@@ -206,17 +191,13 @@ def read_cameras(path: Path, native: bool = False) -> dict[int, Lens]:
 
 
 def read_poses(path: Path) -> dict[int, Pose]:
-    """Return poses by image number from images.bin or images.txt.
-
-    Raises:
-        DataError: The file is malformed.
-    """
+    """Return poses by image number from images.bin or images.txt."""
     poses: dict[int, Pose] = {}
     if path.suffix == ".bin":
         r = _BinaryFile(path)
         for _ in range(r.count(73)):
             number, *values, camera = r.take("i7di")
-            pose = Pose(r.text(), camera, tuple(values[:4]), tuple(values[4:]))
+            pose = (r.text(), camera, tuple(values[:4]), tuple(values[4:]))
             (observed,) = r.take("Q")
             r.raw(24 * observed)
             _store(poses, number, pose, str(path))
@@ -229,31 +210,31 @@ def read_poses(path: Path) -> dict[int, Pose]:
         with _understood(path, line):
             words = text.split(maxsplit=9)
             values = tuple(float(w) for w in words[1:8])
-            pose = Pose(words[9].rstrip(), int(words[8]), values[:4], values[4:])
+            pose = (words[9].rstrip(), int(words[8]), values[:4], values[4:])
             _store(poses, int(words[0]), pose, f"{path}, line {line}")
         # the line of observations always follows, but may be empty
         line, text = next(lines, (0, ""))
         if len(text.split()) % 3:
             raise DataError(
-                f"{path}, line {line}: expected the observations of image {pose.name!r} as X Y POINT, or an empty line; "
+                f"{path}, line {line}: expected the observations of image {pose[0]!r} as X Y POINT, or an empty line; "
                 "write the file again"
             )
     return poses
 
 
+def posed_lenses(poses: dict[int, Pose], lenses: dict[int, Lens], file: Path) -> Iterator[tuple[str, Lens, np.ndarray]]:
+    """Yield name, lens and camera_from_world [4, 4] of each image, sorted by name; ``file`` holds the poses."""
+    for name, camera, quat, translation in sorted(poses.values(), key=lambda pose: pose[0]):
+        where = f"{file}, image {name!r}"
+        if camera not in lenses:
+            raise DataError(f"{where}: camera {camera} is missing from cameras{file.suffix}; export the cameras again")
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = quat_rotation(quat, where), translation
+        yield name, lenses[camera], rigid(viewmat, where)
+
+
 def read_points(path: Path, names: dict[int, str]) -> PointCloud:
-    """Return points, with the views that saw them, from points3D.bin or points3D.txt.
-
-    Args:
-        path: The file; it may list no points.
-        names: View names by image number; images without a name here are left out of the tracks.
-
-    Returns:
-        N points in file coordinates with colours in [0, 1] and tracks.
-
-    Raises:
-        DataError: The file is malformed, or a point is not finite.
-    """
+    """Return points, with the views that saw them, from points3D.bin or points3D.txt."""
     points: list[tuple[float, ...]] = []
     colors: list[tuple[int, ...]] = []
     tracks: list[frozenset[str]] = []
@@ -365,7 +346,7 @@ class ColmapReader(Reader):
         if not points_path.is_file():
             notes.append(f"{points_path.name} is missing, so there are no points to start from")
         else:
-            points = read_points(scene.inside(points_path), {n: view_name(p.name) for n, p in poses.items()})
+            points = read_points(scene.inside(points_path), {n: view_name(p[0]) for n, p in poses.items()})
             if len(points) == 0:
                 notes.append(f"{points_path.name} holds no points")
         return self.scene(folder, views, notes, points=points, pixels=scene.pixel_source(by_folder=True))
@@ -377,19 +358,12 @@ def _read_views(scene: SceneFolder, model: Path, kind: str, poses: dict[int, Pos
     file = model / f"images.{kind}"
     images, factor, note = scene.images()
     notes = [note] if note else []
-    paths, note = _image_paths(scene, images, [p.name for p in poses.values()], str(file))
+    paths, note = _image_paths(scene, images, [name for name, *_ in poses.values()], str(file))
     notes += [note] if note else []
     views = ViewList()
-    for pose in sorted(poses.values(), key=lambda p: p.name):
-        where = f"{file}, image {pose.name!r}"
-        if pose.camera_id not in lenses:
-            raise DataError(f"{where}: camera {pose.camera_id} is missing from cameras.{kind}; export the cameras again")
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = quat_rotation(pose.quat, where)
-        viewmat[:3, 3] = pose.translation
-        path, view = paths[pose.name], views.claim(view_name(pose.name), where)
-        loaded = scene.image(path, lenses[pose.camera_id], downscale=factor, mask=scene.find_mask(path, images))
-        views.add(view, rigid(viewmat, where), loaded)
+    for name, lens, viewmat in posed_lenses(poses, lenses, file):
+        view = views.claim(view_name(name), f"{file}, image {name!r}")
+        views.add(view, viewmat, scene.image(paths[name], lens, downscale=factor, mask=scene.find_mask(paths[name], images)))
     unposed = len(set(list_images(images)) - set(paths.values()))
     if unposed:
         notes.append(f"{unposed} files in {images.name} have no pose in the reconstruction and are left out")

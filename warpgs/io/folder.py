@@ -8,7 +8,7 @@ import posixpath
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
@@ -18,8 +18,9 @@ from warpgs.constants import POSE_TOLERANCE
 from warpgs.errors import DataError, UsageError
 from warpgs.files import inside, is_within
 from warpgs.geometry import matmul, nearest_rotation, rotation_matrices
-from warpgs.io.images import BLACK, MAX_PIXELS, REDUCED, Lens, LoadedImage, decode, list_images, load_image, unread_note
-from warpgs.io.maps import NO_MAPS, NOTHING_NAMED, GivenMaps, MapOptions, NamedMaps
+from warpgs.io.image_files import MAX_PIXELS, decode, unread_note
+from warpgs.io.images import BLACK, REDUCED, Lens, LoadedImage, ReadOptions, list_images, load_image
+from warpgs.io.maps import NOTHING_NAMED, GivenMaps, NamedMaps
 from warpgs.plugins import Registry
 from warpgs.scene import Camera, Scene, View
 
@@ -28,58 +29,6 @@ from warpgs.scene import Camera, Scene, View
 # One module of `warpgs.io` holds one format and registers its reader. Adding a format means adding one such module; a
 # user's own reader is passed to `warpgs.load_scene`, or named as ``module:Class`` or ``file.py:Class``
 # (examples/06_own_format.py).
-
-DEFAULT_MAX_SIDE = 1600
-"""Default of the longest side of an image [px]: 12 MP of a phone would take hours on a CPU."""
-
-
-def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
-    """Return the factor and the longest side [px] (0 for no limit) that follow from two settings, each None if not given."""
-    if max_side is None:
-        max_side = DEFAULT_MAX_SIDE if downscale is None else 0
-    return 1 if downscale is None else downscale, max_side
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Options for reading a scene folder."""
-
-    downscale: int = 1
-    """Factor, at least 1, by which both image sides shrink."""
-    strict: bool = False
-    """True to treat a frame without an image file as an error instead of a note."""
-    allow_outside: bool = False
-    """True to allow names and links that point to files outside the scene folder."""
-    masks: str = "ignore"
-    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
-    mask_keeps: str = "white"
-    """Colour of a mask file that keeps a pixel: white or black."""
-    black_is_empty: bool = True
-    """True to make dark pixels around an object transparent, if every image shows an object on black."""
-    max_pixels: int = MAX_PIXELS
-    """Largest number of pixels that an image or a mask may have."""
-    max_side: int = 0
-    """Largest image side [px], after ``downscale``; 0 for no limit."""
-    lenses: str = "undistort"
-    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (`Camera.model` names the lens)."""
-    maps: MapOptions = NO_MAPS
-    """Given maps of depth and normals."""
-    on_image: Callable[[Path], object] | None = None
-    """Called with the file of each image before it is decoded; None for no call."""
-
-    def __post_init__(self) -> None:
-        if isinstance(self.downscale, bool) or not isinstance(self.downscale, int) or self.downscale < 1:
-            raise UsageError(f"--downscale must be a whole number of at least 1, not {self.downscale!r}")
-        if isinstance(self.max_side, bool) or not isinstance(self.max_side, int) or not 0 <= self.max_side:
-            raise UsageError(f"--max-side must be a whole number of pixels, 0 for no limit, not {self.max_side!r}")
-        if isinstance(self.max_pixels, bool) or not isinstance(self.max_pixels, int) or self.max_pixels < 1:
-            raise UsageError(f"--max-pixels must be a whole number of at least 1, not {self.max_pixels!r}")
-        if self.masks not in ("ignore", "cutout"):
-            raise UsageError(f"--masks must be ignore or cutout, not {self.masks!r}")
-        if self.lenses not in ("undistort", "native"):
-            raise UsageError(f"--lenses must be undistort or native, not {self.lenses!r}")
-        if self.mask_keeps not in ("white", "black"):
-            raise UsageError(f"--mask-keeps must be white or black, not {self.mask_keeps!r}")
 
 
 @dataclass(frozen=True)
@@ -149,9 +98,6 @@ def find_reader(choice: str | type[Reader] | Reader) -> Reader:
     """Return the reader for a name, ``module:Class``, ``path/to/file.py:Class``, a class or a reader object.
 
     A string with a colon imports the module or file, which runs its code: never pass a string from an untrusted file.
-
-    Raises:
-        UsageError: There is no such reader, or it does not derive from `Reader`.
     """
     if isinstance(choice, Reader):
         return choice
@@ -191,21 +137,7 @@ def image_ids(names: list[str]) -> list[int] | None:
 
 
 def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: str) -> dict[int, str]:
-    """Return the names of the images with the wanted ids.
-
-    Args:
-        names: All image names of a scan, sorted.
-        wanted: Ids that a protocol picks, counted from 0.
-        least: Smallest number of images for which the ids of the protocol apply.
-        where: Protocol and scene, for errors.
-
-    Returns:
-        Name by id. Names without numbers are counted in sorted order. Numbered images must have no gaps: after a gap, the
-        numbers might differ from the protocol's ids.
-
-    Raises:
-        DataError: There are too few images, or some ids are missing; the message names them.
-    """
+    """Return the names of the images with the wanted ids."""
     if len(names) < least:
         raise DataError(
             f"{where}: the protocol needs {least} views, and the scene has {len(names)}; restore the scan, or use llff:K or "
@@ -227,11 +159,7 @@ def protocol_ids(names: list[str], wanted: tuple[int, ...], least: int, where: s
 
 
 def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
-    """Return a pose [4, 4] with its rotation made exactly orthonormal.
-
-    Raises:
-        DataError: The pose is not finite, or its upper left 3 x 3 block is not a rotation; ``where`` is file and image.
-    """
+    """Return a pose [4, 4] with its rotation made exactly orthonormal."""
     if viewmat.shape != (4, 4) or not np.isfinite(viewmat).all():
         raise DataError(f"{where}: the pose is not finite; estimate it again, or remove the image")
     R = viewmat[:3, :3]
@@ -250,11 +178,7 @@ def rigid(viewmat: np.ndarray, where: str) -> np.ndarray:
 
 
 def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
-    """Return the rotation [3, 3] of a quaternion wxyz of any length.
-
-    Raises:
-        DataError: The quaternion is zero or not finite.
-    """
+    """Return the rotation [3, 3] of a quaternion wxyz of any length."""
     q = np.array(quat, np.float64)
     norm = float(np.linalg.norm(q)) if (np.abs(q) < 1e100).all() else np.inf
     if not 1e-12 < norm < np.inf:
@@ -263,16 +187,7 @@ def quat_rotation(quat: tuple[float, ...], where: str) -> np.ndarray:
 
 
 def from_camera_to_world(matrix: np.ndarray, where: str, *, opengl: bool) -> np.ndarray:
-    """Return camera_from_world [4, 4] with OpenCV axes from a camera-to-world matrix.
-
-    Args:
-        matrix: Camera to world, shape [3, 4] or [4, 4].
-        where: File and image, for errors.
-        opengl: True if the camera looks along -z with +y up (OpenGL, Blender); y and z are then negated.
-
-    Raises:
-        DataError: The matrix is not rigid or not finite.
-    """
+    """Return camera_from_world [4, 4] with OpenCV axes from a camera-to-world matrix."""
     pose = np.eye(4)
     pose[: matrix.shape[0]] = matrix
     p, q, r, s = pose[3].tolist()  # numpy's allclose would take a quarter of the time of a pose
@@ -296,21 +211,7 @@ def has_folder(root: Path, *patterns: str) -> bool:
 
 
 def child(folder: Path, name: object, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
-    """Return the path of a file that a scene names.
-
-    Args:
-        folder: Folder to which the name is relative.
-        name: Name as in the scene's file.
-        where: The scene's file and the place in it, for errors.
-        root: Folder that must contain the file, links followed; None for ``folder``.
-        allow_outside: Allow links that point outside the folder.
-
-    Returns:
-        The path; the file may not exist.
-
-    Raises:
-        DataError: The name is empty or not a file name, or points outside the scene folder.
-    """
+    """Return the path of a file that a scene names."""
     usable = isinstance(name, str) and name.strip("/\\. ") and "\0" not in name and len(name) < MAX_NAME_LENGTH
     if usable:
         try:
@@ -349,7 +250,7 @@ class SceneFolder:
     def __init__(self, root: Path, options: ReadOptions):
         self.root, self.options = root, options
         self._reduced = False
-        self._maps = GivenMaps(options.maps, options.max_pixels, options.allow_outside)
+        self._maps = GivenMaps(options)
 
     def inside(self, path: Path) -> Path:
         """Return a path after a check that no link in it points outside the scene folder, unless this is allowed.
@@ -394,11 +295,8 @@ class SceneFolder:
         """
         if self.options.on_image is not None:
             self.options.on_image(path)
-        loaded = load_image(
-            self.inside(path), lens, downscale=downscale or self.options.downscale, mask=mask, background=background,
-            max_pixels=self.options.max_pixels, cutout=self.options.masks == "cutout", max_side=self.options.max_side,
-            native=self.options.lenses == "native",
-        )  # fmt: skip
+        options = self.options if downscale is None else replace(self.options, downscale=downscale)
+        loaded = load_image(self.inside(path), lens, options, mask, background)
         self._reduced = self._reduced or any(words.startswith(REDUCED) for words in loaded.done)
         return self._maps.attached(loaded, path, named)
 
@@ -451,11 +349,7 @@ class SceneFolder:
 
 
 def read_mask(path: Path, keeps: str = "white", max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels.
-
-    Raises:
-        DataError: The file cannot be read.
-    """
+    """Return the weight of each pixel from a mask file, float32 [H, W] in [0, 1]; ``keeps`` is the colour of kept pixels."""
     gray = np.ascontiguousarray(decode(path, max_pixels)[0][..., 0])
     return gray if keeps == "white" else 1 - gray
 

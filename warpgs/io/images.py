@@ -3,342 +3,17 @@
 from __future__ import annotations
 
 import functools
-import os
-import struct
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 
 from warpgs import geometry
-from warpgs.errors import DataError, ResourceError, UsageError
-from warpgs.files import read_input, read_start, unread_reason
-from warpgs.io.image_formats import avif, bmp, jpeg, png, tiff, webp
-from warpgs.io.image_formats.avif import kind
-from warpgs.scene import GivenDepth, View
-
-FORMATS: tuple[tuple[bytes, str, ModuleType], ...] = (
-    (b"\xff\xd8\xff", "JPEG", jpeg),
-    (png.SIGNATURE, "PNG", png),
-    (b"BM", "BMP", bmp),
-    (b"II*\0", "TIFF", tiff),
-    (b"MM\0*", "TIFF", tiff),
-    (b"II+\0", "TIFF", tiff),
-    (b"MM\0+", "TIFF", tiff),
-    (b"RIFF", "WEBP", webp),
-)
-"""First bytes, Pillow's name, and module of each supported format; AVIF is recognised by its brand."""
-READ = "JPEG, PNG, BMP, TIFF, WebP or AVIF"
-"""The formats that are read, for messages."""
-
-
-def format_of(data: bytes) -> tuple[str, ModuleType]:
-    """Return name and module of the format of an image file, by its first bytes.
-
-    Raises:
-        ValueError: The format is not supported.
-    """
-    for start, name, module in FORMATS:
-        if data.startswith(start):
-            return name, module
-    if avif.kind(data) == "AVIF":
-        return "AVIF", avif
-    raise ValueError(f"it is not a {READ} file" if data else "it is empty")
-
-
-# Unsupported formats of photographs, and remedies.
-#
-# HEIC is supported only for finding poses (`warpgs.poses.photographs`). RAW is left to a converter, in which the user
-# chooses the same colour and exposure for all photographs.
-
-RAW_SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw")
-"""Suffixes of RAW files of cameras; many begin like a TIFF, and their first image is a small preview."""
-HEIC = "a HEIC photograph, which is supported only for finding poses (warpgs poses); convert all HEIC files to JPEG"
-RAW = (
-    "a RAW file, which is not supported; convert all RAW files to JPEG or 16-bit PNG, with the same settings and white balance"
-)
-
-
-def unread_format(path: Path, head: bytes) -> str | None:
-    """Return a remedy for a photograph of an unsupported format, as the end of a sentence; None for any other file.
-
-    Args:
-        path: Name of the file; only RAW is detected by suffix.
-        head: First bytes of the file; they identify damaged files, too.
-    """
-    if path.suffix.lower() in RAW_SUFFIXES or kind(head) == "RAW":
-        return RAW
-    return HEIC if kind(head) == "HEIC" else None
-
-
-def unread_note(folder: Path) -> str:
-    """Return a sentence on the RAW files of a folder, known by their suffix; empty for none."""
-    files = (
-        sorted(p for p in folder.glob("*") if p.suffix.lower() in RAW_SUFFIXES and p.name[0] != ".") if folder.is_dir() else []
-    )
-    if not files:
-        return ""
-    return f"{files[0].name} is {RAW}" if len(files) == 1 else f"{files[0].name} is {RAW} ({len(files)} such files)"
-
-
-MAX_PIXELS = 100_000_000
-"""Default limit on the pixels of an image; decoded, an image of this size takes 1.2 GB."""
-FILE_BYTES_PER_PIXEL, EXTRA_FILE_BYTES = 16, 2**26
-"""Bytes that a pixel may take in a file (four channels as float32), and bytes for everything else in the file."""
-BYTES_PER_PIXEL = 32
-"""Most memory that decoding takes per pixel [bytes]: four channels as float32, and the colours and alpha made of them."""
-
-
-def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
-    """Return the bytes of an image file; files too large for ``max_pixels`` pixels are rejected.
-
-    Raises:
-        DataError: The file is missing, cannot be read, or is not a regular file.
-    """
-    try:
-        return read_input(path, FILE_BYTES_PER_PIXEL * max_pixels + EXTRA_FILE_BYTES)
-    except OSError as e:
-        raise _unreadable(path, e) from e
-
-
-def read_image_start(path: Path, count: int) -> bytes:
-    """Return the first bytes of an image file, at most ``count``.
-
-    Raises:
-        DataError: The file is missing, cannot be read, or is not a regular file.
-    """
-    try:
-        return read_start(path, count)
-    except OSError as e:
-        raise _unreadable(path, e) from e
-
-
-def _unreadable(path: Path, error: OSError) -> DataError:
-    if not os.path.exists(path):  # False for broken and circular links
-        what = "is a broken link" if path.is_symlink() else "the image file is missing"
-        return DataError(f"{path}: {what}; restore it, or remove its camera from the scene")
-    return DataError(f"{path}: the image cannot be read ({unread_reason(error)}); fix its permissions or copy it again")
-
-
-def _raster(path: Path, data: bytes, max_pixels: int) -> np.ndarray:
-    """Return the pixels as stored, [H, W] or [H, W, C] with colours in BGR order, of any type that OpenCV has."""
-    import cv2
-
-    pixels = 0
-    unread = unread_format(path, data[:32])
-    if unread is not None:
-        raise DataError(f"{path}: is {unread}")
-    try:
-        _, module = format_of(data)
-        width, height = module.size(data)
-        pixels = width * height
-        if pixels > max_pixels:
-            raise DataError(
-                f"{path}: the image is {width} x {height} px, more than the limit of {max_pixels:,} pixels; shrink it, or "
-                f"raise the limit with --max-pixels {pixels} (decoding then needs {BYTES_PER_PIXEL * pixels / 2**30:.1f} GiB)"
-            )
-        if not pixels:
-            raise ValueError(f"it has {width} x {height} px")
-        raster: np.ndarray | None = None
-        if module in (jpeg, avif):
-            raster = module.decode(data)
-        else:
-            module.check(data)
-        if raster is None:
-            # IMREAD_UNCHANGED also ignores the EXIF orientation: the camera, not the tag, determines how the raster lies
-            raster = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if raster is None or raster.shape[:2] != (height, width):
-            raise ValueError("its pixels cannot be read")
-    except (ValueError, cv2.error) as e:
-        if isinstance(e, cv2.error) and e.code == cv2.Error.StsNoMem:
-            raise ResourceError(_too_large(path, pixels)) from e
-        reason = "OpenCV cannot read it" if isinstance(e, cv2.error) else str(e)
-        raise DataError(
-            f"{path}: the image cannot be decoded: {reason}. Restore it from its source; if it looks right, save it as PNG"
-        ) from e
-    except MemoryError as e:
-        raise ResourceError(_too_large(path, pixels)) from e
-    return raster
-
-
-def _too_large(path: Path, pixels: int) -> str:
-    needed = BYTES_PER_PIXEL * pixels / 2**30
-    return f"{path}: decoding the image needs {needed:.1f} GiB of free memory; shrink the image, or end other programs"
-
-
-def decode_png(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Decode a PNG to its numbers as stored, uint8 or uint16, shape [H, W] or [H, W, C] with colours in RGB order.
-
-    Raises:
-        DataError: The file is missing, not a PNG, too large, or damaged.
-        ResourceError: There is not enough memory for the image.
-    """
-    data = read_image_file(path, max_pixels)
-    if not data.startswith(png.SIGNATURE):
-        raise DataError(f"{path}: is not a PNG file; save it as 16-bit PNG or NPY")
-    raw = _raster(path, data, max_pixels)
-    return raw if raw.ndim == 2 else np.ascontiguousarray(raw[..., [2, 1, 0, 3][: raw.shape[2]]])
-
-
-def decode(path: Path, max_pixels: int = MAX_PIXELS, data: bytes | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Decode an image file as stored, without rotation by its EXIF tag.
-
-    Gray, palette, 8- and 16-bit images and straight alpha are supported.
-
-    Args:
-        path: A JPEG, PNG, BMP, TIFF, WebP or AVIF file, with any suffix.
-        max_pixels: Largest number of pixels that its header may announce.
-        data: Bytes of the file, if they have been read already.
-
-    Returns:
-        Colours in [0, 1], float32, shape [H, W, 3]; and alpha in [0, 1], float32, shape [H, W], or None.
-
-    Raises:
-        DataError: The file is missing, of another format, too large, or damaged, as far as its format reveals damage.
-        ResourceError: There is not enough memory for the image.
-    """
-    raw = _raster(path, read_image_file(path, max_pixels) if data is None else data, max_pixels)
-    if raw.dtype in (np.uint8, np.uint16):
-        values = raw.astype(np.float32)
-        values /= np.iinfo(raw.dtype).max
-    elif raw.dtype == np.float32:
-        values = np.clip(raw, 0, 1)
-        if not np.isfinite(raw).all():
-            raise DataError(f"{path}: some pixels are not finite; save it as 8- or 16-bit PNG")
-    else:
-        raise DataError(f"{path}: pixels of type {raw.dtype} are not supported; save it as 8- or 16-bit PNG")
-    del raw  # free it before copies are made
-    if values.ndim == 2:
-        values = values[..., None]
-    channels = values.shape[2]
-    if channels > 4:
-        raise DataError(f"{path}: has {channels} channels; save it as gray, RGB or RGBA")
-    alpha = np.ascontiguousarray(values[..., -1]) if channels in (2, 4) else None
-    color = np.repeat(values[..., :1], 3, axis=2) if channels <= 2 else values[..., 2::-1]
-    return np.ascontiguousarray(color), alpha
-
-
-# EXIF of a photograph and its lens: five tags, read from the first directory and the block of exposure data.
-#
-# The layout is that of TIFF (CIPA DC-008). Only the values of these tags are read, because libraries that read all of
-# EXIF copy overlapping values again and again.
-
-MAKE, MODEL, ORIENTATION, EXPOSURE, FOCAL_35MM = 0x010F, 0x0110, 0x0112, 0x8769, 0xA405
-"""Tags: maker and model of the device, orientation, place of the exposure data, and focal length on 35 mm film [mm]."""
-ASCII = 2
-NUMBERS = {3: "H", 4: "I"}
-"""Layouts of the integers that EXIF tags may hold, by type."""
-MAX_ENTRIES = 1000
-"""Largest number of tags in a directory."""
-MAX_TEXT = 100
-"""Longest maker or model that is read [bytes]."""
-MAX_FOCAL = 10_000
-"""Longest equivalent focal length that is accepted [mm]."""
-PREFIX = b"Exif\0\0"
-"""First bytes of EXIF in JPEG, and in some WebP files."""
-
-
-@dataclass(frozen=True)
-class Exif:
-    """Values of EXIF; missing values have the defaults."""
-
-    orientation: int = 1
-    """Orientation of the stored raster, 1 to 8."""
-    maker: str = ""
-    """Maker of the device."""
-    model: str = ""
-    """Model of the device."""
-    focal: float | None = None
-    """Focal length [mm] that gives the same field of view on 35 mm film."""
-
-    @property
-    def device(self) -> str:
-        """Maker and model, as far as known."""
-        return " ".join(filter(None, (self.maker, self.model)))[:MAX_TEXT]
-
-
-def read_exif(data: bytes) -> Exif:
-    """Return the EXIF values of an image file; damaged values count as missing."""
-    try:
-        return parse_exif(_block(data))
-    except ValueError:
-        return Exif()
-
-
-def parse_exif(block: bytes) -> Exif:
-    """Return the values of a block of EXIF, which begins as a TIFF file does; damaged values count as missing."""
-    block = block.removeprefix(PREFIX)
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(block[:4])
-    if order is None:
-        return Exif()
-    try:
-        first = _Directory(block, order, *struct.unpack_from(order + "I", block, 4))
-        orientation, place = first.number(ORIENTATION), first.number(EXPOSURE)
-        maker, model = first.text(MAKE), first.text(MODEL)
-        focal = None if place is None else _Directory(block, order, place).number(FOCAL_35MM)
-    except (ValueError, struct.error):
-        return Exif()
-    if orientation is None or not 1 <= orientation <= 8:
-        orientation = 1
-    return Exif(orientation, maker, model, float(focal) if focal and focal <= MAX_FOCAL else None)
-
-
-def _block(data: bytes) -> bytes:
-    """Return the bytes of EXIF in an image file, which begin as a TIFF file does; maybe empty."""
-    name, _ = format_of(data)
-    found: bytes | memoryview = b""
-    if name == "TIFF":
-        found = data
-    elif name == "JPEG":
-        for marker, body in jpeg.segments(data):
-            if marker == jpeg.SOS:
-                break
-            if marker == jpeg.APP1 and body.startswith(PREFIX):
-                found = body
-                break
-    elif name == "PNG":
-        found = next((body for kind, body in png.chunks(data) if kind == b"eXIf"), b"")
-    elif name == "WEBP":
-        found = next((body for kind, body in webp.chunks(data) if kind == b"EXIF"), b"")
-    elif name == "AVIF":
-        with avif.open_image(data) as image:
-            found = image.info.get("exif", b"")
-    return bytes(found)
-
-
-class _Directory:
-    """Entries of a directory of tags."""
-
-    def __init__(self, block: bytes, order: str, at: int):
-        self.block, self.order = block, order
-        (count,) = struct.unpack_from(order + "H", block, at)
-        if count > MAX_ENTRIES:
-            raise ValueError(f"a directory of {count} tags")
-        self.entries: dict[int, tuple[int, int, int]] = {}
-        for i in range(count):
-            place = at + 2 + 12 * i
-            tag, kind, length = struct.unpack_from(order + "HHI", block, place)
-            self.entries[tag] = kind, length, place + 8
-
-    def number(self, tag: int) -> int | None:
-        """Return a single integer, or None."""
-        kind, length, place = self.entries.get(tag, (0, 0, 0))
-        if kind not in NUMBERS or length != 1:
-            return None
-        value: int = struct.unpack_from(self.order + NUMBERS[kind], self.block, place)[0]
-        return value
-
-    def text(self, tag: int) -> str:
-        """Return the text of a tag, maybe empty, without the zero bytes and spaces around it."""
-        kind, length, place = self.entries.get(tag, (0, 0, 0))
-        if kind != ASCII:
-            return ""
-        if length > 4:
-            (place,) = struct.unpack_from(self.order + "I", self.block, place)
-        return self.block[place : place + min(length, MAX_TEXT)].decode("latin-1").strip("\0 ")
-
+from warpgs.errors import DataError, UsageError
+from warpgs.io.image_files import MAX_PIXELS, decode, read_exif, read_image_file
+from warpgs.scene import DEPTH_KINDS, GivenDepth, View
 
 BLACK = (0.0, 0.0, 0.0)
 REDUCED = "reduced to "
@@ -354,6 +29,90 @@ MAX_DISTORTION = 1e4
 """Distortion coefficients must be below this value."""
 MIN_FOLD = 1e-9
 """Inverse of a squared radius; a fold of the lens beyond that radius lies outside any image."""
+
+
+DEFAULT_MAX_SIDE = 1600
+"""Default of the longest side of an image [px]: 12 MP of a phone would take hours on a CPU."""
+
+
+def image_scale(downscale: int | None, max_side: int | None) -> tuple[int, int]:
+    """Return the factor and the longest side [px] (0 for no limit) that follow from two settings, each None if not given."""
+    if max_side is None:
+        max_side = DEFAULT_MAX_SIDE if downscale is None else 0
+    return 1 if downscale is None else downscale, max_side
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions:
+    """Options for reading a scene folder."""
+
+    downscale: int | None = None
+    """Factor by which both image sides shrink; None for 1."""
+    strict: bool = False
+    """Treat a frame without an image file as an error."""
+    allow_outside: bool = False
+    """Allow names and links that point to files outside the scene folder."""
+    masks: str = "ignore"
+    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
+    mask_keeps: str = "white"
+    """Colour of a mask file that keeps a pixel: white or black."""
+    black_is_empty: bool = True
+    """Make dark pixels around the object transparent, if every image shows an object on a black background."""
+    score_masks: str | None = None
+    """Folder of object masks for scoring, matched by image id; None for the scene's own idrmasks, if any."""
+    max_pixels: int = MAX_PIXELS
+    """Largest number of pixels of a stored image or mask."""
+    max_side: int | None = None
+    """Largest image side [px], 0 for no limit. None: no limit with --downscale; otherwise 1600, or 800 in a fit on a CPU."""
+    lenses: str = "undistort"
+    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (the model is rendered through the
+    lens). Fisheyes need native."""
+    depths: str | None = None
+    """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
+    Default: the maps that transforms.json names; with the value none, these maps are ignored."""
+    normals: str | None = None
+    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
+    depth_kind: str = "metric"
+    """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
+    disparity (inverse lengths of unknown scale and shift, as networks give)."""
+    depth_unit: float | None = None
+    """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
+    normal_axes: str = "opencv"
+    """Camera axes of the normals: opencv (y down, z forward) or opengl (y up, z back)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions(SceneOptions):
+    """Options as a reader gets them: checked, with the image sizes that follow from the defaults."""
+
+    downscale: int = 1
+    """Factor, at least 1, by which both image sides shrink."""
+    max_side: int = 0
+    """Largest image side [px], after ``downscale``; 0 for no limit."""
+    on_image: Callable[[Path], object] | None = None
+    """Called with the file of each image before it is decoded; None for no call."""
+
+    def __post_init__(self) -> None:
+        for name, least, needs in (
+            ("downscale", 1, "of at least 1"), ("max_side", 0, "of pixels, 0 for no limit"), ("max_pixels", 1, "of at least 1"),
+        ):  # fmt: skip
+            number = getattr(self, name)
+            if isinstance(number, bool) or not isinstance(number, int) or number < least:
+                raise UsageError(f"--{name.replace('_', '-')} must be a whole number {needs}, not {number!r}")
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                listed = f"{choices[0]} or {choices[1]}" if len(choices) == 2 else f"one of {', '.join(choices)}"
+                raise UsageError(f"--{name.replace('_', '-')} must be {listed}, not {getattr(self, name)!r}")
+        unit = self.depth_unit
+        if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
+            raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
+
+
+CHOICES = {
+    "masks": ("ignore", "cutout"), "lenses": ("undistort", "native"), "mask_keeps": ("white", "black"),
+    "depth_kind": DEPTH_KINDS, "normal_axes": ("opencv", "opengl"),
+}  # fmt: skip
+"""Values of the options that have a choice."""
 
 
 @dataclass(frozen=True)
@@ -471,14 +230,7 @@ def _fold_radius2(distortion: tuple[float, ...]) -> float:
 
 
 def undistortion_maps(K: np.ndarray, lens: Lens, width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the columns and rows [H, W] in the distorted image of a pinhole image's pixels, in OpenCV's convention.
-
-    Args:
-        K: Intrinsics [px] of both images at this size, shape [3, 3].
-        lens: Lens with the distortion.
-        width: Width [px].
-        height: Height [px].
-    """
+    """Return the columns and rows [H, W] in the distorted image of a pinhole image's pixels, in OpenCV's convention."""
     import cv2
 
     K = K.copy()
@@ -623,42 +375,16 @@ def _over_background(loaded: LoadedImage, background: tuple[float, float, float]
 def load_image(
     path: Path,
     lens: Lens | Callable[[int, int], Lens],
-    *,
-    downscale: int = 1,
+    options: ReadOptions,
     mask: np.ndarray | None = None,
     background: tuple[float, float, float] = BLACK,
-    max_pixels: int = MAX_PIXELS,
-    cutout: bool = False,
-    max_side: int = 0,
-    native: bool = False,
 ) -> LoadedImage:
-    """Decode an image, rotate it upright by EXIF, remove distortion, and resample.
+    """Decode an image, rotate it upright by EXIF, remove distortion, and resample; see `SceneFolder.image` for the arguments.
 
     Colours are resampled in proportion to their opacity, so that the colours of transparent pixels do not affect others.
-
-    Args:
-        path: The image file.
-        lens: Its intrinsics, at any size; they are scaled to the image. For formats that do not store the image size, a
-            function that makes them from the width and height [px] of the stored raster.
-        downscale: Factor by which both sides shrink (area resampling).
-        mask: Weight of each pixel, in [0, 1], shape [H, W], at the size of the file or at another size of the same aspect.
-        background: Colour in [0, 1] behind transparent pixels.
-        max_pixels: Largest number of pixels that the file may have.
-        cutout: True to make masked-out pixels transparent, gray ones partly; False to ignore pixels with a weight of at most a
-            half.
-        max_side: Longest side that the image keeps [px] after ``downscale``; 0 for no limit.
-        native: Keep the distortion of the lens instead of undoing it.
-
-    Returns:
-        The image with intrinsics for its final size.
-
-    Raises:
-        DataError: The file cannot be decoded, its size does not fit its camera or its mask, its lens cannot be undistorted, or
-            no pixel is left.
-        ResourceError: There is not enough memory to decode the file.
-        UsageError: ``downscale`` or ``max_side`` leaves a side below `MIN_SIDE`.
     """
-    image, alpha = decode(path, max_pixels)
+    cutout, native = options.masks == "cutout", options.lenses == "native"
+    image, alpha = decode(path, options.max_pixels)
     stored = image.shape[:2]
     if not isinstance(lens, Lens):
         lens = lens(stored[1], stored[0])
@@ -676,7 +402,7 @@ def load_image(
     undone = lens if not native and any(lens.distortion) else None
     if undone is not None:
         loaded = _undistort(loaded, undone)
-    loaded = _shrink(path, loaded, downscale, max_side)
+    loaded = _shrink(path, loaded, options.downscale, options.max_side)
     if native and (lens.fisheye or any(lens.distortion)):
         loaded = _native(loaded, lens)
     if loaded.mask is not None and not loaded.mask.any():
@@ -724,12 +450,6 @@ def cut_from_black(views: list[View]) -> tuple[list[View], str]:
 
     All other pixels get an opacity of 1, and so do dark specks and cracks that the object encloses. If any view has an alpha
     channel or a mask, or shows something else, all views stay unchanged.
-
-    Args:
-        views: The views of a scene.
-
-    Returns:
-        The views, and a note for the user; an empty note if nothing is changed.
     """
     done, empty = [], 0.0
     for v in views:

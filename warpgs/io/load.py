@@ -8,7 +8,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -17,17 +17,16 @@ from warpgs.errors import DataError, UsageError, similar_folder
 from warpgs.geometry import camera_extent, matmul
 from warpgs.io.folder import (
     Reader,
-    ReadOptions,
     SceneFolder,
     all_readers,
     find_reader,
     image_ids,
-    image_scale,
     named_by_dtu,
     protocol_ids,
 )
-from warpgs.io.images import MAX_PIXELS, READ, cut_from_black, list_images, unread_note
-from warpgs.io.maps import NO_MAPS, MapOptions, check_found
+from warpgs.io.image_files import MAX_PIXELS, READ, unread_note
+from warpgs.io.images import ReadOptions, SceneOptions, cut_from_black, image_scale, list_images
+from warpgs.io.maps import check_found
 from warpgs.scene import Normalization, PointCloud, Scene, View, checked_scene
 
 MIN_EXTENT = 1e-9
@@ -41,9 +40,6 @@ def normalization_of(views: list[View], points: PointCloud | None, where: str) -
 
     If all cameras are in one place, points set the scale: the median of their largest offsets along an axis becomes 1. Without
     points the scale is unchanged.
-
-    Raises:
-        DataError: A camera centre is absurdly far away; the message begins with ``where`` and names the image.
     """
     centers = np.array([v.camera.center for v in views])
     far = np.abs(centers).max(axis=1)
@@ -75,11 +71,7 @@ def normalize_view(view: View, n: Normalization) -> View:
 
 
 def normalize_points(points: PointCloud, n: Normalization, where: str) -> PointCloud:
-    """Return the points in scene coordinates (float64).
-
-    Raises:
-        DataError: A point is not finite or absurdly far away; the message begins with ``where``.
-    """
+    """Return the points in scene coordinates (float64)."""
     with np.errstate(over="ignore", invalid="ignore"):
         moved = n.scale * (points.points - n.offset)
     far = int((~(np.abs(moved) < MAX_COORDINATE).all(axis=1)).sum())
@@ -215,11 +207,7 @@ class _Names:
 
 
 def check_spec(spec: str) -> None:
-    """Check that the specification of a split can be understood, before a scene is read.
-
-    Raises:
-        UsageError: The specification is unknown or malformed, or leaves nothing to train.
-    """
+    """Check that the specification of a split can be understood, before a scene is read."""
     if "=" in spec:
         _named(spec)
     elif spec == "every:1":
@@ -261,10 +249,6 @@ def split_views(scene: Scene, spec: str) -> Split:
     ``llff:K`` and ``mip360:K``: every 8th of the sorted views is held out, and K of the others, evenly spaced, train. ``dtu:K``
     and ``blender:8``: the published ids. ``every:N``: every Nth is held out, the others train. ``all``: none is held out.
     ``train=a,b;test=c``: names, with or without suffix; if one part is missing, it consists of all other views.
-
-    Raises:
-        DataError: The scene lacks views of the split, or training and test views overlap.
-        UsageError: The split is not understood.
     """
     check_spec(spec)
     names = sorted(v.name for v in scene.views)
@@ -345,18 +329,6 @@ def add_score_masks(views: list[View], folder: Path, scene: SceneFolder) -> tupl
 
     The masks lie in ``folder`` or in its subfolder `mask`, named by id counted from 0 (000.png, 001.png, ...); the images
     are named by the same ids, or by DTU's own names, in which `rect_001_...` is id 0.
-
-    Args:
-        views: The scene's views, at their final size.
-        folder: The folder with the masks; white keeps a pixel.
-        scene: The scene folder that opens the masks.
-
-    Returns:
-        The views with ``score_mask`` set, inside the view's own mask where it has one, and a note for the user.
-
-    Raises:
-        DataError: No masks are found; a mask is missing (the message names the ids) or does not fit; or it is unclear whether
-            the images count from 0 or from 1.
     """
     inner = folder / "mask"
     folder = inner if inner.is_dir() else folder
@@ -449,39 +421,41 @@ def load_scene(
         UsageError: A number is out of range, a choice or the reader is unknown, an image would become too small, or a camera
             model does not support a given map.
     """
-    root, (factor, side) = Path(path), image_scale(downscale, max_side)
-    given = [None if p is None else Path(p) for p in (depths, normals)]
-    maps = MapOptions(given[0], given[1], depth_kind, depth_unit, normal_axes)
-    options = ReadOptions(
-        factor, strict, allow_outside, masks, mask_keeps, black_is_empty, max_pixels, max_side=side,
-        lenses=lenses, maps=maps, on_image=_counted(root, progress),
+    folders = {name: None if p is None else str(p) for name, p in (("depths", depths), ("normals", normals))}
+    options = SceneOptions(
+        downscale=downscale, max_side=max_side, strict=strict, allow_outside=allow_outside, masks=masks, mask_keeps=mask_keeps,
+        black_is_empty=black_is_empty, score_masks=None if score_masks is None else str(score_masks), max_pixels=max_pixels,
+        lenses=lenses, depth_kind=depth_kind, depth_unit=depth_unit, normal_axes=normal_axes, **folders,
     )  # fmt: skip
-    try:
-        _check_folder(root)
-        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
-        return _finished(root, chosen, chosen.read(root, options), notes, score_masks, options)
-    except OSError as e:
-        # folders without permission, names too long for the file system, disks that fail
-        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
+    return read_folder(path, options, reader, progress)
 
 
-def _counted(root: Path, progress: Callable[[str], object] | None) -> Callable[[Path], None]:
-    """Return a function that reports the number of the image that is read next."""
-    numbers = itertools.count(1)
+def read_folder(
+    path: str | Path,
+    options: SceneOptions,
+    reader: str | type[Reader] | Reader | None = None,
+    progress: Callable[[str], object] | None = None,
+) -> Scene:
+    """Read a scene folder, as `load_scene` does."""
+    root, (factor, side), numbers = Path(path), image_scale(options.downscale, options.max_side), itertools.count(1)
 
     def on_image(file: Path) -> None:
         if progress is not None:
             progress(f"reading {root}: image {next(numbers)}")
 
-    return on_image
+    given = {f.name: getattr(options, f.name) for f in fields(SceneOptions)}
+    checked = ReadOptions(**given | {"downscale": factor, "max_side": side, "on_image": on_image})
+    try:
+        _check_folder(root)
+        chosen, notes = detect(root) if reader is None else (_accepted(root, find_reader(reader)), [])
+        return _finished(root, chosen, chosen.read(root, checked), notes, checked)
+    except OSError as e:
+        # folders without permission, names too long for the file system, disks that fail
+        raise DataError(f"{e.filename or root}: cannot be read ({e.strerror or e}); fix its permissions or copy it") from e
 
 
 def detect(root: Path) -> tuple[Reader, list[str]]:
-    """Return the reader of the first complete format of a scene folder, and notes on the formats passed over.
-
-    Raises:
-        DataError: The folder contains no known format, or only an incomplete one; the message names the files to look for.
-    """
+    """Return the reader of the first complete format of a scene folder, and notes on the formats passed over."""
     readers = all_readers()
     found = [(r, p) for r in readers if (p := r.probe(root)) is not None]
     complete = [r for r, p in found if not p.missing]
@@ -524,9 +498,7 @@ def _accepted(root: Path, reader: Reader) -> Reader:
     return reader
 
 
-def _finished(
-    root: Path, reader: Reader, scene: Scene, notes: list[str], score_masks: str | Path | None, options: ReadOptions
-) -> Scene:
+def _finished(root: Path, reader: Reader, scene: Scene, notes: list[str], options: ReadOptions) -> Scene:
     """Check a scene that a reader returned; return it sorted, in scene coordinates, with score masks and fingerprint."""
     own = f"the reader {reader.name} must return a Scene in file coordinates, without a Normalization; fix it"
     if not isinstance(scene, Scene):
@@ -544,15 +516,15 @@ def _finished(
     if options.black_is_empty and not any(scene.background):
         views, note = cut_from_black(views)
         more = (*more, note) if note else more
-    more = (*more, *check_found(views, options.maps, options.allow_outside))
+    more = (*more, *check_found(views, options))
     n: Normalization = normalization_of(views, points, str(root))
     views = [normalize_view(v, n) for v in sorted(views, key=lambda v: v.name)]
     if points is not None:
         points = normalize_points(points, n, str(root))
-    if score_masks is not None or (root / FOLDER).is_dir():
+    if options.score_masks is not None or (root / FOLDER).is_dir():
         # links in a folder that the user names must stay inside it; links in the scene's own folder, inside the scene
-        masks, bound = (root / FOLDER, root) if score_masks is None else (Path(score_masks), Path(score_masks))
-        plain = replace(options, mask_keeps="white", maps=NO_MAPS)
+        masks, bound = (root / FOLDER, root) if options.score_masks is None else (Path(options.score_masks),) * 2
+        plain = replace(options, mask_keeps="white", depths=None, normals=None)
         views, note = add_score_masks(views, masks, SceneFolder(bound, plain))
         more = (*more, note)
     return replace(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -12,8 +11,9 @@ import numpy as np
 from warpgs.errors import DataError, UsageError
 from warpgs.files import inside, open_input, unread_reason
 from warpgs.geometry import CENTRAL
-from warpgs.io.images import MAX_PIXELS, LoadedImage, decode_png, turn_upright, undistortion_maps
-from warpgs.scene import DEPTH_KINDS, GivenDepth, View
+from warpgs.io.image_files import MAX_PIXELS, decode_png
+from warpgs.io.images import LoadedImage, ReadOptions, turn_upright, undistortion_maps
+from warpgs.scene import GivenDepth, View
 
 SUFFIXES = (".png", ".npy")
 UNREAD = (".exr", ".pfm", ".tif", ".tiff", ".hdr", ".npz", ".jpg", ".jpeg", ".bin", ".mat", ".h5", ".pt")
@@ -26,7 +26,6 @@ MILLIMETRES = 0.001
 """Default length of a unit of integers: RGB-D cameras store depth in millimetres, with poses in metres."""
 MAX_DEPTH = 1e12
 """Largest depth [file units]; maps with larger values are rejected."""
-AXES = ("opencv", "opengl")
 UNIT_TOLERANCE = 0.1
 """Largest difference of a normal's length from 1; eight bits round by less than 0.01."""
 NO_NORMAL = 0.5
@@ -35,44 +34,11 @@ MAX_STRAY = 0.05
 """Largest fraction of a map's normals that may have another length, or face away from the camera."""
 
 
-@dataclass(frozen=True)
-class MapOptions:
-    """Given maps of depth and normals, and the meaning of their numbers."""
-
-    depths: Path | None = None
-    """Folder of depth maps; None for the maps that the scene names, ``none`` to ignore these."""
-    normals: Path | None = None
-    """Folder of normal maps; None for the maps that the scene names, ``none`` to ignore these."""
-    depth_kind: str = "metric"
-    """Meaning of the depth maps, one of `DEPTH_KINDS`."""
-    depth_unit: float | None = None
-    """Length of one unit of a depth map in units of the cameras; None means 0.001 for integers and 1 for floats."""
-    normal_axes: str = "opencv"
-    """Axes of the normals: camera axes of OpenCV (y down, z forward) or OpenGL (y up, z back)."""
-
-    def __post_init__(self) -> None:
-        if self.depth_kind not in DEPTH_KINDS:
-            raise UsageError(f"--depth-kind must be one of {', '.join(DEPTH_KINDS)}, not {self.depth_kind!r}")
-        if self.normal_axes not in AXES:
-            raise UsageError(f"--normal-axes must be one of {', '.join(AXES)}, not {self.normal_axes!r}")
-        unit = self.depth_unit
-        if unit is not None and (isinstance(unit, bool) or not isinstance(unit, (int, float)) or not 0 < unit < math.inf):
-            raise UsageError(f"--depth-unit must be a finite number above 0, not {unit!r}")
-
-
-NO_MAPS = MapOptions()
-"""Options of a scene without maps."""
-
-
 class MapFolder:
     """The maps of a folder, found by the names of images."""
 
     def __init__(self, folder: Path, flag: str, allow_outside: bool):
-        """List a folder; links in it may point outside the folder only with ``allow_outside``.
-
-        Raises:
-            DataError: The folder is missing or holds no map, two files are for one image, or a link points outside.
-        """
+        """List a folder; links in it may point outside the folder only with ``allow_outside``."""
         self.folder, self.flag = folder, flag
         if not folder.is_dir():
             raise DataError(f"{folder}: no such folder; name the folder of maps with {flag}")
@@ -93,19 +59,16 @@ class MapFolder:
         if not any(not key.endswith(CONFIDENCE) for key in self._files):
             found = f"it holds {' and '.join(sorted(others))} files, which are not read; convert them to" if others else "add"
             raise DataError(f"{folder}: holds no maps; {found} NPY (float32) or 16-bit PNG, named like the images")
-        self.taken: set[str] = set()
-        """Keys of the maps that images requested."""
 
     def find(self, image: Path) -> tuple[Path | None, Path | None]:
         """Return the files of map and confidence of an image; None for a missing one.
 
         A map is named by the end of the image's path: for `a/b.jpg` it is `a/b.png` or `b.png`; the longest match is used.
         """
-        tails = [PurePosixPath(*image.parts[i:]) for i in range(1 if image.is_absolute() else 0, len(image.parts))]
-        for tail in tails:
+        for i in range(1 if image.is_absolute() else 0, len(image.parts)):
+            tail = PurePosixPath(*image.parts[i:])
             for key in (tail.with_suffix("").as_posix(), tail.as_posix()):
                 if key in self._files and not key.endswith(CONFIDENCE):
-                    self.taken.add(key)
                     return self._files[key], self._files.get(key + CONFIDENCE)
         return None, None
 
@@ -119,28 +82,28 @@ class MapFolder:
 
 
 def read_numbers(path: Path, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C].
-
-    Raises:
-        DataError: The file is missing, larger than ``max_pixels``, of another type or shape, or damaged.
-    """
+    """Return the numbers of a PNG or NPY file, uint8, uint16 or float32, shape [H, W] or [H, W, C]."""
     if path.suffix.lower() == ".npy":
         return _read_array(path, max_pixels)
     return decode_png(path, max_pixels)
 
 
-def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+def mapped_array(path: Path, fix: str) -> np.ndarray:
+    """Return the array of an NPY file, which stays in the file: numpy compares its shape with the file's size first."""
     try:
         open_input(path).close()
-        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); copy it again") from e
     except Exception as e:  # numpy raises a dozen types on malformed files
-        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); write it again") from e
+        why = unread_reason(e) if isinstance(e, OSError) else f"{type(e).__name__}: {e}"
+        raise DataError(f"{path}: cannot be read as a numpy array ({why}); {fix}") from e
     if not isinstance(found, np.ndarray):
         found.close()
-        raise DataError(f"{path}: is an archive of arrays, not one array [height, width]; save the map alone")
+        raise DataError(f"{path}: is an archive of arrays, not one array; {fix}")
+    return found
+
+
+def _read_array(path: Path, max_pixels: int) -> np.ndarray:
+    found = mapped_array(path, "save the map alone")
     if found.dtype.kind not in "fu" or found.dtype.itemsize > 8:
         raise DataError(f"{path}: its numbers are {found.dtype}; save float32, or uint16 in millimetres")
     while found.ndim > 2 and found.shape[0] == 1:
@@ -169,13 +132,9 @@ def _gray(path: Path, raw: np.ndarray, what: str) -> np.ndarray:
     )
 
 
-def read_depth(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values.
-
-    Raises:
-        DataError: The file is not a map, or its values cannot be depths.
-    """
-    raw = _gray(path, read_numbers(path, max_pixels), "depth map")
+def read_depth(path: Path, options: ReadOptions) -> np.ndarray:
+    """Return a depth map in units of the cameras, or in unknown units if relative; float32 [H, W], 0 for missing values."""
+    raw = _gray(path, read_numbers(path, options.max_pixels), "depth map")
     metric = options.depth_kind == "metric"
     if raw.dtype == np.uint8 and metric:
         raise DataError(
@@ -206,9 +165,6 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     """Return a map of confidence in [0, 1], float32 [H, W], of the ``shape`` of its depth map.
 
     uint8 and uint16 maps are divided by 2 if they hold only the levels 0, 1 and 2, else by the largest value of their type.
-
-    Raises:
-        DataError: The file is not a map, of another shape, or not in [0, 1].
     """
     raw = _gray(path, read_numbers(path, max_pixels), "map of confidence")
     if raw.shape != shape:
@@ -224,13 +180,9 @@ def read_confidence(path: Path, shape: tuple[int, ...], max_pixels: int = MAX_PI
     return values
 
 
-def read_normals(path: Path, options: MapOptions, max_pixels: int = MAX_PIXELS) -> np.ndarray:
-    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values.
-
-    Raises:
-        DataError: The file is not a map of normals, contains none, or too many of its vectors have another length than 1.
-    """
-    raw = read_numbers(path, max_pixels)
+def read_normals(path: Path, options: ReadOptions) -> np.ndarray:
+    """Return unit normals in the camera's axes (x right, y down, z forward), float32 [H, W, 3]; 0 for missing values."""
+    raw = read_numbers(path, options.max_pixels)
     if raw.ndim != 3 or raw.shape[2] != 3:
         shape = " x ".join(map(str, raw.shape))
         raise DataError(f"{path}: is {shape}, normals need three channels; save RGB (n + 1) / 2, or NPY [height, width, 3]")
@@ -291,17 +243,7 @@ def resized(values: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def in_pixels_of(loaded: LoadedImage, values: np.ndarray, path: Path) -> np.ndarray:
-    """Rotate, undistort and resize a map like its image; the result has shape [h, w] or [h, w, C] of the image's final size.
-
-    Args:
-        loaded: The image at its final size.
-        values: The map, upright or oriented like the stored image, at the image's size or another size of the same aspect,
-            shape [H, W] or [H, W, C].
-        path: File of the map, for errors.
-
-    Raises:
-        DataError: The aspects differ, or the map holds vectors and the image was rotated.
-    """
+    """Rotate, undistort and resize a map like its image; the result has shape [h, w] or [h, w, C] of the image's final size."""
     import cv2
 
     height, width = loaded.full_size
@@ -356,26 +298,17 @@ NOTHING_NAMED = NamedMaps()
 class GivenMaps:
     """Depth and normal maps of a scene, from the folders that the user names or the files that the scene names."""
 
-    def __init__(self, options: MapOptions, max_pixels: int, allow_outside: bool):
-        """List the files of the folders in ``options``.
+    def __init__(self, options: ReadOptions):
+        """List the files of the folders in ``options``."""
+        self.options = options
 
-        Raises:
-            DataError: A folder is missing, or holds no map.
-        """
-        self.options, self.max_pixels = options, max_pixels
-
-        def folder(path: Path | None, flag: str) -> MapFolder | None:
-            return MapFolder(path, flag, allow_outside) if path is not None and str(path) != NONE else None
+        def folder(path: str | None, flag: str) -> MapFolder | None:
+            return MapFolder(Path(path), flag, options.allow_outside) if path not in (None, NONE) else None
 
         self.depths, self.normals = folder(options.depths, DEPTHS), folder(options.normals, NORMALS)
 
     def attached(self, loaded: LoadedImage, image: Path, named: NamedMaps = NOTHING_NAMED) -> LoadedImage:
-        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene.
-
-        Raises:
-            DataError: A map cannot be read, does not fit its image, or its values cannot be depths or normals.
-            UsageError: The camera model of the image does not support the map.
-        """
+        """Return an image with its maps, at the image's size; the user's folder has priority over maps named in the scene."""
         depth, confidence, options = named.depth, None, self.options
         if options.depths is not None:
             depth, confidence = self.depths.find(image) if self.depths is not None else (None, None)
@@ -388,16 +321,16 @@ class GivenMaps:
             loaded = replace(loaded, depth=self._depth(loaded, depth, confidence, options))
         return loaded if normals is None else replace(loaded, normals=self._normals(loaded, normals))
 
-    def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: MapOptions) -> GivenDepth:
+    def _depth(self, loaded: LoadedImage, path: Path, confidence: Path | None, options: ReadOptions) -> GivenDepth:
         if loaded.camera_model not in CENTRAL or loaded.camera_model == "fisheye":
             raise UsageError(
                 f"{path}: depth is not supported for the camera model {loaded.camera_model}; leave out --lenses "
                 f"native, or the map ({DEPTHS} none)"
             )
-        stored = read_depth(path, options, self.max_pixels)
+        stored = read_depth(path, options)
         values, sure = in_pixels_of(loaded, stored, path), None
         if confidence is not None:
-            known = read_confidence(confidence, stored.shape, self.max_pixels)
+            known = read_confidence(confidence, stored.shape, options.max_pixels)
             sure = in_pixels_of(loaded, np.where(stored > 0, known, 0), confidence)
             values = np.where(sure > 0, values, 0)
         if not values.any():
@@ -412,7 +345,7 @@ class GivenMaps:
                 f"{path}: normals need pinholes, not the camera model {loaded.camera_model}; leave out --lenses native, or the "
                 f"map ({NORMALS} none)"
             )
-        normals = in_pixels_of(loaded, read_normals(path, self.options, self.max_pixels), path)
+        normals = in_pixels_of(loaded, read_normals(path, self.options), path)
         size = np.linalg.norm(normals, axis=-1, keepdims=True)
         normals = np.divide(normals, size, out=np.zeros_like(normals), where=size > 0.5)
         height, width = normals.shape[:2]
@@ -432,27 +365,23 @@ class GivenMaps:
         return np.where((along <= 0)[..., None], normals, 0).astype(np.float32)
 
 
-def check_found(views: Sequence[View], options: MapOptions, allow_outside: bool) -> list[str]:
-    """Return notes on the maps of a scene's views.
-
-    Raises:
-        DataError: A folder is given, but no view has a map in it.
-    """
+def check_found(views: Sequence[View], options: ReadOptions) -> list[str]:
+    """Return notes on the maps of a scene's views."""
     notes = []
     flags = {"depth": (options.depths, DEPTHS), "normals": (options.normals, NORMALS)}
     for name, (path, flag) in flags.items():
         having = [v for v in views if getattr(v, name) is not None]
-        if path is not None and str(path) != NONE and not having:
-            raise MapFolder(path, flag, allow_outside).unmatched()
+        if path not in (None, NONE) and not having:
+            raise MapFolder(Path(path), flag, options.allow_outside).unmatched()
         if not having:
             continue
-        where = f"from {path}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
+        where = f"from {Path(path)}" if path is not None else f"listed in the scene's file; to ignore them, use {flag} none"
         what = "normals" if name == "normals" else "depth maps"
         notes.append(f"{what}: {len(having)} of {len(views)} views, {_about(name, having, options)}, {where}")
     return notes
 
 
-def _about(name: str, views: Sequence[View], options: MapOptions) -> str:
+def _about(name: str, views: Sequence[View], options: ReadOptions) -> str:
     """Return a description of the values of the maps, for a note."""
     if name == "normals":
         return f"{'OpenCV' if options.normal_axes == 'opencv' else 'OpenGL'} axes"

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from warpgs.errors import DataError
-from warpgs.files import open_input, read_input, unread_reason
+from warpgs.files import read_input, unread_reason
 from warpgs.geometry import matmul
 from warpgs.io.folder import (
     Probe,
     Reader,
-    ReadOptions,
     SceneFolder,
     ViewList,
     from_camera_to_world,
@@ -24,7 +24,8 @@ from warpgs.io.folder import (
     rigid,
     view_name,
 )
-from warpgs.io.images import Lens, list_images
+from warpgs.io.images import Lens, ReadOptions, list_images
+from warpgs.io.maps import mapped_array
 from warpgs.scene import Scene
 
 # LLFF scenes: poses_bounds.npy, one row of 17 numbers per image in sorted-name order (Mildenhall et al. 2019).
@@ -35,20 +36,8 @@ MAX_ROWS = 1_000_000
 
 
 def read_poses_bounds(path: Path) -> np.ndarray:
-    """Return the array of poses_bounds.npy, float64, shape [N, 17].
-
-    Raises:
-        DataError: The file does not hold such an array.
-    """
-    try:
-        open_input(path).close()
-        # mapped: numpy then compares the announced shape with the file's size before it allocates memory
-        rows = np.load(path, mmap_mode="r", allow_pickle=False)
-    except Exception as e:  # numpy raises a dozen types on malformed files
-        raise DataError(f"{path}: cannot be read as a numpy array ({type(e).__name__}: {e}); copy it again") from e
-    if not isinstance(rows, np.ndarray):
-        rows.close()
-        raise DataError(f"{path}: is an archive of arrays, not one array [n, 17]; make it again")
+    """Return the array of poses_bounds.npy, float64, shape [N, 17]."""
+    rows = mapped_array(path, "make it again")
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind not in "fiu":
         raise DataError(f"{path}: must be an array [n, 17] of numbers, not {list(rows.shape)} of {rows.dtype}; make it again")
     if len(rows) > MAX_ROWS:
@@ -109,11 +98,7 @@ MAX_MATRIX_BYTES = 4096
 
 
 def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Split a projection matrix [3, 4] into intrinsics [3, 3] and camera_from_world [4, 4].
-
-    Raises:
-        DataError: The matrix is not finite, is singular, or has a skew of more than a thousandth of the focal length.
-    """
+    """Split a projection matrix [3, 4] into K [3, 3], for pixel centres at +0.5, and camera_from_world [4, 4]."""
     M = P[:3, :3]
     if not (np.isfinite(P).all() and abs(np.linalg.det(M)) > 1e-12 * np.abs(M).max() ** 3):
         raise DataError(f"{where}: the projection matrix is not finite or not invertible; calibrate again")
@@ -128,12 +113,23 @@ def decompose(P: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
     if np.linalg.det(R) < 0:  # P is given up to sign
         R, t = -R, -t
     K = K / K[2, 2]
-    if abs(K[0, 1]) > 1e-3 * K[0, 0]:
-        raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
-    K[0, 1] = 0.0
     viewmat = np.eye(4)
     viewmat[:3, :3], viewmat[:3, 3] = R, t
-    return K, rigid(viewmat, where)
+    return _centred(K, where), rigid(viewmat, where)
+
+
+def _centred(K: np.ndarray, where: str) -> np.ndarray:
+    """Return K [3, 3] of a file that counts pixels from the centre of the first one for centres at +0.5, and without skew."""
+    if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
+        raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
+    K[0, 1] = 0.0
+    K[:2, 2] += 0.5
+    return K
+
+
+def _lens(K: np.ndarray, where: str) -> Callable[[int, int], Lens]:
+    """Return the function that makes the lens of K for the size of its image file."""
+    return lambda width, height: Lens(K, width, height).checked(where)
 
 
 def _read_matrices(path: Path) -> dict[str, np.ndarray]:
@@ -210,13 +206,8 @@ class DTUReader(Reader):
             if world is None:
                 raise DataError(f"{where}: world_mat_{i} is missing; copy the archive again")
             K, viewmat = decompose(matmul(world, scale)[:3], where)
-            K[:2, 2] += 0.5  # the archives count pixels from the centre of the first one
-            loaded = scene.image(
-                file,
-                lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
-                mask=scene.mask(masks[file]) if file in masks else None,
-            )
-            views.add(name, viewmat, loaded)
+            mask = scene.mask(masks[file]) if file in masks else None
+            views.add(name, viewmat, scene.image(file, _lens(K, where), mask=mask))
         notes = resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))
 
@@ -233,11 +224,7 @@ def files_of(root: Path) -> list[Path]:
 
 
 def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
-    """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera.
-
-    Raises:
-        DataError: The file is malformed; the message names the line.
-    """
+    """Return line number, image name and the numbers K, R, t, float64, shape [21], of each camera."""
     rows, count = [], None
     try:
         text = read_input(path, MAX_BYTES).decode("utf-8-sig")
@@ -266,17 +253,6 @@ def read_camera_rows(path: Path) -> list[tuple[int, str, np.ndarray]]:
     return rows
 
 
-def _intrinsics(K: np.ndarray, where: str) -> np.ndarray:
-    """Return K [3, 3] of a file for pixel centres at +0.5; DataError if it is not a matrix of intrinsics, or skewed."""
-    if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]):
-        raise DataError(f"{where}: the camera is skewed by {K[0, 1]:.3g} px, which is not supported; rectify the images")
-    if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
-        raise DataError(f"{where}: K is not a matrix of intrinsics (its lower rows are not 0 fy cy, 0 0 1); calibrate again")
-    K[0, 1] = 0.0
-    K[:2, 2] += 0.5  # in the file, the centre of the first pixel is 0
-    return K
-
-
 @register("middlebury")
 class MiddleburyReader(Reader):
     """Middlebury scenes: a parameter file, and beside it the images that it names."""
@@ -296,15 +272,14 @@ class MiddleburyReader(Reader):
         scene, views = SceneFolder(folder, options), ViewList()
         for number, name, values in read_camera_rows(scene.inside(path)):
             where = f"{path}, line {number}, image {name!r}"
-            K, viewmat = _intrinsics(values[:9].reshape(3, 3).copy(), where), np.eye(4)
+            K, viewmat = _centred(values[:9].reshape(3, 3).copy(), where), np.eye(4)
+            if not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1)):
+                lower = "its lower rows are not 0 fy cy, 0 0 1"
+                raise DataError(f"{where}: K is not a matrix of intrinsics ({lower}); calibrate again")
             viewmat[:3, :3], viewmat[:3, 3] = values[9:18].reshape(3, 3), values[18:21]
             viewmat = rigid(viewmat, where)
             file, view = scene.child(folder, name, where), views.claim(view_name(name), where)
-            loaded = scene.image(
-                file,
-                lambda width, height: Lens(K, width, height).checked(where),  # noqa: B023 - called before the next round
-                mask=scene.find_mask(file, folder, folder / "masks"),
-            )
-            views.add(view, viewmat, loaded)
+            mask = scene.find_mask(file, folder, folder / "masks")
+            views.add(view, viewmat, scene.image(file, _lens(K, where), mask=mask))
         notes += resampling_note(options.downscale) + views.notes(options)
         return self.scene(folder, views.views, notes, pixels=scene.pixel_source(by_folder=False))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +17,14 @@ from warpgs.io import colmap
 from warpgs.io.folder import (
     Probe,
     Reader,
-    ReadOptions,
     SceneFolder,
     ViewList,
     from_camera_to_world,
-    quat_rotation,
     register,
     resampling_note,
-    rigid,
     view_name_of,
 )
-from warpgs.io.images import BLACK, SUFFIXES, Lens
+from warpgs.io.images import BLACK, SUFFIXES, Lens, ReadOptions
 from warpgs.io.maps import SUFFIXES as MAPS
 from warpgs.io.maps import NamedMaps
 from warpgs.scene import Camera, Scene
@@ -59,20 +57,21 @@ def _reject_constant(name: str):
     raise ValueError(f"{name} is not a finite number")
 
 
-def read_json(path: Path) -> dict:
-    """Return the parsed file with its list of frames.
-
-    Raises:
-        DataError: The file is malformed, too large or nested too deep, or holds NaN or Infinity.
-    """
+def _json(path: Path, fix: str, constants: Callable[[str], object] | None = None) -> Any:
+    """Return the values of a JSON file of bounded size."""
     try:
         text = read_input(path, MAX_BYTES).decode("utf-8-sig", "surrogateescape")
         check_parts(text)
-        values = json.loads(text, parse_constant=_reject_constant)
+        return json.loads(text, parse_constant=constants)
     except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}); write it again") from e
+        raise DataError(f"{path}: cannot be read ({unread_reason(e)}){fix}") from e
     except (ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read as JSON ({e}); write it again") from e
+        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}){fix}") from e
+
+
+def read_json(path: Path) -> dict:
+    """Return the parsed file with its list of frames."""
+    values = _json(path, "; write it again", _reject_constant)
     try:
         check_depth(values, MAX_DEPTH)
     except SchemaError as e:  # else the error message could not name its values
@@ -96,19 +95,7 @@ def _number(frame: dict, shared: dict, key: str) -> float | None:
 
 
 def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, native: bool = False) -> Lens:
-    """Return the intrinsics of a frame; the frame's own values override the shared values of the file.
-
-    Args:
-        frame: An entry of the list of frames.
-        shared: The whole file.
-        width: Width of the image [px], used if the file gives none.
-        height: Height of the image [px], used if the file gives none.
-        where: File and frame, for errors.
-        native: True to read fisheyes, too.
-
-    Raises:
-        DataError: There is no focal length, a number is not finite, or the lens model is not supported.
-    """
+    """Return the intrinsics of a frame; the frame's own values override the shared values of the file."""
     model = str(frame.get("camera_model", shared.get("camera_model", "OPENCV")))
     kept = ", or fit them with --lenses native" if not native else ""
     known = (*MODELS, FISHEYE) if native else MODELS
@@ -151,11 +138,7 @@ def lens_of(frame: dict, shared: dict, width: int, height: int, where: str, nati
 
 
 def matrix_of(frame: dict, where: str) -> np.ndarray:
-    """Return the transform_matrix of a frame, shape [3, 4] or [4, 4].
-
-    Raises:
-        DataError: The matrix is missing or not made of rows of numbers.
-    """
+    """Return the transform_matrix of a frame, shape [3, 4] or [4, 4]."""
     try:
         # through object, so that ragged rows and huge integers are caught here and strings are not parsed
         rows = [[float(x) if not isinstance(x, (str, bool)) else math.nan for x in row] for row in frame["transform_matrix"]]
@@ -167,74 +150,33 @@ def matrix_of(frame: dict, where: str) -> np.ndarray:
     return matrix
 
 
-@dataclass
-class _Reading:
-    """State of a scene that is read frame by frame."""
+def _image_path(scene: SceneFolder, folder: Path, name: object, where: str) -> Path:
+    """Return the image file of a frame; Blender's file names have no suffix."""
+    path = scene.child(folder, name, where, root=scene.root)
+    if path.suffix.lower() in SUFFIXES:
+        return path
+    candidates = [path.with_name(path.name + s) for s in SUFFIXES]
+    return next((c for c in candidates if c.is_file()), candidates[0])
 
-    root: Path
-    scene: SceneFolder
-    background: tuple[float, float, float]
-    views: ViewList = field(default_factory=ViewList)
-    missing: list[str] = field(default_factory=list)
-    outside: int = 0
-    total: int = 0
 
-    def child(self, folder: Path, name: object, where: str) -> Path:
-        return self.scene.child(folder, name, where, root=self.root)
+def _named_maps(scene: SceneFolder, folder: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
+    """Return the maps that a frame names under nerfstudio's keys."""
 
-    def image_path(self, folder: Path, name: object, where: str) -> Path:
-        """Return the image file of a frame; Blender's file names have no suffix."""
-        path = self.child(folder, name, where)
-        if path.suffix.lower() in SUFFIXES:
-            return path
-        candidates = [path.with_name(path.name + s) for s in SUFFIXES]
-        return next((c for c in candidates if c.is_file()), candidates[0])
+    def path(key: str, flag: str) -> Path | None:
+        if not frame.get(key) or getattr(scene.options, flag) is not None:
+            return None
+        found = scene.inside(scene.child(folder, frame[key], f"{where}, {key}", root=scene.root))
+        if found.suffix.lower() not in MAPS:
+            raise DataError(f"{where}: {key} is {found.name}, but maps must be {' or '.join(MAPS)}; --{flag} none skips it")
+        return found
 
-    def mask(self, file: Path, frame: dict, path: Path, where: str) -> np.ndarray | None:
-        if frame.get("mask_path"):
-            return self.scene.mask(self.child(file.parent, frame["mask_path"], f"{where}, mask"))
-        return self.scene.find_mask(path, self.root / "images")
-
-    def named(self, file: Path, shared: dict, frame: dict, where: str) -> NamedMaps:
-        """Return the maps that a frame names under nerfstudio's keys."""
-
-        def path(key: str, flag: str) -> Path | None:
-            if not frame.get(key) or getattr(self.scene.options.maps, flag) is not None:
-                return None
-            found = self.scene.inside(self.child(file.parent, frame[key], f"{where}, {key}"))
-            if found.suffix.lower() not in MAPS:
-                raise DataError(f"{where}: {key} is {found.name}, but maps must be {' or '.join(MAPS)}; --{flag} none skips it")
-            return found
-
-        try:
-            unit = _number(frame, shared, "depth_unit_scale_factor")
-            if unit is not None and not unit > 0:
-                raise ValueError(f"depth_unit_scale_factor is {unit}; it must be above 0")
-        except ValueError as e:
-            raise DataError(f"{where}: {e}") from e
-        return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
-
-    def frame(self, file: Path, shared: dict, number: int, frame: object) -> None:
-        where = f"{file}, frame {number}"
-        if not isinstance(frame, dict):
-            raise DataError(f"{where}: expected an object with file_path and transform_matrix; write the file again")
-        path = self.image_path(file.parent, frame.get("file_path"), where)
-        self.total += 1
-        if not path.is_file():
-            self.missing.append(str(frame["file_path"]))
-            return
-        name = self.views.claim(view_name_of(path, self.root), where)
-        self.outside += name.startswith("outside/")
-        where = f"{where} ({name})"
-        viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
-        loaded = self.scene.image(
-            path,
-            lambda width, height: lens_of(frame, shared, width, height, where, self.scene.options.lenses == "native"),
-            mask=self.mask(file, frame, path, where),
-            background=self.background,
-            named=self.named(file, shared, frame, where),
-        )
-        self.views.add(name, viewmat, loaded)
+    try:
+        unit = _number(frame, shared, "depth_unit_scale_factor")
+        if unit is not None and not unit > 0:
+            raise ValueError(f"depth_unit_scale_factor is {unit}; it must be above 0")
+    except ValueError as e:
+        raise DataError(f"{where}: {e}") from e
+    return NamedMaps(path("depth_file_path", "depths"), path("normal_file_path", "normals"), unit)
 
 
 @register("transforms")
@@ -256,69 +198,60 @@ class TransformsReader(Reader):
     def read(self, folder: Path, options: ReadOptions) -> Scene:
         """See `Reader.read`."""
         background = WHITE if is_blender(folder) else BLACK
-        reading = _Reading(folder, SceneFolder(folder, options), background)
-        notes = []
+        scene, views, notes = SceneFolder(folder, options), ViewList(), []
+        missing: list[str] = []
+        total = 0
         for file in files_of(folder):
-            shared = read_json(reading.scene.inside(file))
+            shared = read_json(scene.inside(file))
+            total += len(shared["frames"])
             for number, frame in enumerate(shared["frames"]):
-                reading.frame(file, shared, number, frame)
+                where = f"{file}, frame {number}"
+                if not isinstance(frame, dict):
+                    raise DataError(f"{where}: expected an object with file_path and transform_matrix; write the file again")
+                path = _image_path(scene, file.parent, frame.get("file_path"), where)
+                if not path.is_file():
+                    missing.append(str(frame["file_path"]))
+                    continue
+                name = views.claim(view_name_of(path, folder), where)
+                where = f"{where} ({name})"
+                viewmat = from_camera_to_world(matrix_of(frame, where), where, opengl=True)
+                if frame.get("mask_path"):
+                    mask = scene.mask(scene.child(file.parent, frame["mask_path"], f"{where}, mask", root=folder))
+                else:
+                    mask = scene.find_mask(path, folder / "images")
+                lens = functools.partial(lens_of, frame, shared, where=where, native=options.lenses == "native")
+                named = _named_maps(scene, file.parent, shared, frame, where)
+                views.add(name, viewmat, scene.image(path, lens, mask=mask, background=background, named=named))
             if shared.get("ply_file_path"):
                 notes.append(f"the points in {str(shared['ply_file_path'])[:80]} are not read")
-        if missing := reading.missing:
+        if missing:
             some = f"{', '.join(missing[:5])}{' ...' if len(missing) > 5 else ''}"
-            text = f"{len(missing)} of {reading.total} frames have no image file: {some}"
+            text = f"{len(missing)} of {total} frames have no image file: {some}"
             if options.strict:
                 raise DataError(f"{files_of(folder)[0]}: {text}. Restore them, or leave out --strict to go on without them")
             notes.append(f"skipped: {text}")
-        if reading.outside:
-            notes.append(f"{reading.outside} images are outside the scene folder; their views are named outside/...")
-        notes += resampling_note(options.downscale) + reading.views.notes(options)
-        return self.scene(
-            folder,
-            reading.views.views,
-            notes,
-            background=background,
-            pixels=reading.scene.pixel_source(by_folder=False),
-        )
-
-
-MAX_CAMERA_BYTES = 2**25
-"""Largest file of cameras that is read [bytes]."""
+        if outside := sum(v.name.startswith("outside/") for v in views.views):
+            notes.append(f"{outside} images are outside the scene folder; their views are named outside/...")
+        notes += resampling_note(options.downscale) + views.notes(options)
+        pixels = scene.pixel_source(by_folder=False)
+        return self.scene(folder, views.views, notes, background=background, pixels=pixels)
 
 
 def read_cameras(path: Path) -> tuple[dict[str, Camera], list[str]]:
     """Return the cameras of a file or of a COLMAP folder by name, in file units, and notes for the user.
 
     Lenses become pinholes, because renders have no distortion; a note reports lenses with distortion.
-
-    Args:
-        path: A cameras.json, a transforms.json, or a folder with a COLMAP reconstruction, binary or text.
-
-    Raises:
-        DataError: The file is missing, malformed or holds no camera; a pose is not rigid, or a lens has impossible values.
     """
     if path.is_dir():
         found = _colmap(path)
     else:
-        values = _json(path)
+        values = _json(path, ". Check the path, or write the file again")
         found = _inria(path, values) if isinstance(values, list) else _transforms(path)
     if not found:
         raise DataError(f"{path}: holds no camera. Give cameras.json, transforms.json, or the folder of a scene")
     bent = sum(any(lens.distortion) for _, lens in found.values())
     notes = [f"the lens distortion of {bent} of {len(found)} cameras is not rendered"] if bent else []
     return {name: Camera(viewmat, lens.K, lens.width, lens.height) for name, (viewmat, lens) in found.items()}, notes
-
-
-def _json(path: Path) -> Any:
-    """Return the values of a JSON file of bounded size."""
-    try:
-        text = read_input(path, MAX_CAMERA_BYTES).decode("utf-8-sig", "surrogateescape")
-        check_parts(text)
-        return json.loads(text)
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read ({unread_reason(e)}). Check the path, or write the file again") from e
-    except (ValueError, RecursionError) as e:
-        raise DataError(f"{path}: cannot be read as JSON ({str(e)[:80]}). Check the path, or write the file again") from e
 
 
 def _inria(path: Path, rows: list[Any]) -> dict[str, tuple[np.ndarray, Lens]]:
@@ -370,14 +303,9 @@ def _colmap(folder: Path) -> dict[str, tuple[np.ndarray, Lens]]:
         raise DataError(f"{folder}: lacks COLMAP's files cameras and images. Give cameras.json, transforms.json or a scene")
     lenses = colmap.read_cameras(model / f"cameras.{kind}")
     found = _Names()
-    for pose in sorted(colmap.read_poses(model / f"images.{kind}").values(), key=lambda p: p.name):
-        where = f"{model}, image {pose.name!r}"
-        if pose.camera_id not in lenses:
-            raise DataError(f"{where}: camera {pose.camera_id} is missing from cameras.{kind}; export the cameras again")
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = quat_rotation(pose.quat, where)
-        viewmat[:3, 3] = pose.translation
-        found.add(pose.name, rigid(viewmat, where), lenses[pose.camera_id])
+    poses = colmap.read_poses(model / f"images.{kind}")
+    for name, lens, viewmat in colmap.posed_lenses(poses, lenses, model / f"images.{kind}"):
+        found.add(name, viewmat, lens)
     return found
 
 

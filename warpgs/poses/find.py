@@ -25,7 +25,7 @@ from warpgs.files import (
     write_text,
 )
 from warpgs.io.folder import all_readers
-from warpgs.io.images import MAX_PIXELS, unread_note
+from warpgs.io.image_files import MAX_PIXELS, unread_note
 from warpgs.poses.mapping import EXHAUSTIVE, LEARNED, Mapping, camera_groups, cameras_of, check_installed, find_model
 from warpgs.poses.matching import Matcher, open_matcher, write_matches
 from warpgs.poses.photographs import (

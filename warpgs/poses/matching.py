@@ -12,7 +12,7 @@ import numpy as np
 
 from warpgs.errors import DataError
 from warpgs.files import writing
-from warpgs.io.images import decode_png
+from warpgs.io.image_files import decode_png
 from warpgs.onnx import first_line, read_model, start_session
 
 if TYPE_CHECKING:

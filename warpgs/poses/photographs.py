@@ -19,24 +19,27 @@ import numpy as np
 
 from warpgs.errors import DataError, UsageError, install_extras
 from warpgs.files import UNDECODABLE, inside, make_folder, read_start, unread_reason, write_bytes, write_json
-from warpgs.io.image_formats.avif import BRANDS_END, kind
-from warpgs.io.image_formats.jpeg import EOI, LONE, MARKER, NEXT_MARKER, SOS
-from warpgs.io.image_formats.png import SIGNATURE
-from warpgs.io.images import (
+from warpgs.io.image_files import (
+    BRANDS_END,
+    EOI,
     EXPOSURE,
     FOCAL_35MM,
+    LONE,
     MAKE,
+    MARKER,
     MAX_PIXELS,
     MODEL,
+    NEXT_MARKER,
+    PNG_START,
+    SOS,
+    brand,
     decode,
     format_of,
-    list_images,
     parse_exif,
     read_exif,
     read_image_file,
-    read_image_start,
-    turn_upright,
 )
+from warpgs.io.images import list_images, turn_upright
 from warpgs.process import ProcessFailed, answer, end_with_parent, hidden_stderr, python_lines, utf8_name
 
 JFIF, ADOBE, COMMENT = 0xE0, 0xEE, 0xFE
@@ -76,7 +79,7 @@ def without_png_metadata(data: bytes) -> bytes:
     Args:
         data: A file that was decoded without an error.
     """
-    parts, at = [SIGNATURE], len(SIGNATURE)
+    parts, at = [PNG_START], len(PNG_START)
     while at + 12 <= len(data):
         kind, begin = data[at + 4 : at + 8], at
         at += 12 + int.from_bytes(data[at : at + 4], "big")
@@ -213,7 +216,7 @@ def is_heic(path: Path) -> bool:
     Raises:
         DataError: The file cannot be read.
     """
-    return kind(read_image_start(path, BRANDS_END)) == "HEIC"
+    return brand(read_image_file(path, start=BRANDS_END)) == "HEIC"
 
 
 def to_jpeg(
@@ -397,7 +400,7 @@ def scene_name(name: str, data: bytes) -> str:
 
 def _format(data: bytes) -> str:
     try:
-        return format_of(data)[0]
+        return format_of(data)
     except ValueError:
         return ""
 

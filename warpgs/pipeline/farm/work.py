@@ -30,7 +30,7 @@ from warpgs.files import (
     write_bytes,
     writing_into,
 )
-from warpgs.io.images import decode
+from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.kernels.launch import set_threads
 from warpgs.locks import hold_folder

@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 from warpgs.constants import NEAR
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import check_pinhole, pinhole_of, relative_pose
-from warpgs.io.images import decode
+from warpgs.io.image_files import decode
 from warpgs.kernels.ssim import ssim
 from warpgs.pipeline.metrics.scores import over_white, psnr_of, render_view, scored_region, to_8_bit
 from warpgs.priors.given_depth import pinhole_view

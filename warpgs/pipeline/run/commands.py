@@ -23,7 +23,7 @@ from warpgs.export.base import format_of, read_with_antialiasing
 from warpgs.export.ply import write_ply
 from warpgs.files import filling, write_bytes, write_json, writing_into
 from warpgs.geometry import convert_camera, rotation_matrices
-from warpgs.io.images import MAX_PIXELS
+from warpgs.io.image_files import MAX_PIXELS
 from warpgs.io.load import Split, load_scene
 from warpgs.io.transforms import colmap_folder, read_cameras
 from warpgs.locks import hold_file, hold_folder

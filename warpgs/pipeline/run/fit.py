@@ -558,7 +558,7 @@ def _scene_of(
     """Read and split a scene that is given in one of four ways; returns request, scene, split and notes."""
     if isinstance(scene, Scene):
         split, notes = choose_split(scene, spec)
-        return SceneRequest("", spec, 1).with_scale(device), scene, split, [*scene.notes, *notes]
+        return SceneRequest("", spec, downscale=1).with_scale(device), scene, split, [*scene.notes, *notes]
     request = (scene if isinstance(scene, SceneRequest) else SceneRequest(str(scene))).with_scale(device)
     if spec is not None:
         request = replace(request, split=spec)

@@ -22,8 +22,8 @@ from warpgs import schema
 from warpgs.constants import K_TOLERANCE, POSE_TOLERANCE, RULES
 from warpgs.errors import DataError, NotFiniteError, UsageError, similar_folder
 from warpgs.files import is_empty, open_input, plain, unread_reason, write_bytes
+from warpgs.io.images import CHOICES
 from warpgs.io.load import Split
-from warpgs.io.maps import AXES
 from warpgs.kernels.cameras import check_camera
 from warpgs.locks import check_free, hold_folder
 from warpgs.pipeline.model.table import FittedModel, checked_gaussians, unpack
@@ -33,7 +33,7 @@ from warpgs.pipeline.train.view_modules import FittedViews
 from warpgs.pipeline.train.views import LearnedViews
 from warpgs.poses.find import JSON as POSES
 from warpgs.render.options import RasterizeOptions
-from warpgs.scene import DEPTH_KINDS, Camera, Gaussians, Normalization, Scene, View
+from warpgs.scene import Camera, Gaussians, Normalization, Scene, View
 from warpgs.schema import Schema, SchemaError, fields, flag, items, mapping, number, one_of, or_null, real, text, whole
 from warpgs.version import __version__
 
@@ -89,13 +89,13 @@ _CAMERA = fields(
 _SCENE = fields(
     {
         "path": or_null(text), "split": or_null(text), "downscale": whole(1), "strict": flag, "allow_outside": flag,
-        "masks": one_of("ignore", "cutout"), "mask_keeps": one_of("white", "black"), "black_is_empty": flag,
+        **{name: one_of(*choices) for name, choices in CHOICES.items()}, "black_is_empty": flag,
         "score_masks": or_null(text), "reader": or_null(text),
     },
     {
-        "max_pixels": whole(1), "max_side": whole(0), "lenses": one_of("undistort", "native"),
-        "depths": or_null(text), "normals": or_null(text), "depth_kind": one_of(*DEPTH_KINDS),
-        "depth_unit": or_null(number(above=0)), "normal_axes": one_of(*AXES), "matcher": or_null(text),
+        "max_pixels": whole(1), "max_side": whole(0),
+        "depths": or_null(text), "normals": or_null(text),
+        "depth_unit": or_null(number(above=0)), "matcher": or_null(text),
     },
     others=False,
 )  # fmt: skip

@@ -10,9 +10,8 @@ from pathlib import Path
 import torch
 
 from warpgs.errors import ResourceError, UsageError
-from warpgs.io.folder import image_scale
-from warpgs.io.images import MAX_PIXELS
-from warpgs.io.load import Split, coincident_views, load_scene, split_views
+from warpgs.io.images import SceneOptions, image_scale
+from warpgs.io.load import Split, coincident_views, read_folder, split_views
 from warpgs.pipeline.train.settings import FitConfig
 from warpgs.scene import Scene
 
@@ -24,7 +23,7 @@ NO_SCORES = "no photograph is held out, so new views get no score; hold some out
 
 
 @dataclass(frozen=True)
-class SceneRequest:
+class SceneRequest(SceneOptions):
     """A scene folder with options for reading it."""
 
     path: str
@@ -33,41 +32,8 @@ class SceneRequest:
     split: str | None = None
     """Views to hold out for scores: llff:K, mip360:K, dtu:3|6|9, blender:8, every:N, all (all views train), or
     train=NAMES;test=NAMES. None: a fit trains on all views; a study holds out every 8th view or the middle one."""
-    downscale: int | None = None
-    """Factor by which both image sides shrink; None for 1."""
-    strict: bool = False
-    """Treat a frame without an image file as an error."""
-    allow_outside: bool = False
-    """Allow names and links that point to files outside the scene folder."""
-    masks: str = "ignore"
-    """Treatment of masked-out pixels: ignore (left out of fit and scores) or cutout (transparent)."""
-    mask_keeps: str = "white"
-    """Colour of a mask file that keeps a pixel: white or black."""
-    black_is_empty: bool = True
-    """Make dark pixels around the object transparent, if every image shows an object on a black background."""
-    score_masks: str | None = None
-    """Folder of object masks for scoring, matched by image id; None for the scene's own idrmasks, if any."""
     reader: str | None = None
     """Name of the scene's format, or your own reader as module:Class or path/to/file.py:Class; None to detect the format."""
-    max_pixels: int = MAX_PIXELS
-    """Largest number of pixels of a stored image or mask."""
-    max_side: int | None = None
-    """Largest image side [px], 0 for no limit. None: no limit with --downscale; otherwise 1600, or 800 in a fit on a CPU."""
-    lenses: str = "undistort"
-    """Treatment of lens distortion: undistort (images are resampled to a pinhole) or native (the model is rendered through the
-    lens). Fisheyes need native."""
-    depths: str | None = None
-    """Folder of depth maps, 16-bit PNG or NPY, with the names of the images. They place the first Gaussians and guide the fit.
-    Default: the maps that transforms.json names; with the value none, these maps are ignored."""
-    normals: str | None = None
-    """Folder of normal maps, RGB PNG of (n + 1) / 2 or NPY, with the names of the images."""
-    depth_kind: str = "metric"
-    """Meaning of the depth maps: metric (lengths in units of the cameras), relative (lengths of unknown scale and shift) or
-    disparity (inverse lengths of unknown scale and shift, as networks give)."""
-    depth_unit: float | None = None
-    """Length of one unit of a metric depth map, in units of the cameras. None: 0.001 for integer maps, 1 for float maps."""
-    normal_axes: str = "opencv"
-    """Camera axes of the normals: opencv (y down, z forward) or opengl (y up, z back)."""
     matcher: str | None = None
     """ONNX file of `warpgs priors export --model xfeat`, used if SIFT leaves photographs without a pose; None: SIFT only."""
 
@@ -166,12 +132,6 @@ def choose_split(scene: Scene, spec: str | None) -> tuple[Split, list[str]]:
 
 def read_scene(request: SceneRequest, progress: Callable[[str], object] | None = None) -> tuple[Scene, Split, list[str]]:
     """Load a scene and split its views; returns both with the notes for the user. ``progress`` is as in `load_scene`."""
-    scene = load_scene(
-        request.path, reader=request.reader, downscale=request.downscale, max_side=request.max_side, strict=request.strict,
-        allow_outside=request.allow_outside, masks=request.masks, mask_keeps=request.mask_keeps,
-        black_is_empty=request.black_is_empty, score_masks=request.score_masks, max_pixels=request.max_pixels,
-        lenses=request.lenses, depths=request.depths, normals=request.normals, depth_kind=request.depth_kind,
-        depth_unit=request.depth_unit, normal_axes=request.normal_axes, progress=progress,
-    )  # fmt: skip
+    scene = read_folder(request.path, request, request.reader, progress)
     split, notes = choose_split(scene, request.split)
     return scene, split, [*scene.notes, *notes]

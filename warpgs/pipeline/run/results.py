@@ -21,7 +21,7 @@ from warpgs.device import format_bytes
 from warpgs.errors import ResourceError
 from warpgs.files import make_folder, read_file, write_bytes
 from warpgs.geometry import MODELS, depth_normals
-from warpgs.io.images import decode
+from warpgs.io.image_files import decode
 from warpgs.io.load import Split
 from warpgs.pipeline.films.paths import up_of
 from warpgs.pipeline.metrics.coverage import coverage_section
